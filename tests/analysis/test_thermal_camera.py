@@ -12,13 +12,14 @@ import pytest
 import thermocald as tc
 from benchmarks.thermal_model import undistorting
 from thermocald.analysis.camera.undistortion import ideal_points
-from thermocald.analysis.thermal.predictions import warm_up
+from thermocald.analysis.thermal.predictions import predict_along, warm_up
 from thermocald.analysis.thermal.steady import ExtrapolationWarning
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.testfields import demonstration_field, demonstration_model
+from thermocald.store.logger.temperatures import TemperatureLog
 
 
 def thermal_model(*listed):
@@ -149,6 +150,23 @@ def test_missing_readings_are_refused():
     assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda camera: camera.at(30.0, temperature_sd="0.1"),
+        lambda camera: camera.at(30.0, channels=[30.0]),
+        lambda camera: camera.along([0, 1], [25.0, 26.0], relative_to="x"),
+        lambda camera: camera.live(size=("640", "480")),
+        lambda camera: camera.live(size=640),
+        lambda camera: camera.live().correct([[1, 2], [3, 4]]),
+        lambda camera: tc.load_camera(None),
+    ],
+)
+def test_a_wrong_type_is_one_clear_error(call):
+    with pytest.raises(UsageError, match=r"(is|is a) .*(give|must be)"):
+        call(ThermalCamera(thermal_model()))
+
+
 def test_images_of_another_camera_a_crop_and_a_binning():
     camera = ThermalCamera(thermal_model())
     with pytest.raises(ConfigurationError, match="belongs to one camera"):
@@ -207,3 +225,29 @@ def test_a_formula_with_a_decimal_point_is_predicted_along_a_log(tmp_path):
     camera.save(tmp_path / "camera.yaml")
     again = tc.load_camera(tmp_path / "camera.yaml").along(*log)
     np.testing.assert_allclose(again.values, along.values, rtol=1e-9)
+
+
+@pytest.mark.parametrize("formula", [False, True])
+def test_a_dead_thermometer_is_not_followed_for_ever(formula):
+    """The last reading stands in for ten intervals; one warning outside the fit's range."""
+    model = replace(thermal_model(), validity={"temperature": (20.0, 30.0)})
+    live = ThermalCamera(model).live()
+    live.keeps_all = formula
+    for k in range(3):
+        live.update(10.0 * k, 25.0)
+    assert live.update(120.0, float("nan")).temperature == 25.0
+    with pytest.raises(DataError, match="temperature gave no reading for 980 s"):
+        live.update(1000.0, float("nan"))
+    with pytest.warns(ExtrapolationWarning) as said:
+        assert live.update(1010.0, 32.0).temperature == 32.0
+    assert len(said) == 1
+
+
+def test_nothing_is_predicted_in_a_gap_of_the_log():
+    """A reading that failed is interpolated, a quarter of an hour of them is not."""
+    times, temperatures = 10.0 * np.arange(120), np.linspace(25.0, 35.0, 120)
+    temperatures[5], temperatures[20:110] = np.nan, np.nan
+    log = TemperatureLog(times, {"temperature": temperatures})
+    with pytest.warns(UserWarning, match="90 of 120 times are in a gap"):
+        rows = predict_along(ThermalCamera(thermal_model()), log, False).document["rows"]
+    assert [row[0] for row in rows] == [*times[:20], *times[110:]]

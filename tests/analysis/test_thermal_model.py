@@ -94,6 +94,25 @@ def test_sixteen_targets_suffice(seed):
         reduced(replace(s, field=s.field.subset(rows[:11])))
 
 
+@pytest.mark.parametrize("kind", ["noisy", pytest.param("coarse", marks=pytest.mark.slow)])
+def test_a_poor_thermometer_does_not_bias_a_lag(kind):
+    """Noise or steps of 1 K: errors are as large as their sds, and of either sign."""
+    source, z = audit_thermal.seen(simulated(6, epochs=100, power=5.0)), []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        read, phase = source.readings["temperature"], rng.uniform()
+        poor = read + rng.normal(0, 1, len(read)) if kind == "noisy" else np.round(read + phase)
+        one = reduce_series(
+            replace(source, readings={"temperature": poor}, noises=None), strict=False
+        )
+        model = fit_thermal_model([one], [START]).model
+        lag = model.effects[0]
+        true = dict(LAG.values)["tau"]
+        z.append((float(lag.values["tau"]) - true) / lag.sds["tau"])
+    assert abs(np.mean(z)) < 1.0, z  # 1.3 with the determinant in the objective
+    assert np.sqrt(np.mean(np.square(z))) < 1.5, z
+
+
 @pytest.mark.slow
 def test_events_and_phases_differ_between_series():
     """Two series have a slip, at different times; a fan has another phase in each series."""

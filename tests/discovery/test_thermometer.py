@@ -11,6 +11,8 @@ from scipy.sparse import csr_array
 from thermocald.thermal.thermometer import (
     Thermometer,
     estimate_reading_noise,
+    find_passages,
+    find_step,
     find_times_between,
     smooth_channel,
     thermometers,
@@ -42,6 +44,19 @@ def test_noise_with_quantisation():
     noises = [estimate_reading_noise(*read(seed), 0.0625) for seed in range(40)]
     # 177 correlated third differences: 12 % each, so 2 % for the mean; kinks raise it slightly
     assert np.mean(noises) == pytest.approx(true, rel=0.08)
+
+
+def test_a_coarse_thermometer_is_read_where_it_changes():
+    """Its step shows in its readings, and the errors of its passages are as large as stated."""
+    z = []
+    for phase in np.arange(0.0, 1.0, 0.05):
+        t, y = read(int(20 * phase))
+        passages = find_passages(t, np.round(y + phase) - phase, None)
+        z.append((passages.values - trajectory(passages.times)) / passages.sd)
+    assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.1
+    assert find_step(np.round(y), 0.0625) == 1.0
+    assert find_step(y, None) < 0.07
+    assert find_passages(t, y, 0.0625) is None
 
 
 def test_a_step_is_not_better_than_itself():

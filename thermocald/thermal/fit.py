@@ -389,11 +389,24 @@ class HypothesisFitter:
             out.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
         return out
 
-    def _objective_with_prior(self, fit: Fit) -> float:
-        return fit.objective + sum(w * left**2 for left, w in self.prior_terms(fit) if w)
+    def refine(
+        self,
+        fit: Fit,
+        max_iterations: int = 6,
+        only: Sequence[int] | None = None,
+        least_squares: bool = False,
+    ) -> Fit:
+        """Improve the non-linear parameters by Gauss-Newton, without increasing the objective.
 
-    def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
-        """Improve the non-linear parameters by Gauss-Newton, without increasing the objective."""
+        least_squares: without increasing χ² alone. The objective's determinant prefers parameters
+        that smooth the readings' errors more (Neyman-Scott), such as a longer lag: the comparison
+        of hypotheses needs it, an estimate is biased by it as far as the thermometer is noisy.
+        """
+
+        def cost(of: Fit) -> float:
+            prior = sum(w * left**2 for left, w in self.prior_terms(of) if w)
+            return (of.chi2 if least_squares else of.objective) + prior
+
         searched = self.searched(fit.terms)
         # fewer periods than _PERIODS cannot be told from a slow drift
         longest = max(float(e.times[-1]) for e in self.series) / _PERIODS
@@ -416,7 +429,7 @@ class HypothesisFitter:
                         continue
                     tried = terms
                     trial = self.fit(terms, fit.coefficients, 2, only)
-                    gain = self._objective_with_prior(fit) - self._objective_with_prior(trial)
+                    gain = cost(fit) - cost(trial)
                     if gain > 0:
                         fit, improved = trial, True
                         break

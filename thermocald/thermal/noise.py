@@ -176,7 +176,7 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
         ok = precision > 0
         own = instrument.noise**2
         alike = _find_alike(e, ok)
-        if alike.sum() > 18:
+        if alike.sum() > 18 and not instrument.coarse:  # steps are no noise from epoch to epoch
             trajectory = fitter.drive_trajectory((), s)
             matrix = e.history.temperature_matrix() @ instrument.mixing
             shown = trajectory + matrix @ instrument.deviation
@@ -224,14 +224,12 @@ def _slope_jumps(series: ReducedSeries, direction: Array) -> Array:
     return out
 
 
-def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
+def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
     """Return the series linearised at the temperature estimated from readings and images together.
 
-    The readings and their errors remain the data. A delay shifts the smoothed readings, and noise
-    that is left in their slope would seem to determine it. None if the hypothesis has no drive.
+    The readings and their errors remain the data. Noise that is left in the smoothed readings would
+    bias the rates towards 0, and in their slope would seem to determine a delay.
     """
-    if not any(term.is_drive for term in fit.terms):
-        return None
     direction = fit.direction(fit.blocks[0])[0]
     out = []
     for s, e in enumerate(fitter.series):

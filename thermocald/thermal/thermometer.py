@@ -10,7 +10,7 @@ cross-validation as Golub, Heath, Wahba (1979), Technometrics 21, 215-223.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +32,8 @@ _OFTEN_SHARP = 0.2  # share of sharp intervals above which a sharp bend need not
 _KINK = 1.5  # times the usual sharp bend, which a kink must then exceed
 _ALIKE = 0.75  # of the sharpest bend near it, which a kink must then reach
 _STRAIGHT = 0.25  # of a reading's noise: root-sum-square that straight lines may miss in a series
+_STEADY = 1.5  # readings, on average, that a coarse thermometer shows alike, at least
+_WITHIN = 0.05  # of a coarse thermometer's step: its noise, which its readings do not show
 _PARTS = 4  # of an interval between two readings in which a straight line is not accurate enough
 
 
@@ -43,7 +45,7 @@ class Thermometer:
     knots of other columns; deviation (K,) K: reading minus trajectory; sd (K,) K: of the
     independent errors; mixing (K, K), sparse: errors of the knots = mixing @ independent errors,
     where a latent time has the errors of the readings next to it and its own; real (K,): whether a
-    knot is a reading time; noise K: of one reading.
+    knot is a reading time; noise K: of one reading; coarse: whether its steps dominate its errors.
     """
 
     times: Array
@@ -53,6 +55,7 @@ class Thermometer:
     mixing: csr_array
     real: NDArray[np.bool_]
     noise: float
+    coarse: bool = False
 
     @property
     def bulge(self) -> float:
@@ -109,6 +112,87 @@ class Thermometer:
         return 0.5 * np.fromiter(near, dtype=float, count=len(times))
 
 
+def find_step(readings: Array, resolution: float | None) -> float:
+    """Return a thermometer's step, K: as stated, or as its readings show if they often repeat."""
+    known = readings[np.isfinite(readings)]
+    shown = np.unique(np.round(known, 6))
+    if len(shown) < 2 or 2 * len(shown) > len(known):
+        return resolution or 0.0
+    return max(resolution or 0.0, float(np.diff(shown).min()))
+
+
+@dataclass(frozen=True, eq=False)
+class Passages:
+    """The passages of the temperature from one step of a coarse thermometer to the next.
+
+    times (P,) s, values (P,) °C half way between two readings, sd (P,) K; readings (R,) °C: between
+    the passages; bow (R,) K: the sd of what they differ from straight lines.
+    """
+
+    times: Array
+    values: Array
+    sd: Array
+    readings: Array
+    bow: Array
+
+
+def find_passages(times: Array, readings: Array, resolution: float | None) -> Passages | None:
+    """Find where the temperature passes the steps of a coarse thermometer; None if it is fine.
+
+    An error due to steps stays the same as long as the reading does: not the readings but the times
+    at which they change tell the temperature. Between two passages it may be bent as much as its
+    slope changes; before the first, after the last and where it turns, it is anywhere in the step.
+    That is one error per run of equal readings, however many there are. Passages that follow each
+    other after equal times, or to and fro, have much of their error in common.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    step = find_step(readings, resolution)
+    rows = np.flatnonzero(np.isfinite(readings) & np.isfinite(times))
+    y, t = readings[rows], times[rows]
+    first = np.flatnonzero(np.diff(y, prepend=np.inf) != 0.0)
+    if len(first) < 3 or len(y) < _STEADY * len(first):
+        return None
+    size = np.diff(first, append=len(y))
+    before = first[1:] - 1
+    at, values = 0.5 * (t[before] + t[before + 1]), 0.5 * (y[before] + y[before + 1])
+    error = step / np.sqrt(12.0)
+    sd = error / np.minimum(size[:-1], size[1:])
+    sd = np.hypot(sd, max(_estimate_excess(at, values, sd), _WITHIN * step))
+    apart = size[1:-1]
+    new = np.append([True, True], apart[1:] != apart[:-1])
+    new[1:] &= np.diff(values) != 0.0
+    group = np.cumsum(new) - 1
+    sd = sd * np.sqrt(0.5 + 0.5 * np.bincount(group))[group]  # half of the error in common
+    run = np.repeat(np.arange(len(first)), size)
+    begin, end = np.append(t[0], at), np.append(at, t[-1])
+    share = np.clip((t - begin[run]) / np.maximum(end - begin, 1e-9)[run], 0.0, 1.0)
+    slope = np.diff(values) / size[1:-1]  # K per reading
+    change = np.abs(np.diff(slope, prepend=slope[:1], append=slope[-1:]))
+    bow = np.full(len(first), error)
+    straight = np.flatnonzero(slope != 0.0)
+    bend = size[1:-1] * np.maximum(change[:-1], change[1:]) / 8.0
+    bow[1 + straight] = np.minimum(bend, error)[straight]
+    shape = 4.0 * share * (1.0 - share)
+    shape[run == 0] = 1.0 - share[run == 0]
+    shape[run == len(first) - 1] = share[run == len(first) - 1]
+    line = PchipInterpolator(at, values)(np.clip(t, at[0], at[-1]))
+    within, spread = np.full(len(readings), np.nan), np.full(len(readings), np.nan)
+    open_ = np.isin(run, 1 + straight, invert=True)
+    within[rows] = line + np.where(open_, shape * (y - line), 0.0)
+    spread[rows] = np.hypot(shape * (bow * np.sqrt(size))[run], 0.1 * _WITHIN * step)
+    return Passages(at, values, sd, within, spread)
+
+
+def _estimate_excess(t: Array, y: Array, sd: Array) -> float:
+    """Return the noise K of values (P,) at times (P,) s beyond their sds (P,), 0 if none shows."""
+    if len(y) < 8:
+        return 0.0
+    own = np.convolve(sd**2, np.full(4, 0.25), mode="valid")
+    square = np.minimum(_third_differences(t, y) ** 2, 9.0 * np.median(own))
+    return float(np.sqrt(max(np.average(square - own, weights=own**-2.0), 0.0)))
+
+
 def estimate_reading_noise(times: Array, readings: Array, resolution: float | None) -> float:
     """Estimate the standard deviation of a reading, K, including quantisation.
 
@@ -123,7 +207,7 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
         readings = np.concatenate([readings[run] for run in runs])
     there = np.isfinite(readings) & np.isfinite(times)
     t, values = times[there], readings[there]
-    floor = (resolution or 0.0) / np.sqrt(12.0)
+    floor = find_step(values, resolution) / np.sqrt(12.0)
     if len(values) < 8:
         return max(float(floor), 1e-6)
     d = _third_differences(t, values)
@@ -212,12 +296,14 @@ def smooth_channel(
     curved: NDArray[np.bool_],
     resolution: float | None,
     noises: Array | None = None,
+    passed: NDArray[np.bool_] | None = None,
 ) -> Thermometer:
     """Smooth a column on knots: its own times, and other columns' knots, which stay NaN.
 
     times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent, curved (K,):
     whether a knot is a reading time of this column, a latent time of it, or a time on the curve
-    through its neighbours; noises (K,) K: of readings that are means of many.
+    through its neighbours; noises (K,) K: of readings that are means of many, or coarse; passed
+    (K,): whether a knot is a passage of a coarse thermometer, whose lines replace the smoothing.
     """
     from scipy.sparse import csr_array, lil_array
 
@@ -229,7 +315,9 @@ def smooth_channel(
     t, y = times[own], readings[own]
     there = np.isfinite(y)
     smooth = filled = np.interp(t, t[there], y[there])
-    if valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
+    if passed is not None:
+        smooth = filled
+    elif valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
         smooth = _smooth(filled, there.astype(float), noise)
     trajectory, sd = np.full(len(times), np.nan), np.full(len(times), 1e-6)
     trajectory[own] = smooth
@@ -242,6 +330,12 @@ def smooth_channel(
     mixing.setdiag(np.ones(len(times)))
     knot, rows = np.flatnonzero(own), np.flatnonzero(latent)
     index = np.clip(np.searchsorted(t, times[rows]) - 1, 0, max(len(t) - 2, 0))
+    if passed is not None:
+        from thermocald.physics.operators import interpolation_matrix
+
+        between = np.flatnonzero(own & ~passed)
+        lines = interpolation_matrix(times[passed], times[between])
+        mixing[np.ix_(between, np.flatnonzero(passed))] = lines.toarray()
     if curved.any():
         sharp = np.isin(np.arange(len(t) - 1), index)
         for row in np.flatnonzero(curved):
@@ -319,6 +413,7 @@ def extend(channel: Thermometer) -> Thermometer:
         mixing,
         np.concatenate([np.zeros(n, dtype=bool), channel.real, np.zeros(m, dtype=bool)]),
         channel.noise,
+        channel.coarse,
     )
 
 
@@ -357,29 +452,43 @@ def thermometers(
 ) -> tuple[Array, dict[str, Thermometer]]:
     """Return common knots (K,) s, and all columns on them as instruments.
 
-    The knots are the reading times and the latent and curved times of each column. noises {column:
-    (R,)} K: of readings that are means of many; there are no times between those.
+    The knots are the reading times and each column's latent and curved times, or its passages if it
+    is coarse. noises {column: (R,)} K: of readings that are means of many; there are no times
+    between those.
     """
+    nothing = np.zeros(0)
+    coarse = {
+        name: None if noises else find_passages(times, r, resolutions.get(name))
+        for name, r in readings.items()
+    }
     between = {
-        name: (np.zeros(0), np.zeros(0))
-        if noises is not None
+        name: (nothing, nothing)
+        if noises or coarse[name]
         else find_times_between(times, r, resolutions.get(name))
         for name, r in readings.items()
     }
     every = [instants for pair in between.values() for instants in pair]
-    knots, first = np.unique(np.concatenate([times, *every]), return_index=True)
+    passages = [found.times for found in coarse.values() if found]
+    knots, first = np.unique(np.concatenate([times, *every, *passages]), return_index=True)
     from_reading = first < len(times)
     channels = {}
     for name, r in readings.items():
-        on_knots = np.full(len(knots), np.nan)
-        on_knots[from_reading] = r[first[from_reading]]
+        found, resolution = coarse[name], resolutions.get(name)
+        sds = found.bow if found else noises[name] if noises else None
+        on_knots, known, passed = np.full(len(knots), np.nan), None, None
+        on_knots[from_reading] = (found.readings if found else r)[first[from_reading]]
         latent, curved = (np.isin(knots, instants) for instants in between[name])
-        known = None
-        if noises is not None:
-            known = np.full(len(knots), np.nan)
-            known[from_reading] = noises[name][first[from_reading]]
         own = from_reading & ~latent & ~curved
-        resolution = resolutions.get(name)
-        channel = smooth_channel(knots, on_knots, own, latent, curved, resolution, known)
+        if sds is not None:
+            known = np.full(len(knots), np.nan)
+            known[from_reading] = sds[first[from_reading]]
+        if found and known is not None:
+            passed = np.isin(knots, found.times)
+            own |= passed
+            on_knots[passed], known[passed] = found.values, found.sd
+        channel = smooth_channel(knots, on_knots, own, latent, curved, resolution, known, passed)
+        if found:
+            noise = estimate_reading_noise(times, r, resolution)
+            channel = replace(channel, noise=noise, coarse=True)
         channels[name] = extend(channel)
     return next(iter(channels.values())).times, channels

@@ -178,9 +178,16 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
 
 
 def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool) -> Prediction:
-    """Predict the camera along a log, one row per reading."""
+    """Predict the camera along a log, one row per reading; none, with a warning, in a gap of it."""
+    known = log.known_at(log.times)
+    if not known.all():
+        warnings.warn(
+            f"{int((~known).sum())} of {len(known)} times are in a gap of the temperature log of "
+            "over ten of its intervals: nothing is predicted for them",
+            stacklevel=3,
+        )
     along = thermal.along(
-        log.times, log.channels, extrapolate=extrapolate,
+        log.times, log.channels, log.times[known], extrapolate=extrapolate,
         temperature_sd=thermal.thermometer_sd or 0.0,
     )  # fmt: skip
     sds = along.sd

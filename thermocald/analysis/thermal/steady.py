@@ -153,3 +153,10 @@ def steady_camera(
             for key, row in own:
                 add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
     return SteadyCamera(model, names, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
+
+
+def widened(covariance: Array, drift: Array | float) -> Array:
+    """Return covariances (E, 10, 10) with a drift (E, 10) beyond a thermometer's range added."""
+    rows = np.arange(10)
+    covariance[:, rows, rows] += np.square(drift)
+    return covariance

@@ -28,7 +28,7 @@ import numpy as np
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
-from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
+from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera, widened
 from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
@@ -50,7 +50,9 @@ if TYPE_CHECKING:
 USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _CHUNK = 20_000  # times predicted at once
 _STEP = 1e-3  # relative step of a parameter for its derivative
+_LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _REMEMBERED = 6  # readings that the present effects follow from, besides two of each channel
+_NUMBER = (int, float, np.number)
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
@@ -176,6 +178,10 @@ class ThermalCamera(Result):
         >>> now.temperature
         25.0
         """
+        if size is not None and (
+            len(np.atleast_1d(size)) != 2 or not all(isinstance(n, _NUMBER) for n in size)
+        ):
+            raise UsageError(f"size is {size!r}: give (width, height) px")
         return LiveCamera(self if size is None else self.for_images(*size))
 
     def for_images(self, width: int, height: int, camera: str | None = None) -> ThermalCamera:
@@ -284,7 +290,7 @@ class ThermalCamera(Result):
         if channels is not None:
             others = {name: np.array([float(value)]) for name, value in channels.items()}
             outside, drift = self._beyond(others, extrapolate)
-            covariance = _widened(covariance[None], drift)[0]
+            covariance = widened(covariance[None], drift)[0]
             beyond = max(beyond, float(np.max(outside)))
         return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
 
@@ -312,6 +318,8 @@ class ThermalCamera(Result):
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
+        if not isinstance(given, Mapping):
+            raise UsageError(f"channels is {given!r}: give {{channel: °C}}")
         known = list(dict.fromkeys([*self.model.validity, *self.channels]))
         for name, value in given.items():
             if name not in known:
@@ -344,6 +352,8 @@ class ThermalCamera(Result):
         ((3, 10), (3, 10))
         """
         _require_sd(temperature_sd)
+        if not isinstance(relative_to, (*_NUMBER, type(None))):
+            raise UsageError(f"relative_to is {relative_to!r}: give one number, °C")
         t = seconds(times)
         columns = (
             temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
@@ -392,7 +402,7 @@ class ThermalCamera(Result):
             instants,
             history.temperature(),
             np.concatenate(values),
-            _widened(np.concatenate(covariance), drift),
+            widened(np.concatenate(covariance), drift),
             np.maximum(outside, further),
             self.model.camera,
         )
@@ -476,13 +486,6 @@ class ThermalCamera(Result):
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
 
 
-def _widened(covariance: Array, drift: Array | float) -> Array:
-    """Return covariances (E, 10, 10) with a drift (E, 10) beyond a thermometer's range added."""
-    rows = np.arange(10)
-    covariance[:, rows, rows] += np.square(drift)
-    return covariance
-
-
 def _require_known(log: Array, readings: Array, times: Array) -> None:
     """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
     from thermocald.store.recording.readings import interpolate_readings
@@ -499,8 +502,8 @@ def _require_known(log: Array, readings: Array, times: Array) -> None:
 
 
 def _require_sd(temperature_sd: float) -> None:
-    if not 0.0 <= temperature_sd < math.inf:
-        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be at least 0")
+    if not isinstance(temperature_sd, _NUMBER) or not 0.0 <= temperature_sd < math.inf:
+        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
 
 
 def _noise_share(times: Array, at: Array) -> Array:
@@ -521,6 +524,8 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
+    if not isinstance(path, (str, Path)):
+        raise UsageError(f"the path of a model is {path!r}: give a text or a Path")
     return ThermalCamera.load(Path(path).expanduser())
 
 
@@ -555,6 +560,8 @@ class LiveCamera:
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._channels: tuple[str, ...] = ()
+        self._seen: tuple[float, ...] = ()  # when each channel was last measured, s
+        self._updates = 0
         self._now: Camera | None = None
         self._maps: Maps | None = None
         drives = {name for name, _ in model.drives}
@@ -569,14 +576,21 @@ class LiveCamera:
         """Take a reading and return the camera now, equal to `along` over the history so far.
 
         time: s or datetime64, later than the last; temperature: °C, or {channel: °C} with the
-        reference first; for NaN (a failed reading) the channel's last reading is used. Raises
-        UsageError if the time is not later, and far outside the temperatures of the fit.
+        reference first; for NaN (a failed reading) the channel's last reading is used, for at most
+        ten intervals between readings, then DataError is raised. Raises UsageError if the time is
+        not later, and far outside the temperatures of the fit.
 
         >>> live = tc.load_camera("camera.yaml").live()
         >>> live.update(0.0, 25.0).sd["c"] > 0
         True
         """
         thermal, (t, row) = self.thermal, self._checked(time, temperature)
+        if self.keeps_all:  # the state changes only if `along` raises nothing
+            rows = np.array([*self._rows, row]).T
+            history_of = dict(zip(self._channels, rows, strict=True))
+            self._now = thermal.along([*self._times, t], history_of, [t])[0]
+            self._remember(t, row)
+            return self._now
         outside = np.zeros(1)
         if thermal.validity is not None:  # first, so that an error leaves the state unchanged
             outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
@@ -585,9 +599,6 @@ class LiveCamera:
         self._remember(t, row)
         times = np.array(self._times)
         readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
-        if self.keeps_all:
-            self._now = thermal.along(times, readings, [t], extrapolate=True)[0]
-            return self._now
         drive = _push(self._drive, t, row[0])
         driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
@@ -596,7 +607,7 @@ class LiveCamera:
         covariance = thermal._propagate(history, drive, linear, outside, driven=driven)
         values = model.carried(linear)[0]
         beyond = float(np.max(np.maximum(outside, further)))
-        covariance = _widened(covariance, drift)
+        covariance = widened(covariance, drift)
         self._now = Camera(model.sensor, row[0], values, covariance[0], beyond, model.camera)
         return self._now
 
@@ -616,6 +627,8 @@ class LiveCamera:
         import cv2
 
         sensor = self.thermal.model.sensor
+        if not isinstance(frame, np.ndarray) or frame.ndim < 2:
+            raise UsageError(f"the frame is a {type(frame).__name__}: give an array (H, W)")
         if frame.shape[:2] != (sensor.height, sensor.width):
             raise UsageError(
                 f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "
@@ -662,11 +675,22 @@ class LiveCamera:
             row = tuple(b if math.isnan(n) else n for b, n in zip(last, row, strict=True))
         elif any(math.isnan(v) for v in row):
             raise UsageError("the first reading is NaN: begin with one that was measured")
-        self._channels = names
+        measured = [not math.isnan(float(v)) for v in given.values()]
+        seen = tuple(t if m else s for m, s in zip(measured, self._seen or row, strict=True))
+        if self._updates > 1:
+            usual = (self._times[-1] - self._times[0]) / (self._updates - 1)
+            oldest = min(zip(seen, names, strict=True))
+            if t - oldest[0] > _LARGEST_GAP * usual:
+                raise DataError(
+                    f"{oldest[1]} gave no reading for {t - oldest[0]:.0f} s, over ten of its "
+                    f"intervals of {usual:.0f} s: the camera's temperature is not known"
+                )
+        self._channels, self._seen = names, seen
         return t, row
 
     def _remember(self, time: float, row: tuple[float, ...]) -> None:
         """Store a reading; unless all are needed, drop all but first, extremes and last three."""
+        self._updates += 1
         self._times.append(time)
         self._rows.append(row)
         last = len(self._times) - 1

@@ -108,16 +108,16 @@ def _fit_hypothesis(
     for effect in listed:
         if catalogue.get(effect.name).seen_in == "trajectory":
             fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search)))
-    fit = fitter.refine(fit, max_iterations=20)
+    fit = fitter.refine(fit, 20, least_squares=True)
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
-        fit = fitter.refine(fitter.fit(terms), max_iterations=20)
+        fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
     for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
         better = again(fitter, fit)
         if better is not None:
             fitter = HypothesisFitter(better)
             fitter.held, fitter.priors = held, priors
-            fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), max_iterations=20)
+            fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), 20, least_squares=True)
     return fitter, fit
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from functools import partial
 
+import numpy as np
 import pytest
 import yaml
 
+import thermocald as tc
 from tests.blind.case import Case
 from tests.blind.generator import generate, write
 from tests.commands import answer, succeed
@@ -64,10 +66,15 @@ def test_everything_is_written(recordings, found):
 
 
 def test_with_the_model_found_nothing_is_missing(recordings, found):
-    """The new model, read back, explains the recording: no effect is found a second time."""
-    result = discover(recordings / "M1", "--model", recordings / "model.yaml", "--json", "-")
+    """The new model explains the recording, predicts, and keeps its effect in the next version."""
+    model, again = recordings / "model.yaml", recordings / "again.yaml"
+    result = discover(recordings / "M1", "--model", model, "--json", "-", "--model-out", again)
 
     assert json.loads(result.stdout)["verdict"] == "adequate"
+    cameras = [tc.load_camera(model), tc.load_camera(again)]
+    assert [[e.name for e in c.model.effects] for c in cameras] == [["thermal_lag"]] * 2
+    first, second = (c.at(c.model.T0) for c in cameras)
+    assert np.allclose(first.values[:3], second.values[:3], atol=0.1 * first.sd["c"])
 
 
 def test_another_camera_is_refused(recordings, tmp_path):

@@ -72,7 +72,8 @@ class Examination:
     best, per series. cross_validation: gains (blocks,) of its effects in blocks of time left out.
     surrogates: the test of each of its effects. mount: its movement, if it moves; knocks: of the
     mount, as terms of the base; as_slips: whether a slip inside the camera explains each equally
-    well. field_movements: of boards and targets, per series.
+    well. unblocked: the series as examined, not averaged in blocks. field_movements: of boards and
+    targets, per series. distortion_sigmas: significance of what the distortion follows.
     """
 
     base: Solution
@@ -89,8 +90,9 @@ class Examination:
     mount: Mount | None = None
     knocks: tuple[Term, ...] = ()
     as_slips: tuple[bool, ...] = ()
-    original: tuple[ReducedSeries, ...] = ()
+    unblocked: tuple[ReducedSeries, ...] = ()
     field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
+    distortion_sigmas: float = 0.0
 
     @property
     def fitter(self) -> HypothesisFitter:
@@ -126,9 +128,8 @@ def examine_series(
         displaced.append(tuple(groups))
         cleaned.append(without)
     # only after the movements of the field are removed
-    distortion, _ = choose_distortion(cleaned)
+    distortion, sure = choose_distortion(cleaned)
     cleaned = [e.in_basis(distortion) for e in cleaned]
-    series = [e.in_basis(distortion) for e in series]
     say("measuring noise")
     growth = noise_growth(cleaned)
     if growth is not None:
@@ -143,8 +144,8 @@ def examine_series(
         shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
         result = _examine_standing(ready, shaking, say, given, jobs)
     return replace(
-        result, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
-        field_movements=tuple(field),
+        result, displaced=tuple(displaced), noise_growth=growth, unblocked=tuple(cleaned),
+        field_movements=tuple(field), distortion_sigmas=sure,
     )  # fmt: skip
 
 

@@ -2,10 +2,8 @@
 
 It also describes the movements of the test field and the mount during the series.
 
-The model is the next version of a thermal model, which `simulate` runs. Its level is the camera and
-its orientation at T₀ with all effects at zero. Level and drifts are one system of normal equations,
-from which the thermometers' errors are eliminated, so that these and the drifts' errors are
-propagated to the level; the errors of the field's coordinates are added.
+The model is the next version of a thermal model, which `simulate` runs, built from its fit as `fit`
+builds one.
 """
 
 from __future__ import annotations
@@ -15,6 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.thermal.camera_fit import with_covariance
+from thermocald.analysis.thermal.level import Moved
+from thermocald.analysis.thermal.result import build_camera
 from thermocald.discovery import criteria
 from thermocald.discovery.entries import (
     EffectFound,
@@ -37,26 +38,17 @@ from thermocald.discovery.unnamed import (
     say_contradiction,
 )
 from thermocald.discovery.validation import cross_validation
-from thermocald.photogrammetry.camera.camera_model import (
-    EOP_NAMES,
-    IOP_NAMES,
-    PARAMETER_NAMES,
-    ExteriorOrientation,
-    InteriorOrientation,
-)
-from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inverse
 from thermocald.physics import catalogue
-from thermocald.physics.model import ThermalModel
+from thermocald.physics.model import ModelEffect
 from thermocald.result import jsonable
-from thermocald.thermal.hypothesis import BASE, Term
+from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.scan import examine, examine_all
-from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from thermocald.arrays import Array
-    from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.physics.model import ThermalModel
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
@@ -65,7 +57,7 @@ def field_lines(x: Examination) -> list[str]:
     """Return a line for each movement of the test field."""
     return [
         f"{m.sentence} in {e.source.name}; this is not counted as an effect"
-        for e, movements in zip(x.original, x.field_movements, strict=True)
+        for e, movements in zip(x.unblocked, x.field_movements, strict=True)
         for m in movements
     ]
 
@@ -184,7 +176,7 @@ class Discovery:
             }
         movements = [
             {"recording": e.source.name, **m.as_dict()}
-            for e, moved in zip(x.original, x.field_movements, strict=True)
+            for e, moved in zip(x.unblocked, x.field_movements, strict=True)
             for m in moved
         ]
         if movements:
@@ -410,60 +402,49 @@ def _conclude_unexplained(
     return Discovery("unexplained", (entry,), tuple(stages), x, *fits, (nan, nan))
 
 
-_P = len(PARAMETER_NAMES)
-
-
-def estimate_level(fitter: HypothesisFitter, fit: Fit) -> tuple[Array, Array]:
-    """Estimate the first series' level (16,) about its linearisation, px-scaled, and sds (16,).
-
-    The scales of the test field are held. The sds include the noise of image and thermometers, the
-    drifts' errors, and the stated errors of the test field's coordinates.
-    """
-    weighting, index = fit.weightings[0], fit.designs[0][2]
-    X, V, places = fitter.tangent(fit, fit.searched, 0, centred=False)
-    A, _, coupling = weighting.joint(X, V)
-    drifts = coupling[:, : len(index)] @ fit.coefficients[index]
-    own = weighting.level_normal[:_P, :_P]
-    level = inverse_of_determined(own) @ (weighting.level_b - drifts)[:_P]
-
-    T = np.eye(_P + len(fit.covariance))[np.concatenate([_P + places, np.arange(_P)])]
-    normal = T.T @ np.block([[A, coupling[:_P].T], [coupling[:_P], own]]) @ T
-    empty = np.diag(normal) <= 0
-    normal[empty, empty] = 1e12  # coefficients of other series
-    along = fitter.series[0].along[:_P, :_P]
-    Q = scaled_inverse(normal)[:_P, :_P] + _field_errors(fitter.series[0])
-    return along @ level, np.sqrt(np.einsum("ij,jk,ik->i", along, Q, along))
-
-
-def _field_errors(series: ReducedSeries) -> Array:
-    """Return the level's covariance (16, 16) from the errors of the targets' coordinates."""
-    weights = series.weights[..., :2].sum(axis=0)
-    A = series.columns[..., :_P]
-    WA = A * weights[..., None]
-    lever = np.einsum("tci,tcx->itx", WA, series.at.B).reshape(_P, -1)
-    moved = inverse_of_determined(np.einsum("tci,tcj->ij", WA, A)) @ (
-        lever * series.source.field.sigmas.ravel()
-    )
-    return np.asarray(moved @ moved.T)
-
-
 def build_model(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
-    """Build the thermal model with the effects found; its constants are those from M1 alone.
+    """Build the thermal model with the effects found, as `fit` does, from M1 alone.
 
-    What an effect has separately in each series (a time, a phase) is that of M1.
+    What an effect has separately in each series (a time, a phase) is that of M1. The effects that
+    the model had already stay in it.
     """
-    x, fit = discovery.examination, discovery.final_fit
-    e = x.fitter.series[0]
-    level, sd = estimate_level(x.fitter, fit)
-    scale = e.scale[: len(PARAMETER_NAMES)]
-    start = np.concatenate([e.at.iop, e.at.eop])
-    values, sds = start + level / scale, sd / scale
-    block = fit.blocks[0]
-    rates, rate_sds = {}, {}
-    for j, name in enumerate(BASE):
-        unit = e.scale[COLUMNS.index(name)]
-        rates[name] = float(fit.coefficients[block.start + j] / unit)
-        rate_sds[f"rates.{name}"] = float(np.sqrt(fit.covariance[j, j]) / unit)
+    x = discovery.examination
+    own = [t for t in discovery.final_fit.terms if t not in x.knocks]
+    # an effect before the knocks, which may have its name
+    terms = [replace(t, fresh=t.fresh[:1]) for t in (*own, *x.knocks) if t.values(0) is not None]
+    fitter = HypothesisFitter(x.fitter.series[:1])
+    fit = fitter.refine(fitter.fit(terms))
+    listed = [m for e in discovery.effects if e.term is None for m in effects_of(e)]
+    moved = [
+        Moved(
+            float(m.values["time"]),
+            np.array([m.values[k] for k in kind.linear]),
+            np.diag([m.sds[k] ** 2 for k in kind.linear]),
+        )
+        for m in listed
+        if (kind := catalogue.get(m.name)).seen_in == "targets"
+    ]
+    for t in own:
+        linear = [p for p in t.kind.linear if t.kind.column(p) in t.parameters]
+        start = dict.fromkeys((*t.kind.fresh, *linear), 0.0)
+        listed.append(ModelEffect(t.effect, {**start, **(t.values(0) or {})}))
+    model = build_camera(
+        fitter, fit, x.unblocked[:1], listed, x.noise_growth, moved, x.distortion_sigmas
+    ).model
+    names = model.covariance_names
+    stated = {  # some are wider than the fit's, as those of `_widen_estimates`
+        f"{m.name}.{k}": sd
+        for e in discovery.effects
+        for m in effects_of(e)
+        for k, sd in m.sds.items()
+    }
+    wider = np.array([max(1.0, stated.get(n, 0.0) / (model.sd(n) or np.inf)) for n in names])
+    model = with_covariance(
+        model,
+        names,
+        np.array([model.value(n) for n in names]),
+        model.covariance_of(names) * np.outer(wider, wider),
+    )
     document = discovery.as_dict()
     evidence: dict[str, Any] = {"verdict": discovery.verdict, "gap": document["gap"]}
     for entry in document["effects"]:
@@ -471,27 +452,9 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
         evidence[entry["effect"]] = {key: entry[key] for key in kept}
         if "bridge" in entry["evidence"]:
             evidence["unnamed"]["note"] = "bridged by a smooth term for M1 only; not transferable"
-    T = e.history.temperature()
-    weights = e.weights[..., :2] / e.source.per_row[:, None, None]
-    return ThermalModel(
-        camera=e.source.camera,
-        sensor=e.source.sensor,
-        T0=e.T0,
-        interior=InteriorOrientation.from_array(values[:10]),
-        rates=rates,
-        effects=tuple(one for entry in discovery.effects for one in effects_of(entry)),
-        distortion=e.distortion,
-        exterior=ExteriorOrientation.from_array(values[10:]),
-        image_sigma=float(1.0 / np.sqrt(np.mean(weights[weights > 0]))),
-        sds={
-            **{f"interior.{n}": float(s) for n, s in zip(IOP_NAMES, sds[:10], strict=True)},
-            **{f"exterior.{n}": float(s) for n, s in zip(EOP_NAMES, sds[10:], strict=True)},
-            **rate_sds,
-        },
-        validity={e.history.reference: (float(T.min()), float(T.max()))},
-        fitted_on=[{"recording": s.source.name, "epochs": int((s.n > 0).sum())}
-                   for s in x.fitter.series[:1]],
-        evidence=evidence,
-        name=old.name if old else e.source.camera,
+    return replace(
+        model,
+        evidence={**model.evidence, **evidence},
+        name=old.name if old else model.name,
         version=old.version + 1 if old else 1,
-    )  # fmt: skip
+    )

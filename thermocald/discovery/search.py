@@ -15,7 +15,6 @@ European Physical Journal C 70, 525-530 (look-elsewhere effect).
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -254,22 +253,21 @@ class Search:
 
     def with_other_delay(self, solution: Solution) -> Solution | None:
         """Replace a solution's delay of the temperature by the best other kind; None if none."""
-        delays = [c for c in self.candidates if c.kind.delay]
         for i, term in enumerate(solution.terms):
             if not term.kind.delay:
                 continue
             seconds = float(dict(term.nonlinear)[term.kind.delay])
-            others = [c for c in delays if c.effect not in solution.names]
-            if seconds <= 0 or not others:
+            # an offset as long as the series leaves its temperature constant and its rates free
+            others = [
+                c.term(seconds, len(self.fitter.series))
+                for c in self.candidates
+                if c.kind.delay and c.effect not in solution.names and seconds <= c.grid[-1]
+            ]
+            if seconds <= 0:
                 return None
-            solutions = []
-            for candidate in others:
-                swapped = candidate.term(seconds, len(self.fitter.series))
-                terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-                # an offset as long as the series leaves its temperature constant and its rates free
-                with contextlib.suppress(np.linalg.LinAlgError):
-                    solutions.append(self.refine(terms, solution.penalties))
-            return min(solutions, key=lambda s: s.fit.chi2, default=None)
+            before, after = solution.terms[:i], solution.terms[i + 1 :]
+            fits = [self.refine((*before, t, *after), solution.penalties) for t in others]
+            return min(fits, key=lambda s: s.fit.chi2, default=None)
         return None
 
     def with_events_moved(self, solution: Solution) -> Solution:

@@ -58,7 +58,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
     high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
     channel = next(iter(first.validity), "temperature")
-    mean = _with_values(first, names, people.mean, people.prior, name)
+    mean = with_covariance(first, names, people.mean, people.prior)
     own = {k: v for k, v in mean.sds.items() if k.split(".")[0] in ("interior", "rates")}
     return replace(
         mean,
@@ -161,14 +161,17 @@ def shrink_to_type(
     for i in np.flatnonzero(sd > 0):
         value, low, _ = new.interval(np.eye(len(names))[i])
         wider[i] = (value - low) / (NORMAL_95 * sd[i])
-    return _with_values(
-        model, names, new.values, new.covariance * np.outer(wider, wider), str(kind.camera)
-    )
+    shrunk = with_covariance(model, names, new.values, new.covariance * np.outer(wider, wider))
+    return replace(shrunk, evidence={**model.evidence, "shrunk_to_type": str(kind.camera)})
 
 
-def _with_values(
-    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array, kind: str
+def with_covariance(
+    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array
 ) -> ThermalModel:
+    """Return the model with other values and another covariance of some numbers and its interior.
+
+    names: as in `ThermalModel.parameter_names`, the interior orientation's among them.
+    """
     found = dict(zip(names, values.tolist(), strict=True))
     sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
     moved = model.with_values({n: v for n, v in found.items() if not n.startswith("interior.")})
@@ -183,7 +186,6 @@ def _with_values(
         sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
         covariance_names=names,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
-        evidence={**model.evidence, "shrunk_to_type": kind},
     )
 
 

@@ -202,7 +202,7 @@ def _covariance(
     Q = scaled_inverse(_joint_normal(fitter, fit))[: n + size, : n + size]
     Q[:n, :n] += parameters
     Q[n:, n:] += unknowns
-    rows = {name: row for name, (_, row) in numbers.items() if "@" not in name}
+    rows = {name: row for name, (_, row) in numbers.items()}
     R = np.zeros((n + len(rows), n + size))
     R[:n, :n] = first.along[np.ix_(_INTERIOR, _INTERIOR)] / first.scale[_INTERIOR, None]
     R[n:, n:] = list(rows.values())
@@ -277,7 +277,10 @@ def build_camera(
     ]
     models, field = estimate_level(series, starts)
     verdict, unknowns, parameters = examine_rest(fitter, fit, _INTERIOR)
-    names, covariance = _covariance(fitter, fit, series[0], numbers, unknowns, parameters)
+    # a knock of the mount is in the fit, but not in the model
+    known = models[0].parameter_names()
+    own = {name: number for name, number in numbers.items() if name in known}
+    names, covariance = _covariance(fitter, fit, series[0], own, unknowns, parameters)
     covariance[: len(_INTERIOR), : len(_INTERIOR)] += field
     if moved:
         e = next(e for e in listed if catalogue.get(e.name).seen_in == "targets")

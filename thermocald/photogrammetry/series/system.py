@@ -132,6 +132,7 @@ def offset_weights(field: TestField, at: Partials) -> Array:
 
 
 _FARTHEST_PX = 200.0  # largest movement of an image point by one step
+_KEPT = 4_000_000  # elements of all couplings, 32 MB, up to which they are kept
 _CHUNK = 128  # epochs whose couplings with the offsets are computed at a time
 
 
@@ -160,7 +161,8 @@ class SeriesSystem:
     weights (E, T, 3): a priori; use (E, T): points in use; N (E, 16, 16): empty without common
     unknowns; Q (E, p, p): cofactors of the epochs' own parameters, the common ones held; good (E,):
     epochs that determine their parameters; Q_common (q, q), or with offsets (q + 2T, q + 2T): empty
-    before `solved`; alike: epochs with the same matrices, from `same_rows`, None if outdated.
+    before `solved`; alike: epochs with the same matrices, from `same_rows`, None if outdated;
+    coupled: the result of `couplings`, if it needs little memory.
     """
 
     design: Design
@@ -171,6 +173,7 @@ class SeriesSystem:
     good: Mask
     Q_common: Array
     alike: tuple[Index, Index] | None
+    coupled: list[tuple[Index, Array]] | None = None
 
     @classmethod
     def formed(cls, design: Design, weights: Array, use: Mask) -> SeriesSystem:
@@ -189,6 +192,8 @@ class SeriesSystem:
 
     def solved(self) -> SeriesSystem:
         """Return the system with the cofactors of the common unknowns."""
+        if len(self.good) * len(self.design.own) * self.design.width <= _KEPT:
+            self.coupled = list(self.couplings())
         return replace(self, Q_common=inverse_of_determined(self.common_normals()))
 
     def used(self, rows: Index | Mask | slice = slice(None)) -> Array:
@@ -219,6 +224,9 @@ class SeriesSystem:
 
     def couplings(self) -> Iterator[tuple[Index, Array]]:
         """Yield chunks of good epochs and their blocks (e, p, q + 2T) of own by common unknowns."""
+        if self.coupled is not None:
+            yield from self.coupled
+            return
         rows, design = np.flatnonzero(self.good), self.design
         if design.width == 0 or len(design.own) == 0:
             return
@@ -236,19 +244,16 @@ class SeriesSystem:
         right = self.own_gradient(residuals, state)
         right[~self.good] = 0.0
         total = design.common_pull(state.pose, state.offsets)
+        if design.width:
+            total += design.gradient(self.used(self.good), residuals[self.good])
         solved = (self.Q @ right[..., None])[..., 0]
-        if design.width:  # the gradient with the own parameters reduced: at their solution
-            left = residuals[self.good]
-            self._correct(left, solved[self.good])
-            total += design.gradient(self.used(self.good), left)
+        for part, C in self.couplings():
+            total -= np.einsum("epi,ep->i", C, solved[part])
         d_all = self.Q_common @ total
         size = float(np.sqrt(max(float(total @ d_all), 0.0)))
         if len(d_all):
-            shift = design.at.A[..., design.common] @ d_all[:q]
-            shift[: len(design.offset_prior)] += d_all[q:].reshape(2, -1).T
-            everywhere = np.broadcast_to(shift, residuals.shape)
-            own = design.at.A[..., design.own]
-            right -= right_hand_sides(self.weights, everywhere, own, self.use)
+            for part, C in self.couplings():
+                right[part] -= C @ d_all
             solved = (self.Q @ right[..., None])[..., 0]
         solved[~self.good] = 0.0
         sizes = np.sqrt(np.maximum((right * solved).sum(axis=1), 0.0))
@@ -271,17 +276,13 @@ class SeriesSystem:
 
     def move(self, residuals: Array, step: Step) -> None:
         """Update the residuals (E, T, 2) px for a small step by the partials, in place."""
+        A, own = self.design.at.A, self.design.own
         if self.design.width:
-            common = self.design.at.A[..., self.design.common]
-            residuals -= common @ step.d_common + step.d_offsets
-        self._correct(residuals, step.d_own)
-
-    def _correct(self, residuals: Array, d_own: Array) -> None:
-        """Update residuals (e, T, 2) px for corrections (e, p) of the own parameters, in place."""
-        A = self.design.at.A[..., self.design.own]
+            residuals -= A[..., self.design.common] @ step.d_common + step.d_offsets
+        Ax, Ay = A[:, 0, own].T, A[:, 1, own].T
         for part in chunks(*residuals.shape[:2]):
-            for k in range(2):
-                residuals[part, :, k] -= d_own[part] @ A[:, k].T
+            residuals[part, :, 0] -= step.d_own[part] @ Ax
+            residuals[part, :, 1] -= step.d_own[part] @ Ay
 
     def gradient(self, residuals: Array) -> Array:
         """Return Aᵀ P l (E, 16) of every epoch."""

@@ -130,6 +130,7 @@ def calibrate(
     from thermocald.photogrammetry.camera_files import read_camera
     from thermocald.results import Calibration
 
+    require_within(pixel_pitch=(pixel_pitch, 1e-6))
     paths = images_of(_paths(images))
     if camera is not None:
         file = read_camera(source_of(camera), pixel_pitch)
@@ -255,7 +256,7 @@ def fit(
     if not series:
         raise UsageError("give at least one series to fit a model to")
     require_series(series)
-    require_within(T0=(T0, COLDEST_C))
+    require_within(T0=(T0, COLDEST_C), jobs=(jobs, 1, 256))
     if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
         kind = read_model(source_of(kind))
     if isinstance(kind, ThermalModel):
@@ -457,7 +458,7 @@ def _check_settings(s: StudySettings) -> None:
         window=(s.window, 3), alpha=(s.alpha, 1e-6, 0.5), sets=(s.sets, 2), seed=(s.seed, 0),
         distance_mm=(s.distance_mm, 10.0), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10.0),
         f_number=(s.f_number, 0.1), confusion_mm=(s.confusion_mm, 1e-6),
-        thermometer_sd=(s.thermometer_sd, 0.0),
+        thermometer_sd=(s.thermometer_sd, 0.0), jobs=(s.jobs, 1, 256),
     )  # fmt: skip
     if s.window % 2 == 0:
         raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")

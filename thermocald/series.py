@@ -383,5 +383,7 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
 
 def source_of(text: Path | str) -> Path:
     """Return a path with `~` expanded, or a server's address, as the readers take it."""
+    if not isinstance(text, str | Path):
+        raise UsageError(f"{text!r} is not a path: give a text or a Path")
     path = Path(text)
     return path if is_server(path) else path.expanduser()

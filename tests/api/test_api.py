@@ -308,6 +308,8 @@ OUT_OF_BOUNDS = {
     "seed is 1.5; it must be a whole": lambda M1, field: tc.simulate("nexus5-cold", seed=1.5),
     "jobs is 999; it must be from 1 to 256": lambda M1, field: M1.calibrate(jobs=999),
     "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
+    "jobs is '2'; it must be a whole number": lambda M1, field: tc.study(M1, jobs="2"),
+    "None is not a path": lambda M1, field: tc.open(None),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
     "give finite": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(0, float("nan"))]),

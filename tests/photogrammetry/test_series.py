@@ -259,6 +259,15 @@ def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
 
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
+def test_without_a_free_parameter_only_the_pose_is_estimated(exterior):
+    field, _, observations = series(np.random.default_rng(5), 12, coordinate_error=0.0, hidden=0.0)
+    r = scene.adjusted_series(field, observations, free=(), exterior=exterior)
+    assert r.ok.all()
+    assert (r.values[:, :10] == scene.INTERIOR.as_array()).all()
+    assert (r.sd[:, 10:] > 0).all()
+
+
+@pytest.mark.parametrize("exterior", ["per_epoch", "series"])
 def test_repeated_frames_have_positive_variances(exterior):
     """A camera repeats its last frame, so the errors of whole markers seem to correlate."""
     plain, _, observations = series(np.random.default_rng(4), 45, coordinate_error=0.02, hidden=0.0)

@@ -300,7 +300,8 @@ def cofactors(N: Array) -> tuple[Array, Mask]:
 def among_all(Q: Array, own: Index) -> Array:
     """Expand matrices (E, p, p) of some parameters to all (E, 16, 16), 0 for the others."""
     whole = np.zeros((len(Q), 16, 16))
-    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1)
+    # none if the common exterior orientation is all that is estimated
+    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1) if len(own) else []
     for rows in runs:
         for columns in runs:
             a, b = (

@@ -90,7 +90,7 @@ def test_faults(camera):
     ("options", "reason"),
     [
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
-        ({"programme": "hot"}, r"valid list"),
+        ({"programme": "hot"}, r"must be a list"),
         ({"exposure_s": -1}, "exposure_s"),
         ({"faults": [{"kind": "bored"}]}, "input should be 'timeout'"),
     ],

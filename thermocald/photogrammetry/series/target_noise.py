@@ -224,8 +224,9 @@ def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array
         large = size > moving * _LEAST_STEP_PX**2
         if large and abrupt and gain > _STEP_GAIN * np.sqrt(moving) * rest:
             (slope, variance, _), row, course = step, at, stair
-    left = np.sqrt(np.maximum(1 - variance / np.maximum(slope**2, 1e-300), 0.0))
-    return slope * left, course, row
+    squares = slope**2
+    noise = np.divide(variance, squares, out=np.ones_like(squares), where=squares > variance)
+    return slope * np.sqrt(1.0 - noise), course, row
 
 
 def neighbours_variance(unit: Array, known: Mask) -> Array:

@@ -241,8 +241,10 @@ def result(
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
     slow, step = np.zeros((16, 16)), 0
     if many:
+        # only of few targets is it unknown which have moved
+        few = 2 * np.median(use.sum(axis=1)) - s.carried < TRUSTED_REDUNDANCY
         changes, course, step = slow_errors(
-            estimate.residuals, use & estimate.solved[:, None], not series.windows
+            estimate.residuals, use & estimate.solved[:, None], bool(few) and not series.windows
         )
         slow = slow_target_covariance(system, changes, series.testfield.groups, step > 0)
         trend += slow

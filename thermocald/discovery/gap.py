@@ -127,7 +127,7 @@ def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: fl
     moved, count = _measure_moved(e, x.displaced[series], "targets" in in_model)
     total, image, free = total + moved, image + moved, free + count
     chi2 = total / free
-    if x.noise_growth and "noise" not in in_model:
+    if x.noise_growth and "noise" in x.image_places[known:]:
         noise = x.noise_growth.noise[series]
         chi2 *= float(np.mean(noise**2)) / float(np.min(noise) ** 2)
     rms = e.sigma_px * float(np.sqrt(image / free))

@@ -10,7 +10,7 @@ size.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from thermocald.discovery import criteria
 from thermocald.discovery.search import Search, Solution
@@ -28,6 +28,7 @@ from thermocald.thermal.movement import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from thermocald.physics.model import ModelEffect
     from thermocald.thermal.fit import HypothesisFitter
 
 _WIDTH = 4  # solutions of a level whose movement is estimated
@@ -46,7 +47,7 @@ _SETTLED = 0.1
 def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]] = (),
+    given: Sequence[ModelEffect] = (),
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks one by one while the penalised likelihood improves.
 

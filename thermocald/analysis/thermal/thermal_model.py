@@ -112,13 +112,8 @@ def _fit_hypothesis(
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
         fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
-    for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
-        better = again(fitter, fit)
-        if better is not None:
-            fitter = HypothesisFitter(better)
-            fitter.held, fitter.priors = held, priors
-            fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), 20, least_squares=True)
-    return fitter, fit
+    twice = (sharpen_trajectories, sharpen_trajectories)
+    return fitter.refine_in(fit, (*twice, remove_curvature, add_jumps_to_noise))
 
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:

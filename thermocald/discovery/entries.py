@@ -294,7 +294,7 @@ def _describe_moved_targets(x: Examination) -> EffectFound:
     e = x.fitter.series[0]
     names = e.source.field.names
     group = max(x.displaced[0], key=lambda g: g.gain)
-    effect = catalogue.seen_in("targets")
+    effect = catalogue.find(lambda e: e.seen_in == "targets")
     lengths = np.linalg.norm(group.vectors, axis=1)
     sd = np.sqrt(np.mean(group.sd_vectors**2)) / np.sqrt(len(lengths))
     estimates: dict[str, Estimate] = {
@@ -328,7 +328,7 @@ def _describe_moved_targets(x: Examination) -> EffectFound:
 
 
 def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound:
-    effect = catalogue.seen_in("noise")
+    effect = catalogue.find(lambda e: e.seen_in == "noise")
     estimates = {"factor": _make_estimate(growth.factor, growth.sd, "1/K")}
     where = {
         "parameters": ["sigma0"],

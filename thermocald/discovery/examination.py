@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.discovery import criteria
 from thermocald.discovery.evidence import (
     Displaced,
@@ -31,6 +30,7 @@ from thermocald.discovery.validation import (
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
+from thermocald.thermal.hypothesis import targets_of
 from thermocald.thermal.movement import (
     WAVES,
     add_jumps_to_noise,

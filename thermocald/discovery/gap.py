@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.discovery.evidence import left_by_cameras
 from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 from thermocald.thermal.scan import examine
 
@@ -150,7 +149,7 @@ def _measure_moved(
     w = evidence.weights[..., 0]
     weight = float(np.mean(w[w > 0]))
     for group in displaced:
-        v = left_by_cameras(evidence, group.rows)
+        v = evidence.left_by_cameras(group.rows)
         after = evidence.times >= group.time
         if known:
             v = np.where(after[:, None, None], v - group.steps, v)

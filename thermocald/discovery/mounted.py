@@ -10,6 +10,7 @@ size.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from thermocald.discovery import criteria
@@ -91,12 +92,8 @@ def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
 
     A scan without the movement of the mount may miss it.
     """
-    for solution in solutions:
-        other = search.with_other_delay(solution)
-        if other is not None:
-            names = [s.names for s in solutions]
-            return solutions if other.names in names else [*solutions, other]
-    return solutions
+    others = (o for s in solutions if (o := search.with_other_delay(s)) is not None)
+    return solutions + [o for o in islice(others, 1) if o.names not in [s.names for s in solutions]]
 
 
 def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
@@ -222,8 +219,7 @@ def contradict(best: Solution) -> bool:
     """
     count = len(best.fitter.series)
     shared = _profile(best, best).fit.objective
-    kinds = {n: catalogue.get(n) for n in catalogue.names()}
-    along_T = next(n for n, k in kinds.items() if isinstance(k, Proportional) and k.power == 1)
+    along_T = catalogue.find(lambda k: isinstance(k, Proportional) and k.power == 1).name
     for s in range(1, count):
         fresh = tuple(() if k == s else None for k in range(count))
         own = Term(along_T, BASE, fresh=fresh, through_drive=True)

@@ -301,8 +301,7 @@ def _find_lagging_thermometer(x: Examination, fit: Fit, k: int) -> dict[str, Any
     term = fit.terms[k]
     if float(dict(term.nonlinear).get(term.kind.delay, 0.0)) < 0.0:
         rate = next(n for n in catalogue.names() if catalogue.get(n).follows_rate)
-        fit = x.fitter.fit([Term(rate) if t is term else t for t in fit.terms])
-        fit = x.fitter.refine(fit)
+        fit = x.fitter.refine(x.fitter.fit([Term(rate) if t is term else t for t in fit.terms]))
         if fit.chi2 > x.best.fit.chi2 + criteria.DRIVES_BAND:
             return None
     return lagging_thermometer(fit, k)

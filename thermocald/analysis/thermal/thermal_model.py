@@ -22,7 +22,7 @@ from thermocald.analysis.thermal.result import build_camera
 from thermocald.errors import DataError
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
-from thermocald.thermal.hypothesis import BASE, Term, make_candidate
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
 from thermocald.thermal.movement import add_jumps_to_noise
 from thermocald.thermal.noise import (
     calibrate_thermometers,
@@ -82,15 +82,6 @@ def fit_thermal_model(
     fitter, fit = _fit_hypothesis(others, listed, search, frozenset(fixed), dict(priors or {}))
     moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
     return build_camera(fitter, fit, others, listed, growth, moved, sure)
-
-
-def targets_of(listed: Sequence[ModelEffect]) -> tuple[str, ...]:
-    """Return the targets that effects name as moving."""
-    names: list[str] = []
-    for effect in listed:
-        targets = effect.values.get("targets", ())
-        names += [targets] if isinstance(targets, str) else list(targets)
-    return tuple(names)
 
 
 def _fit_hypothesis(

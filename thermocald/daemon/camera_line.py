@@ -20,7 +20,6 @@ from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import running_series
-from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.store.series import Event
@@ -318,11 +317,7 @@ class CameraLine:
 
     def check(self) -> None:
         """Check the next frame without storing it; `checked` then holds the result."""
-        if not isinstance(self.plan.calibrator, Calibrator):
-            raise ConfigurationError(
-                f"camera {self.plan.name!r}: the check needs its `testfield`; set it, or give "
-                "--no-check"
-            )
+        self.plan.calibrator_of_check()
         self.checked = None
         self._replace(None, checking=True)
 
@@ -347,8 +342,7 @@ class CameraLine:
         if runtime.fast:
             self.thermometers.read_now(self.plan.config.thermometers)
         if self._checking:
-            assert self.plan.calibrator is not None
-            found = check_frame(self.plan.name, self.plan.calibrator, frame)
+            found = check_frame(self.plan.name, self.plan.calibrator_of_check(), frame)
             if self._checking:
                 self._checking, self.checked = False, found
             return

@@ -169,23 +169,22 @@ def replay_into(
 def _open_series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
     """Return the store's series of a recording, created if there is none."""
     wanted = {"exterior": "per_epoch", "free": list(settings.free)}
-    for series in store.all_series():
-        if (series.camera, series.name) != (recording.camera.name, recording.series):
-            continue
-        if series.head != recording.head or series.testfield.names != recording.testfield.names:
-            raise DataError(
-                f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
-                "use another store, or change `series` in recording.yaml"
-            )
-        if series.settings.get("free") != wanted["free"]:
-            raise UsageError(
-                f"{store.path}: series {series.name!r} was calibrated with --free "
-                f"{','.join(series.settings.get('free', []))}; use the same, or another store"
-            )
-        return series
-    return store.create_series(
-        recording.head, recording.testfield, settings=wanted, created_utc=time.time()
-    )
+    series = store.series_of(recording.camera.name, recording.series)
+    if series is None:
+        return store.create_series(
+            recording.head, recording.testfield, settings=wanted, created_utc=time.time()
+        )
+    if series.head != recording.head or series.testfield.names != recording.testfield.names:
+        raise DataError(
+            f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
+            "use another store, or change `series` in recording.yaml"
+        )
+    if series.settings.get("free") != wanted["free"]:
+        raise UsageError(
+            f"{store.path}: series {series.name!r} was calibrated with --free "
+            f"{','.join(series.settings.get('free', []))}; use the same, or another store"
+        )
+    return series
 
 
 def table_of_stored(

@@ -64,18 +64,6 @@ def test_target_offsets_halve_the_scatter():
     assert ratio[True] < 0.5 * ratio[False]
 
 
-def test_repeated_epochs_count_once():
-    """Each three times, they would be 90 independent epochs."""
-    field, _, observations = series(np.random.default_rng(38), epochs=30)
-    once = scene.adjusted_series(field, observations, exterior="series")
-    thrice = scene.adjusted_series(
-        field, [o for o in observations for _ in range(3)], exterior="series"
-    )
-    assert list(thrice.status) == ["ok", "no_observations", "no_observations"] * 30
-    np.testing.assert_allclose(thrice.sd[::3], once.sd, rtol=0.01)
-    assert (np.abs(thrice.values[::3] - once.values) < 0.1 * once.sd)[:, OWN].all()
-
-
 def test_an_epoch_that_moved_is_found():
     rng = np.random.default_rng(34)
     field, _, observations = series(rng, epochs=40, moved=17)
@@ -244,6 +232,18 @@ def test_the_perspective_sd_is_that_of_a_single_epoch():
     own = np.median(apart.sd[:, :3], axis=0)
     assert alike.perspective_sd[:3] == pytest.approx(own, rel=0.15)
     assert (alike.perspective_sd[:3] > 5 * np.median(alike.sd[:, :3], axis=0)).any()
+
+
+def test_repeated_epochs_count_once():
+    """Each three times, they would be 90 independent epochs."""
+    field, _, observations = series(np.random.default_rng(38), epochs=30)
+    once = scene.adjusted_series(field, observations, exterior="series")
+    thrice = scene.adjusted_series(
+        field, [o for o in observations for _ in range(3)], exterior="series"
+    )
+    assert list(thrice.status) == ["ok", "no_observations", "no_observations"] * 30
+    np.testing.assert_allclose(thrice.sd[::3], once.sd, rtol=0.01)
+    assert (np.abs(thrice.values[::3] - once.values) < 0.1 * once.sd)[:, OWN].all()
 
 
 @pytest.mark.parametrize(("held", "moved"), [("C1", 2), ("C2", 1)])

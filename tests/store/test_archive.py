@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import thermocald as tc
+from thermocald.epoch import Epoch
 from thermocald.store.database.archive import archive_series, archive_store
 from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.series import clock_corrections
 
 
@@ -92,3 +95,18 @@ def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):
         )
     assert found["recordings"] == []  # all exist already
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a--b-c", "a-b", "a-b--c"]
+
+
+@pytest.mark.parametrize(("place", "named"), [("", "M1/frames/000001.png"), ("away", None)])
+def test_a_replay_names_frames_in_the_folder_of_its_store_only(tmp_path, field, head, place, named):
+    """Regression: a store that named frames elsewhere could not be read."""
+    (tmp_path / "away").mkdir()
+    (tmp_path / "0.png").write_bytes(b"no image")
+    readings = dict.fromkeys(head.channels, 20.0)
+    epoch = Epoch(1, 0.0, 0.0, readings, frame=tmp_path / "0.png")
+    write_recording(tmp_path / "M1", head, field, [epoch])
+    path = tmp_path / place / "t.db"
+    assert tc.open(tmp_path / "M1").calibrate(store=path).status == ("bad_frame",)
+    with Store.open(path) as store:
+        (stored,) = store.epochs(store.find_series())
+    assert stored.epoch.frame == (named and Path(named))

@@ -354,7 +354,7 @@ def judge_epochs(
 
     few = 2 * offered - s.carried < TRUSTED_REDUNDANCY
     most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
-    fail(offered == 0, "no_observations", "no target was measured")
+    fail(offered == 0, "no_observations", "no target was measured, or the frame before again")
     fail(
         ~enough_targets(grid, s),
         "too_few_targets",

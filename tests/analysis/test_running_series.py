@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.analysis.online import running_series
 from thermocald.analysis.online.running_series import RunningSeries
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.epochs import calibrate_epochs
@@ -299,33 +298,6 @@ def test_priors_and_held_parameters_are_kept():
     for result, _ in results:
         assert result.values[0] == pytest.approx(3.1, abs=1e-4)
         assert (result.values[3:10] == 0).all()
-
-
-@pytest.mark.slow
-def test_the_cost_of_an_epoch_does_not_grow_over_months(monkeypatch):
-    """Counts the common adjustments and their epochs once the window is full."""
-    monkeypatch.setattr(running_series, "_WINDOW", 30)
-    monkeypatch.setattr(running_series, "_FEWEST", 30)
-    together: list[int] = []
-    real = running_series.adjusted
-
-    def counted(sensor, field, grid, *rest, **options):
-        together.append(len(grid))
-        return real(sensor, field, grid, *rest, **options)
-
-    monkeypatch.setattr(running_series, "adjusted", counted)
-    scene = Scene(11)
-    running, _, _, _ = take(scene, 60)
-    assert max(together) == 30
-    early = len(together)
-    running.epochs += 3_000_000
-    running._look_at = [k + 3_000_000 for k in running._look_at]
-    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
-    for k in range(60, 120):
-        refined(scene, calibrator, running, k)
-    assert max(together) == 30
-    assert len(together) - early <= 4 * 3
-    assert len(running._kept) == 30
 
 
 @pytest.mark.slow

@@ -222,21 +222,3 @@ def test_what_only_some_commands_need_is_imported_by_those():
         "print(*sorted(set(heavy) & set(sys.modules)))"
     )
     assert heavy == []
-
-
-def test_the_daemon_s_imports_stay_small():
-    """What the daemon needs, imported and waiting: 80 MB where numpy and cv2 alone are 41.
-
-    The kernel maps more or less of the libraries' files, 41 to 65 MB for the same two: what is ours
-    is the difference.
-    """
-    resident = (
-        "print([l for l in open('/proc/self/status') if l.startswith('VmRSS')][0].split()[1])"
-    )
-    libraries, ours = printed_by(
-        f"import numpy, cv2\n{resident}\n"
-        "import thermocald.acquisition.calibrator, thermocald.config, thermocald.hal\n"
-        "import thermocald.store.database.store, thermocald.acquisition.pipeline\n"
-        f"{resident}"
-    )
-    assert (int(ours) - int(libraries)) / 1024 < 80 - 41

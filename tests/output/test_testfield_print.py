@@ -275,9 +275,3 @@ def test_impossible_designs_are_refused(design, reason, tmp_path):
 def test_unknown_paper_is_refused(text):
     with pytest.raises(UsageError, match="paper"):
         paper_size(text)
-
-
-def test_unwritable_folder_is_one_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="file"):
-        print_testfield(Design((210, 297), 7.0), tmp_path / "file")

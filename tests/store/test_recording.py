@@ -68,13 +68,6 @@ def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
         assert same(a.observations, b.observations)
 
 
-def test_epochs_without_observations_are_empty_not_missing(tmp_path, field, head, make_epoch):
-    epochs = [make_epoch(1), make_epoch(2, targets=0), make_epoch(3)]
-    write_recording(tmp_path / "r", head, field, epochs)
-    read = read_recording(tmp_path / "r").epochs
-    assert [len(epoch.observations) for epoch in read] == [12, 0, 12]
-
-
 def test_rows_in_any_order(recording_path):
     file = recording_path / "observations.csv"
     expected = read_recording(recording_path).epochs

@@ -1,4 +1,4 @@
-"""A day of a recording is written and read in bounded memory; benchmarks/store.py has size and speed."""
+"""A day is written and read in bounded memory; benchmarks/store.py has sizes and speed."""
 
 from __future__ import annotations
 
@@ -16,6 +16,11 @@ from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.store.recording.reader import RecordingWriter
 
 DAY = 8640
+
+
+@pytest.mark.slow
+def test_the_file_stays_small_when_chunks_merge(tmp_path):
+    assert benchmark.size_ratio(tmp_path, 150, 16_500) <= benchmark.BOUNDS["size"]
 
 
 READ = textwrap.dedent(

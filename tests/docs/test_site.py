@@ -94,8 +94,7 @@ def built(tmp_path_factory):
 
 
 @pytest.fixture(
-    scope="module",
-    params=["pages", pytest.param("with modules", marks=pytest.mark.slow)],
+    scope="module", params=["pages", pytest.param("with modules", marks=pytest.mark.slow)]
 )
 def site(request, built):
     """{path: Document} of the built site, and its folder."""

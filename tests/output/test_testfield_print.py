@@ -15,11 +15,7 @@ from thermocald.analysis.field import usual_station
 from thermocald.errors import UsageError
 from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
 from thermocald.output.testfield.print import default_diameter, print_testfield
-from thermocald.photogrammetry.camera.camera_model import (
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.store.recording.testfield_file import read_testfield
 

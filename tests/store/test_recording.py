@@ -154,15 +154,6 @@ def test_testfield_keeps_kinds_and_codes(tmp_path):
     assert np.array_equal(read.sigmas, field.sigmas)
 
 
-def test_extra_columns_are_kept_and_ignored(recording_path):
-    for name, column in (("epochs.csv", "weather"), ("testfield.csv", "remark")):
-        file = recording_path / name
-        header, *rows = file.read_text().splitlines()
-        file.write_text("\n".join([f"{header},{column}", *(f"{row},fine" for row in rows)]) + "\n")
-    recording = read_recording(recording_path)
-    assert recording.columns.extra == {"weather": ("fine",) * 5}
-
-
 def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):
     def peak(epochs: int) -> int:
         tracemalloc.start()

@@ -14,11 +14,7 @@ from tests.commands import call
 from thermocald.errors import RecordingError, TestFieldError
 from thermocald.output.thermal_model import render_certificate
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.sense import (
-    find_spikes,
-    find_unit_change,
-    interior_doubts,
-)
+from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
 
 SIZE = "width: 3280, height: 2464"
 

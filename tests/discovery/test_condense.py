@@ -71,3 +71,10 @@ def test_a_gross_error_is_left_out(recorded):
     row = int(np.searchsorted(out.numbers, 4002, side="right")) - 1
     fine = np.nanmedian(grid.points[4001 - 100 : 4001 + 100, 3], axis=0)
     np.testing.assert_allclose(out.grid.points[row, 3], fine, atol=0.1)
+
+
+def test_what_is_fast_keeps_short_rows(recorded):
+    whole, grid = recorded
+    out = condensed(whole, InBlocks(grid, 911), most=500)
+    fast = (out.frame_times > 20 * 3600) & (out.frame_times < 21 * 3600)
+    assert np.mean(out.counts[fast]) * 2 < np.median(out.counts[~fast])

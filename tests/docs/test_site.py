@@ -231,21 +231,6 @@ def test_the_makefile_builds_it():
     assert (ROOT / "docs" / script).is_file()
 
 
-def test_the_makefile_installs_nothing_where_mkdocs_is(tmp_path):
-    there = tmp_path / "bin" / "mkdocs"
-    there.parent.mkdir()
-    there.touch()
-
-    def commands(folder: Path) -> str:
-        return subprocess.run(
-            ["make", "--dry-run", "docs", f"VENV={folder}"],
-            cwd=ROOT, check=True, capture_output=True, text=True,
-        ).stdout  # fmt: skip
-
-    assert "pip" not in commands(tmp_path)
-    assert "pip install" in commands(tmp_path / "elsewhere")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_search_works_from_a_folder(built, page_of, width):

@@ -305,6 +305,8 @@ def test_what_was_measured_is_no_spike(values):
 @pytest.mark.parametrize("rise", [9.0, 15.0, 25.0, 35.0, 60.0])
 def test_a_camera_that_is_carried_changes_no_unit(rise):
     assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise]) is None
+    settling = 0.6 * rise * np.exp(-np.arange(30) / 2.0)
+    assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise - settling]) is None
 
 
 def test_lenses_near_what_is_stated_are_not_doubted(recording):

@@ -22,9 +22,9 @@ from thermocald.store.database.store import Store
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Forty epochs of a warming camera."""
+    """Twenty-four epochs of a warming camera."""
     folder = tmp_path_factory.mktemp("recording") / "M1"
-    tc.simulate("rpi-v2.1-heating", seed=1, epochs=40, out=folder)
+    tc.simulate("rpi-v2.1-heating", seed=1, epochs=24, out=folder)
     return folder
 
 
@@ -36,8 +36,8 @@ def test_a_store_gives_what_is_stored(recording, tmp_path):
     direct = run("export", recording, "--format", "csv")
     assert from_store.returncode == direct.returncode == 0
     a, b = (list(csv.DictReader(io.StringIO(d.stdout))) for d in (from_store, direct))
-    assert len(a) == len(b) == 40
-    assert [r["status"] for r in a] == [r["status"] for r in b] == ["ok"] * 40
+    assert len(a) == len(b) == 24
+    assert [r["status"] for r in a] == [r["status"] for r in b] == ["ok"] * 24
     with Store.open(store) as opened:
         kept = opened.series_columns(opened.find_series(), ["c", "sd_c", "Z0", "sigma0"])
     for name, column in kept.items():
@@ -54,15 +54,15 @@ def test_an_interrupted_replay_goes_on(recording, tmp_path):
     half.mkdir()
     for name in ("recording.yaml", "testfield.csv"):
         (half / name).write_bytes((recording / name).read_bytes())
-    (half / "epochs.csv").write_text("\n".join(whole[:21]) + "\n")
-    last = whole[20].split(",")[0]
+    (half / "epochs.csv").write_text("\n".join(whole[:13]) + "\n")
+    last = whole[12].split(",")[0]
     lines = (recording / "observations.csv").read_text().splitlines()
     kept = [lines[0]] + [line for line in lines[1:] if int(line.split(",")[0]) <= int(last)]
     (half / "observations.csv").write_text("\n".join(kept) + "\n")
     finish("replay", half, "--store", store)
-    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 20
+    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 12
     finish("replay", recording, "--store", store)
-    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 40
+    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 24
 
 
 @pytest.mark.parametrize("path", ["/proc/self/status", "/proc/1", "/sys", "/dev/null"])

@@ -118,20 +118,6 @@ def test_many_epochs_are_averaged():
     assert [c.drifts for c in courses(table_of(values, sd, "series"))] == [False, True, False]
 
 
-def test_a_group_is_left_out_once_for_all_parameters():
-    """Each parameter once repeated the same adjustments."""
-    table, calls = series(0), []
-    assert table.without is not None
-
-    def without(rows, quick):
-        calls.append(tuple(rows))
-        return table.without(rows, quick)
-
-    found = courses(replace(table, without=without))
-    assert sum(c.drifts for c in found) > 1
-    assert len(calls) == len(set(calls)) > 0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("coloured", "phi", "epochs"), [(1.0, 0.97, 150), (0.5, 0.97, 150), (1.0, 0.9, 30)]

@@ -1,6 +1,5 @@
 """Studies of series and cameras: results, and notes where there is no result."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -164,16 +163,6 @@ def test_without_covariances_there_is_a_note_instead_of_a_monte_carlo(warm_up):
     camera = study([series], StudySettings(sets=100)).cameras[0]
     assert camera.montecarlo is None
     assert "No epoch has a covariance matrix" in " ".join(camera.notes)
-
-
-@pytest.mark.slow
-def test_two_hundred_thousand_epochs_in_seconds(warm_up):
-    """A sixteenth of a year; benchmarks/study.py has a whole year."""
-    series = warm_up(epochs=200_000)(correlations=np.tile(np.eye(10), (5000, 1, 1)))
-    begin = time.process_time()  # so that other programs do not count
-    result = study([series], StudySettings())
-    assert time.process_time() - begin < 12
-    assert result.cameras[0].series[0].significance["x0"].tests == 200_000 - 30
 
 
 def test_a_shift_of_the_principal_point_moves_all_points_equally(warm_up):

@@ -78,8 +78,8 @@ def slow_target_covariance(
 
     errors (T, 2) px: from the residuals. The parameters have absorbed a part of the error of a
     group of targets with a common error; it is restored as in the jackknife (HC3):
-    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups. together: whether some targets moved
-    with one another. A camera absorbs the targets' mean movement: residuals do not show it, but
+    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups. together: whether many targets may
+    have moved alike. A camera absorbs the targets' mean movement: residuals do not show it, but
     most targets, which stood still, have as large an error.
     """
     design = system.design

@@ -46,6 +46,7 @@ from thermocald.photogrammetry.series.covariances import (
     slow_target_covariance,
     stillness,
     typical_sensitivity,
+    with_excess,
 )
 from thermocald.photogrammetry.series.estimator import (
     NOISE_SHOWN,
@@ -252,7 +253,7 @@ def result(
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
         excess[own] = _excess(series, estimate.values[:, own], variances, sound)
-        relative[:, own, own] += excess[own] * sound[:, None]
+        relative[block] = with_excess(relative[block], excess[own])
     # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends,
     # or a step
     if slow.any():

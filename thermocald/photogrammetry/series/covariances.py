@@ -71,6 +71,17 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
     return relative, level, trend
 
 
+def with_excess(covariance: Array, excess: Array) -> Array:
+    """Add excess variances (p,) to covariances (E, p, p), whose correlations remain.
+
+    Scatter beyond the noise is that of image points: real series show the noise's correlations.
+    """
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    ratio = np.divide(excess, variances, out=np.zeros_like(variances), where=variances > 0)
+    factor = np.sqrt(1.0 + ratio)
+    return covariance * factor[:, :, None] * factor[:, None, :]
+
+
 def slow_target_covariance(
     system: SeriesSystem, errors: Array, group: Index, together: bool
 ) -> Array:

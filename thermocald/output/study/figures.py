@@ -152,15 +152,16 @@ def _movement_figure(camera: CameraStudy) -> Figure | None:
     ]
     if not moved:
         return None
-    lengths = [float(np.max(np.linalg.norm(vectors, axis=1))) for *_, vectors, _ in moved]
+    longest = max(float(np.linalg.norm(vectors, axis=1).max()) for *_, vectors, _ in moved)
     panels, words = [], []
-    for (s, colour, grid, vectors, covariance), length in zip(moved, lengths, strict=True):
+    for s, colour, grid, vectors, covariance in moved:
         frame = (s.sensor.width, s.sensor.height)
-        arrows = Arrows(grid, vectors, frame, colour, max(lengths))
+        arrows = Arrows(grid, vectors, frame, colour, longest)
         panels.append(Panel(s.name, "x in px", "y in px, down", (), arrows=arrows))
-        farthest = int(np.argmax(np.linalg.norm(vectors, axis=1)))
-        along = vectors[farthest] / length
-        sd = float(np.sqrt(along @ covariance[farthest] @ along))
+        lengths = np.linalg.norm(vectors, axis=1)
+        k = int(lengths.argmax())
+        length, along = float(lengths[k]), vectors[k] / lengths[k]
+        sd = float(np.sqrt(along @ covariance[k] @ along))
         words.append(f"{with_sd(length, sd, 'px')} in {s.name}")
     return Figure(
         "movement", "Movement of the image",

@@ -8,9 +8,11 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
+from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.covariances import with_excess
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 OWN = np.arange(8)
@@ -62,6 +64,23 @@ def test_target_offsets_halve_the_scatter():
         error = (r.values - truth)[:, 1]
         ratio[offsets] = error.std()
     assert ratio[True] < 0.5 * ratio[False]
+
+
+def test_excess_scatter_has_the_correlations_of_the_noise():
+    """Added to the variances alone, c and A1 were drawn as if independent."""
+    rng = np.random.default_rng(37)
+    roots = rng.normal(size=(5, 4, 4))
+    noise = roots @ np.swapaxes(roots, 1, 2)
+    noise[2] = 0.0  # an epoch without a result
+    excess = np.array([0.0, 1.0, 10.0, 100.0])
+
+    wide = with_excess(noise, excess)
+
+    good = [0, 1, 3, 4]
+    variances = np.diagonal(wide, axis1=1, axis2=2)
+    np.testing.assert_allclose(variances[good], np.diagonal(noise, axis1=1, axis2=2)[good] + excess)
+    np.testing.assert_allclose(correlations_of(wide[good]), correlations_of(noise[good]))
+    assert not wide[2].any()
 
 
 def test_an_epoch_that_moved_is_found():

@@ -162,9 +162,7 @@ def measured_series(
         of = np.arange(len(ok)) if table.sampled is None else table.sampled
         some = np.flatnonzero(ok[of] & adjustment.ok)
         some = some[spread_rows(len(some), _MOST_MATRICES)]
-        # the excess scatter has sds only: with it, the parameters would seem independent
         covariances = adjustment.covariance[some][:, :10, :10]
-        covariances = covariances - np.diag(np.square(adjustment.excess_sd[:10]))
     time_s, thermometers = table.frame_time[ok], []
     for name, channel in source.head.channels.items():
         read, readings = source.columns.readings_of(name)

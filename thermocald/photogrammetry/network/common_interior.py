@@ -51,7 +51,7 @@ _ITERATIONS = 60
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 _FEWEST_TO_COMPARE = 3  # photographs
-_DISAGREE = 4.0  # standard deviations of the mean square of the moves
+_DISAGREE = 3.0  # standard deviations of the mean square of the moves
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
 

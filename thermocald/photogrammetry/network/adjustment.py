@@ -361,10 +361,8 @@ def adjust_network(
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
-    disagreement, *more = adjustment.scatter(bundle, variance)
-    of_interior, of_centres, of_points = inner_constraints(
-        bundle, found, free_rows, (more[0], more[1])
-    )
+    disagreement, more = adjustment.scatter(bundle, variance)
+    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, more)
     placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,
         of_points * variance,

@@ -297,18 +297,14 @@ class BundleAdjustment:
         """
         f, moves, cofactors = len(self.free), [], []
         for photo in range(len(bundle.centres)):
-            rest = replace(self, rays=self.rays.select(self.rays.photo != photo))
-            normals = rest._normal_equations(bundle, np.ones(len(rest.rays)))
-            pose = f + 6 * photo + np.arange(6)
-            normals[0][pose, pose] = 1.0  # nothing else determines it
-            S, s, _ = _reduce(normals)
+            S, s, _ = _reduce(self._without(bundle, photo))
             np.linalg.cholesky(unit_diagonal(S)[0])
             Q = scaled_inverse(S)
             moves.append(Q[:f] @ s)
             cofactors.append((Q - found.cameras)[:f, :f])
         return np.array(moves), np.array(cofactors)
 
-    def scatter(self, bundle: Bundle, variance: float) -> tuple[float, Array, Array]:
+    def scatter(self, bundle: Bundle, variance: float) -> tuple[float, tuple[Array, Array]]:
         """Return how many times farther than by chance the unknowns of a free network move if a
         photograph is left out, 1 if that may be chance, and roots (k, u), (k, 3m) of what the
         cofactors lack then, by the jackknife.
@@ -318,11 +314,9 @@ class BundleAdjustment:
         """
         k, m, f = len(bundle.centres), len(bundle.points), len(self.free)
         cameras, targets, by_points = np.zeros((k, f + 6 * k)), np.zeros((k, 3 * m)), np.zeros(k)
-        nothing = 1.0, 0 * cameras, 0 * targets
+        nothing = 1.0, (0 * cameras, 0 * targets)
         for photo in range(k):
-            # the rest of its weight determines its pose
-            weights = np.where(self.rays.photo == photo, 1e-9, 1.0)
-            step = self._step(bundle, self._normal_equations(bundle, weights), 0.0)
+            step = self._step(bundle, self._without(bundle, photo), 0.0)
             if step is None:  # the others are too few
                 return nothing
             cameras[photo], targets[photo], by_points[photo] = step[0], step[1].ravel(), step[2]
@@ -341,7 +335,11 @@ class BundleAdjustment:
         values, vectors = np.linalg.eigh(squares * ((k - 1) / k / variance))
         excess = np.maximum(1 - (1 + n / (k - 1)) / np.maximum(values, 1), 0)
         roots = (np.sqrt(excess * (k - 1) / k / variance) * vectors).T
-        return float(np.sqrt(largest) / root), roots @ cameras, roots @ targets
+        return float(np.sqrt(largest) / root), (roots @ cameras, roots @ targets)
+
+    def _without(self, bundle: Bundle, photo: int) -> _Normals:
+        """Return the normal equations without a photograph, but for a trace that gives its pose."""
+        return self._normal_equations(bundle, np.where(self.rays.photo == photo, 1e-9, 1.0))
 
     def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""

@@ -161,10 +161,6 @@ def refuse_before(
 def refuse_weak(network: Network, found: Cofactors) -> None:
     """Refuse a result with weak geometry or large residuals."""
     reasons = []
-    if len(network.stations) < MIN_PHOTOS:
-        reasons.append(
-            f"only {len(network.stations)} photographs could be oriented, {MIN_PHOTOS} are needed"
-        )
     if network.redundancy < 10:
         reasons.append(f"a redundancy of {network.redundancy} is too small for any check")
     # how weak the geometry is, whatever the photographs disagree in
@@ -351,7 +347,7 @@ def adjust_network(
     kept_names = tuple(names[int(t)] for t in targets)
 
     angles = _intersection_angles(bundle, final)
-    angle = float(np.median(angles)) if len(angles) else 0.0
+    angle = float(np.median(angles))
     if angle < MIN_ANGLE:
         meet, least = f"{np.degrees(angle):.0f}°", f"{np.degrees(MIN_ANGLE):.0f}°"
         where = "take photographs from further to the left, right, above, and below"
@@ -361,7 +357,7 @@ def adjust_network(
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
-    disagreement, more = adjustment.scatter(bundle, variance)
+    disagreement, more = adjustment.scatter(bundle, found, variance)
     of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, more)
     placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,

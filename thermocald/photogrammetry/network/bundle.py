@@ -54,7 +54,7 @@ _SEPARATE_NOTHING = (
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _LEAST_DECREASE = 0.5  # of what the step predicts
-_DISAGREE = 6.0  # standard deviations of the largest eigenvalue
+_DISAGREE = 5.0  # standard deviations of the largest eigenvalue
 _CONTROLLED = 1e-3  # cofactor of a residual below which no other observation controls it
 
 
@@ -304,7 +304,9 @@ class BundleAdjustment:
             cofactors.append((Q - found.cameras)[:f, :f])
         return np.array(moves), np.array(cofactors)
 
-    def scatter(self, bundle: Bundle, variance: float) -> tuple[float, tuple[Array, Array]]:
+    def scatter(
+        self, bundle: Bundle, found: Cofactors, variance: float
+    ) -> tuple[float, tuple[Array, Array]]:
         """Return how many times farther than by chance the unknowns of a free network move if a
         photograph is left out, 1 if that may be chance, and roots (k, u), (k, 3m) of what the
         cofactors lack then, by the jackknife.
@@ -324,10 +326,12 @@ class BundleAdjustment:
         mixed, by_target = cameras @ B @ targets.T, targets.reshape(k, m, 3)
         squares = cameras @ A @ cameras.T + mixed + mixed.T
         squares += np.einsum("kmi,mij,lmj->kl", by_target, D, by_target)
-        # by chance the scaled moves' squares sum to n, however unequal the photographs' weights are
+        # by chance each scaled move has a square of n, however unequal the photographs' weights are
         n = f + 3 * m - 7
-        scale = np.sqrt(by_points / squares.diagonal() / variance)
-        largest = k * float(np.linalg.eigvalsh(squares * np.outer(scale, scale))[-1])
+        own = np.trace(self.explained(bundle, found), axis1=1, axis2=2)
+        expected = variance * (np.bincount(self.rays.photo, own) - 6)
+        scale = np.sqrt(n * by_points / expected / squares.diagonal())
+        largest = float(np.linalg.eigvalsh(squares * np.outer(scale, scale))[-1])
         root = np.sqrt(n) + np.sqrt(k)
         sd = root * np.cbrt(1 / np.sqrt(n) + 1 / np.sqrt(k))
         if not largest > root**2 + _DISAGREE * sd:

@@ -141,7 +141,7 @@ def adjust_common_interior(
     # how weak the geometry is, whatever the photographs disagree in
     weak = _weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)
     disagreement = 1.0
-    if f and len(photographs) >= _FEWEST_TO_COMPARE:
+    if len(photographs) >= _FEWEST_TO_COMPARE:
         with suppress(np.linalg.LinAlgError):  # the others may be too few without one of them
             moves, cofactors = part.without_each(bundle, found)
             disagreement, own = _between(moves, cofactors * variance, Q[:f, :f])
@@ -220,8 +220,6 @@ def _weaknesses(
 ) -> list[str]:
     """Return the reasons why the photographs do not determine the free parameters."""
     reasons: list[str] = []
-    if not s.free:
-        return reasons
     _, axes, flat = plane_fit(places[np.unique(rays.target)])
     if flat and "c" in s.free:
         angles = [obliqueness_deg(eop, axes[2]) for eop in eops]

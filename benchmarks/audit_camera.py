@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.audit_rows import Row, ratio
 from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.analysis.online.equilibrium import slope
+from thermocald.analysis.online.equilibrium import fit_approach
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import (
     CameraSpec,
@@ -354,12 +354,19 @@ def online(draws: int, rng: np.random.Generator) -> list[Row]:
                           "noise, the field's coordinates", np.array(off)))  # fmt: skip
         rows.append(ratio("daemon: innovation", f"√(χ²/dof); {what}", "noise alone",
                           np.sqrt(chi2)))  # fmt: skip
-    t = np.arange(20) * 10.0
-    drift = []
+    t = np.arange(40)[:, None] * 10.0
+    course, now = 200.0 * 0.005 * np.exp((t[-1] - t) / 200.0), 0.005  # px, px/s at the last epoch
+    truth = 200.0 * np.log(now / 1e-3)
+    drift, ready = [], []
     for _ in range(draws):
-        found_slope, sd_slope = slope(t, (0.01 * t + rng.normal(0, 0.05, 20))[:, None],
-                                      np.full((20, 1), 0.05))  # fmt: skip
-        drift.append((found_slope[0] - 0.01) / sd_slope[0])
-    rows.append(ratio("daemon, `status`: drift", "sd of px/min", "noise, more where no line fits",
-                      np.array(drift), low=0.85))  # fmt: skip
+        noise = rng.normal(0, 0.05, t.shape)
+        speed, sd, ready_in, sd_ready_in, _ = fit_approach(
+            t[:, 0], course + noise, np.full(t.shape, 0.05), 1e-3
+        )
+        drift.append((speed - now) / sd)
+        ready.append((ready_in - truth) / sd_ready_in)
+    rows.append(ratio("daemon, `status`: drift", "sd of px/min", "noise, the time constant",
+                      np.array(drift)))  # fmt: skip
+    rows.append(ratio("daemon, `status`: ready", "sd of min", "noise, the time constant",
+                      np.array(ready)))  # fmt: skip
     return rows

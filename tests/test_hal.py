@@ -14,7 +14,7 @@ import pytest
 
 from thermocald import errors, hal
 from thermocald.errors import ConfigurationError, DriverMissing, ThermocaldError
-from thermocald.hal import Frame, SystemClock, VirtualClock, load_driver, open_device, option_names
+from thermocald.hal import Frame, SystemClock, VirtualClock, load_driver
 
 
 def test_a_frame_cannot_be_changed_and_holds_something():
@@ -74,25 +74,6 @@ def test_look_up_names_what_there_is(kind, monkeypatch):
         load_driver(kind, "none")
 
 
-def test_options_of_a_driver():
-    assert "clock" not in option_names("thermometer", "mock")
-    assert {"programme", "seed", "faults"} <= set(option_names("thermometer", "mock"))
-
-
-@pytest.mark.parametrize(
-    ("kind", "driver", "options", "message"),
-    [
-        ("output", "mqtt", {}, "output driver 'mqtt': host: is missing"),
-        ("camera", "android", {"serial": "X"}, r"width: is missing \(and 1 more\)"),
-        ("thermometer", "ds18b20", {}, "sensors: is missing"),
-        ("thermometer", "mock", {"sed": 1}, "driver 'mock': sed: unknown; is 'seed' meant"),
-    ],
-)
-def test_a_missing_or_unknown_option_is_named(kind, driver, options, message):
-    with pytest.raises(ConfigurationError, match=message):
-        open_device(kind, driver, options, VirtualClock())
-
-
 def test_a_devices_name_cannot_leave_its_comment():
     found = hal.Found({"serial": "x"}, "Cam\n- {driver: evil}\x1b[31m °")
     assert found.about == "Cam?- {driver: evil}?[31m °"
@@ -113,14 +94,6 @@ def test_a_driver_that_cannot_be_imported(monkeypatch):
     monkeypatch.setattr(hal, "entry_points", lambda group: [point])
     with pytest.raises(DriverMissing, match="'lost' cannot be imported"):
         load_driver("camera", "lost")
-
-
-def test_a_device_is_closed_at_the_end_of_the_block():
-    device = open_device("output", "mock", {}, VirtualClock())
-    with device:
-        device.emit({"epoch": 1})
-    with pytest.raises(errors.DeviceError):
-        device.emit({"epoch": 2})
 
 
 def test_errors_are_one_tree_and_leaves_are_the_built_in_they_are():

@@ -9,7 +9,6 @@ import copy
 import math
 import re
 import shutil
-import tempfile
 import time
 from datetime import UTC, datetime, timedelta, timezone
 from functools import reduce
@@ -362,28 +361,3 @@ def test_any_file_of_a_logger(amount, tmp_path):
 
     check()
     assert len(read) > amount["max_examples"] // 5  # else nothing was shown
-
-
-def test_the_examples_are_what_they_seem(recorded):
-    """Undamaged examples are right and without doubts."""
-    path, _, right = recorded
-    assert right.ok.all()
-    assert tc.open(path).doubts(right) == []
-
-
-def test_a_log_without_damage_is_read(tmp_path):
-    with tempfile.TemporaryDirectory(dir=tmp_path) as folder:
-        log = {
-            "date": DATES[0], "unit": "C", "header": 0, "separator": ";", "comma": True,
-            "encoding": "utf-8", "end": "\n", "step": 10, "zone_h": 1, "preamble": 2,
-            "footer": True,
-            "humidity": True, "setpoint": True, "missing": {3}, "word": "---", "spikes": set(),
-            "spike": 85.0, "switch": None, "seed": 1,
-        }  # fmt: skip
-        path = Path(folder) / "log.csv"
-        true_times, celsius = written(log, path)
-        found = read_log(path, LogOptions(clock=DeviceClock(zone=time_zone("+01:00"))))
-    assert found.times.tolist() == true_times.tolist()
-    (values,) = found.channels.values()
-    assert np.flatnonzero(np.isnan(values)).tolist() == [3]
-    assert np.nanmax(np.abs(values - celsius)) < 0.006

@@ -287,21 +287,6 @@ def test_what_a_library_says_is_clean_in_status_event_and_log(caplog, kind):
     assert f"user:{SECRET}" not in stream.getvalue().splitlines()[-1]
 
 
-def test_a_program_of_the_user_gets_a_few_named_variables(tmp_path, monkeypatch):
-    monkeypatch.setenv("DATABASE_PASSWORD", SECRET)
-    script = tmp_path / "alarm"
-    script.write_text(f"#!/bin/sh\nenv > {tmp_path}/environment\n")
-    script.chmod(0o755)
-    options = {"command": [str(script)], "when": [{"no_result": 1}]}
-    with open_device("output", "alert_exec", options, SystemClock()) as output:
-        output.emit({"device": "cam", "series": "a", "epoch": 1, "status": "failed"})
-    names = {
-        line.split("=")[0] for line in (tmp_path / "environment").read_text().splitlines() if line
-    }
-    assert {"THERMOCALD_STATE", "THERMOCALD_TEXT", "PATH"} <= names
-    assert "DATABASE_PASSWORD" not in names
-
-
 WRITING = {
     "testfield": "testfield import --chessboard 9x6 --square 30 --out new/t.csv",
     "a recording": "simulate --preset rpi-v2.1-heating --out new/M",

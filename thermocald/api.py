@@ -174,10 +174,10 @@ def study(
     >>> found.cameras[0].label
     'rpi-v2.1'
     """
-    from thermocald.analysis.study.measured import refuse_copies
     from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import study as run
     from thermocald.results import Study
+    from thermocald.thermal.source import refuse_copies
 
     if not series:
         raise UsageError("give at least one series to study")
@@ -198,7 +198,8 @@ def study(
         one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
         for label, one in zip(named, series, strict=True)
     ]
-    refuse_copies(measured)
+    several = [(one.source, one.values) for one in measured if len(one) > 1]
+    refuse_copies(several, "has the same epochs as {}; give each series once", 1e-9, 0.0)
     return Study(settings, run(measured, settings, progress).cameras)
 
 
@@ -272,7 +273,7 @@ def fit(
     if start is not None and T0 is None:
         T0 = start.T0
     inputs = [one.observed(progress, jobs) for one in series]
-    refuse_copies(inputs)
+    refuse_copies([(one.name, one.grid.points) for one in inputs])
     reduced = [reduce_series(one, strict=False) for one in inputs]
     check_names(listed, reduced)
     if isinstance(kind, ThermalModel):

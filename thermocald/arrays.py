@@ -53,6 +53,11 @@ def spread_rows(count: int, most: int) -> Index:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
+def eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return 8-bit values of an image of 8 or 16 bit."""
+    return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+
+
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Return an array with undefined contents; the thread's next call with this name reuses it."""
     kind = np.dtype(dtype)

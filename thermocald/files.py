@@ -215,6 +215,11 @@ def write_parts(path: Path, parts: Iterable[str]) -> None:
         file.writelines(parts)
 
 
+def utc_stamp() -> str:
+    """Return the time as part of a file's name."""
+    return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+
+
 def make_folder(path: Path) -> None:
     """Make a folder and its parents unless it exists; raises OutputError."""
     try:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 WITH_VALUES = ("ok", "predicted", "resected", "last_pose")
 """Statuses of epochs without a fault: calibrated, or predicted and posed with a thermal model."""
+UNEVENTFUL = (*WITH_VALUES, "repeated_frame", "not_calibrated")
+"""Statuses of epochs whose frame need not be kept: it is nothing special, or kept already."""
 
 PAGE_OF = "THERMOCALD_PAGE_OF"
 """Environment variable: the process id of the daemon that started a page, which ends with it."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from abc import ABC, abstractmethod
 from dataclasses import fields, is_dataclass
@@ -9,12 +11,17 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from thermocald.files import write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    Columns = dict[str, NDArray[Any] | Sequence[str]]
 
 
 class Result(ABC):
@@ -125,3 +132,31 @@ def with_sds(names: Iterable[str], values: Iterable[Any], sds: Iterable[Any]) ->
     named = list(names)
     numbers = {name: float(value) for name, value in zip(named, values, strict=True)}
     return numbers | {f"sd_{name}": float(sd) for name, sd in zip(named, sds, strict=True)}
+
+
+def csv_text(
+    parts: Iterable[Mapping[str, NDArray[Any] | Sequence[str]]],
+    separator: str = ",",
+    decimal: str = ".",
+) -> Iterator[str]:
+    """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
+    for number, columns in enumerate(parts):
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+        if not number:
+            writer.writerow(columns)
+        cells = [_cells(name, values, decimal) for name, values in columns.items()]
+        writer.writerows(zip(*cells, strict=True))
+        yield text.getvalue()
+
+
+def _cells(name: str, values: NDArray[Any] | Sequence[str], decimal: str) -> Sequence[str]:
+    if not isinstance(values, np.ndarray):
+        return values
+    if values.dtype.kind in "iU":
+        return [str(v) for v in values.tolist()]
+    digits = [
+        "" if not math.isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
+        for v in values.tolist()
+    ]
+    return [d.replace(".", decimal) for d in digits] if decimal != "." else digits

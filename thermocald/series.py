@@ -40,11 +40,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.epochs import Columns, Epochs
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.physics.simulation import Simulation
+    from thermocald.result import Columns
     from thermocald.store.recording.head import Head
     from thermocald.store.series import StoredSeries
     from thermocald.thermal.series import SeriesInput

@@ -1,5 +1,7 @@
 """Epochs calibrated in blocks: the same bits on any number of processes."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, calibrated_epochs
@@ -11,21 +13,36 @@ from thermocald.physics.testfields import corner_field, demonstration_model
 EPOCHS = EPOCHS_OF_A_BLOCK + 40
 
 
-def test_processes_do_not_matter():
+def scene(count):
+    """Return a calibrator and epochs of noisy image points."""
     field = corner_field("plain", per_side=4, pitch_mm=150.0)
     model, rng = demonstration_model(field), np.random.default_rng(3)
     image = project(
         model.sensor, model.interior.as_array(), model.exterior.as_array(), field.points
     )
     epochs = []
-    for number in range(EPOCHS):
+    for number in range(count):
         points = image + rng.normal(0, 0.05, image.shape)
         seen = Observations(np.arange(len(field)), points, np.full(points.shape, 0.05))
         epochs.append(Epoch(number, 10.0 * number, 10.0 * number, {}, observations=seen))
-    one, two = (
-        list(calibrated_epochs(Calibrator(model.sensor, field, nominal_c=3.04), epochs, jobs))
-        for jobs in (1, 2)
-    )
+    return lambda: Calibrator(model.sensor, field, nominal_c=3.04), epochs
+
+
+def test_a_repeated_frame_is_no_new_observation():
+    calibrator, (a, b, c) = scene(3)
+    nothing = Epoch(7, 0.0, 0.0, {}, observations=Observations.none())
+    again = [replace(epoch, number=n) for n, epoch in enumerate([nothing, a, a, a, b, nothing, c])]
+    done = list(calibrated_epochs(calibrator(), again))
+    same, few = "repeated_frame", "too_few_targets"
+    statuses = ["no_observations", "ok", same, same, "ok", few, "ok"]
+    assert [d.adjustment.status for d in done] == statuses
+    assert "epoch 1" in done[3].adjustment.reason
+    assert [d.epoch.observations is None for d in done[2:5]] == [True, True, False]
+
+
+def test_processes_do_not_matter():
+    calibrator, epochs = scene(EPOCHS)
+    one, two = (list(calibrated_epochs(calibrator(), epochs, jobs)) for jobs in (1, 2))
     assert [done.epoch.number for done in two] == list(range(EPOCHS))
     for a, b in zip(one, two, strict=True):
         assert a.adjustment.ok

@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.audit_thermal import (
-    NAMES,
-    fitted,
-    rate_errors,
-    seen,
-    seen_by_opencv,
-    simulated,
-)
+from benchmarks.audit_thermal import NAMES, fitted, rate_errors, seen, seen_by_opencv, simulated
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation

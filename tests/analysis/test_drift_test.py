@@ -7,7 +7,7 @@ from scipy.fft import dct
 
 from tests.marks import mostly_slow
 from thermocald.analysis.statistics.dependence import holm, slope_p_value
-from thermocald.analysis.statistics.noise_models import Frequencies, cosines, drift_test
+from thermocald.analysis.statistics.noise_models import cosines, drift_test
 
 N = 150
 TIME_S = np.arange(N) * 10.0
@@ -191,11 +191,3 @@ def test_a_series_of_prime_length_is_shortened_by_a_few_epochs():
     whole = y[: len(found) + 1]
     np.testing.assert_allclose(found, dct(whole - whole.mean(), norm="ortho")[1:], atol=1e-9)
     assert len(cosines(np.arange(997.0))) == 996  # a short series is not shortened
-
-
-def test_pooled_frequencies_are_means():
-    at = Frequencies.of(20_001)
-    assert at.count.sum() == 20_000
-    every = np.pi * np.arange(1, 20_001) / 20_001
-    np.testing.assert_allclose(at.mean, at.sums(every) / at.count, rtol=1e-12)
-    assert len(at.mean) < 3001

@@ -80,18 +80,6 @@ def test_no_alarm_over_a_warm_up():
         assert all(take(0.35 * max(k - 20, 0)).change == "" for k in range(60))
 
 
-@pytest.mark.parametrize(
-    ("name", "parameter", "size"),
-    [("knock", 13, 0.5), ("knock", 12, 0.002), ("slip", 0, 3e-3), ("wrong_lens", 0, 0.2)],
-)
-def test_a_change_that_stays_is_named_at_its_second_epoch(name, parameter, size):
-    _, take = Surveyed(0.0, 1).filter()
-    for _ in range(20):
-        take()
-    named = [take(change=one_changed(parameter, size)).change for _ in range(6)]
-    assert named == ["outlier", name, "", "", "", ""]
-
-
 def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
     found, take = Surveyed(0.0, 2).filter()
     for _ in range(20):

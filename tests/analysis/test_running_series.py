@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.analysis.online import running_series
 from thermocald.analysis.online.running_series import RunningSeries
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.epochs import calibrate_epochs
@@ -244,7 +243,7 @@ def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_
 
 def test_remembered_epochs_restore_the_series():
     scene = Scene(7)
-    _, results, alone, _ = take(scene, 32)
+    _, results, alone, _ = take(scene, 27)
     _, again = begun(scene.sensor, scene.field)
     for calibrated, (result, _) in zip(alone[:22], results, strict=False):
         again.remember(calibrated, calibrated.epoch.observations, result.values)
@@ -276,14 +275,14 @@ def test_a_clock_that_is_set_back_is_harmless():
     """It is set back by two hours in the middle, and to the first instant at the end."""
     scene = Scene(11)
     calibrator, running = begun(scene.sensor, scene.field)
-    for k in range(32):
+    for k in range(26):
         epoch, _ = scene.epoch(k)
-        back = 1e9 if k == 31 else epoch.frame_time - 7200.0 * (k >= 24)
+        back = 1e9 if k == 25 else epoch.frame_time - 7200.0 * (k >= 21)
         epoch = replace(epoch, frame_time=back, temperature_time=back)
         result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
         assert result.ok
         assert np.isfinite(result.values).all()
-    assert columns["series_epochs"] == 32
+    assert columns["series_epochs"] == 26
 
 
 def test_without_common_unknowns_epochs_are_unchanged():
@@ -299,33 +298,6 @@ def test_priors_and_held_parameters_are_kept():
     for result, _ in results:
         assert result.values[0] == pytest.approx(3.1, abs=1e-4)
         assert (result.values[3:10] == 0).all()
-
-
-@pytest.mark.slow
-def test_the_cost_of_an_epoch_does_not_grow_over_months(monkeypatch):
-    """Counts the common adjustments and their epochs once the window is full."""
-    monkeypatch.setattr(running_series, "_WINDOW", 30)
-    monkeypatch.setattr(running_series, "_FEWEST", 30)
-    together: list[int] = []
-    real = running_series.adjusted
-
-    def counted(sensor, field, grid, *rest, **options):
-        together.append(len(grid))
-        return real(sensor, field, grid, *rest, **options)
-
-    monkeypatch.setattr(running_series, "adjusted", counted)
-    scene = Scene(11)
-    running, _, _, _ = take(scene, 60)
-    assert max(together) == 30
-    early = len(together)
-    running.epochs += 3_000_000
-    running._look_at = [k + 3_000_000 for k in running._look_at]
-    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
-    for k in range(60, 120):
-        refined(scene, calibrator, running, k)
-    assert max(together) == 30
-    assert len(together) - early <= 4 * 3
-    assert len(running._kept) == 30
 
 
 @pytest.mark.slow

@@ -1,12 +1,11 @@
 """Studies of series and cameras: results, and notes where there is no result."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.analysis.conftest import NEXUS
+from tests.analysis.conftest import INTERIOR, NEXUS
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.measured import Thermometer
 from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
@@ -15,6 +14,7 @@ from thermocald.analysis.study.series_study import (
     circle_of_confusion,
     depth_of_field,
     deviation,
+    displacement_covariance,
     image_displacement,
     study_series,
 )
@@ -166,16 +166,6 @@ def test_without_covariances_there_is_a_note_instead_of_a_monte_carlo(warm_up):
     assert "No epoch has a covariance matrix" in " ".join(camera.notes)
 
 
-@pytest.mark.slow
-def test_two_hundred_thousand_epochs_in_seconds(warm_up):
-    """A sixteenth of a year; benchmarks/study.py has a whole year."""
-    series = warm_up(epochs=200_000)(correlations=np.tile(np.eye(10), (5000, 1, 1)))
-    begin = time.process_time()  # so that other programs do not count
-    result = study([series], StudySettings())
-    assert time.process_time() - begin < 12
-    assert result.cameras[0].series[0].significance["x0"].tests == 200_000 - 30
-
-
 def test_a_shift_of_the_principal_point_moves_all_points_equally(warm_up):
     """A change of x0 alone moves every image point by D Δx0 / c, with little distortion."""
     series = warm_up(drift={"x0": 0.0194}, sds=np.full(10, 1e-12))()
@@ -252,6 +242,26 @@ def test_displacements_by_principal_point_and_principal_distance():
     first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
     moved = image_displacement(NEXUS, first, 1.002 * first, points)
     np.testing.assert_allclose(moved, 0.002 * (points - NEXUS.centre), atol=1e-9)
+
+
+def test_the_covariance_of_displacements_is_their_scatter(warm_up):
+    series = warm_up(drift={}, epochs=2)()
+    points = image_grid(NEXUS)
+    covariance = displacement_covariance(series, points)
+
+    rng = np.random.default_rng(9)
+    sds = np.nan_to_num(series.sds[0])
+    of_epoch = series.correlations[0] * np.outer(sds, sds)
+    drawn = rng.multivariate_normal(INTERIOR, of_epoch, (2000, 2))
+    moved = [image_displacement(NEXUS, first, last, points) for first, last in drawn]
+
+    found = np.einsum("nki,nkj->kij", moved, moved) / len(moved)
+    # 2000 draws give a variance to 3 %
+    scale = np.sqrt(np.einsum("kii->ki", covariance))
+    assert np.all(np.abs(found - covariance) < 0.15 * scale[:, :, None] * scale[:, None, :])
+    assert not displacement_covariance(
+        replace(series, correlations=np.empty((0, 10, 10))), points
+    ).any()
 
 
 def blur(f, f_number, focus, distance):

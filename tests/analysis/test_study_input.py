@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from thermocald.analysis.study.measured import measured_series
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.presets import preset_simulation
@@ -42,20 +41,6 @@ def test_epochs_without_a_result_are_counted(recording):
     assert series.correlations.shape == (8, 10, 10)
     assert [t.name for t in series.thermometers] == ["temperature", "board_temperature"]
     assert 0.02 < series.thermometers[0].sd < 0.12
-
-
-def test_correlations_are_those_without_the_excess_scatter(recording):
-    """Its sds have no correlations: with them c and A1 would be drawn as if independent."""
-    source, table = open_recording(recording), tc.open(recording).calibrate()
-
-    def correlations(adjustment):
-        given = replace(table, adjustment=adjustment)
-        return measured_series(source, given, lambda _: None, "").correlations
-
-    excess = 100 * np.diagonal(table.adjustment.covariance, axis1=1, axis2=2).max(axis=0)
-    scattered = table.adjustment.covariance + np.diag(excess)
-    found = replace(table.adjustment, covariance=scattered, excess_sd=np.sqrt(excess))
-    np.testing.assert_allclose(correlations(found), correlations(table.adjustment), atol=1e-6)
 
 
 def test_the_thermometers_noise_may_be_given(recording):

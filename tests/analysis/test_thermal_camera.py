@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 import thermocald as tc
-from benchmarks.thermal_model import undistorting
 from thermocald.analysis.camera.undistortion import ideal_points
 from thermocald.analysis.thermal.predictions import predict_along, warm_up
 from thermocald.analysis.thermal.steady import ExtrapolationWarning
@@ -78,18 +75,6 @@ def test_covariance_against_draws():
     np.testing.assert_allclose(scatter[free] / stated[free], 1.0, atol=0.11)
 
 
-def test_at_takes_50_microseconds():
-    camera = ThermalCamera(thermal_model(*LISTED))
-    camera.at(30.0)
-    best = np.inf
-    for _ in range(20):
-        begin = time.thread_time()
-        for _ in range(50):
-            camera.at(30.0)
-        best = min(best, (time.thread_time() - begin) / 50)
-    assert best < 50e-6
-
-
 def test_undistort_is_exact():
     state = ThermalCamera(thermal_model(*LISTED)).at(33.0)
     rng = np.random.default_rng(2)
@@ -113,13 +98,6 @@ def test_a_folding_distortion_has_the_rays_of_the_camera_model():
     np.testing.assert_allclose(
         ideal_points(sensor, iop, points), r[:, :2] / -r[:, 2:], rtol=0, atol=1e-12
     )
-
-
-@pytest.mark.slow
-def test_undistorting_a_million_points():
-    """At most twice cv2.undistortPoints, which stops at a coarser answer."""
-    cv2.setNumThreads(1)
-    assert undistorting(ThermalCamera(thermal_model()).at(30.0)) <= 2
 
 
 def test_outside_the_validity_it_warns_or_refuses():

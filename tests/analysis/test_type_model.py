@@ -69,14 +69,6 @@ def test_the_type_improves_a_camera_measured_at_few_temperatures():
     assert found.validity == new.validity
 
 
-@pytest.mark.slow
-def test_intervals_hold_over_a_thousand_fleets():
-    """The new camera's sds equal its type's scatter, the most difficult case."""
-    rng = np.random.default_rng(5)
-    pulls = [pull(*of_its_type(rng)[1:]) for _ in range(1000)]
-    assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.01)
-
-
 def test_models_of_different_kinds_are_refused():
     _, fleet = cameras(np.random.default_rng(9), 4, 0.1)
     kind = type_model(fleet, "rpi")

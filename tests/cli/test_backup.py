@@ -43,6 +43,14 @@ def test_a_backup_is_made_beside_a_writer_verified_and_old_ones_go(store_path, t
         assert restored._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
+def test_a_folder_is_made_for_the_store_of_a_configuration(store_path, tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text(f"thermometers: [{{name: t, driver: mock}}]\nstore: {{path: {store_path}}}\n")
+    done = call("backup", "--config", config, f"{tmp_path}/backups/", "--keep", "2")
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "backups").glob("s-*Z.db"))) == 1
+
+
 def test_a_damaged_store_is_not_backed_up_and_check_names_the_place(store_path, tmp_path):
     database = sqlite3.connect(store_path)
     database.execute("DROP TRIGGER epoch_update")

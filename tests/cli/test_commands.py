@@ -22,9 +22,9 @@ from thermocald.store.database.store import Store
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Forty epochs of a warming camera."""
+    """Twenty-four epochs of a warming camera."""
     folder = tmp_path_factory.mktemp("recording") / "M1"
-    tc.simulate("rpi-v2.1-heating", seed=1, epochs=40, out=folder)
+    tc.simulate("rpi-v2.1-heating", seed=1, epochs=24, out=folder)
     return folder
 
 
@@ -36,8 +36,8 @@ def test_a_store_gives_what_is_stored(recording, tmp_path):
     direct = run("export", recording, "--format", "csv")
     assert from_store.returncode == direct.returncode == 0
     a, b = (list(csv.DictReader(io.StringIO(d.stdout))) for d in (from_store, direct))
-    assert len(a) == len(b) == 40
-    assert [r["status"] for r in a] == [r["status"] for r in b] == ["ok"] * 40
+    assert len(a) == len(b) == 24
+    assert [r["status"] for r in a] == [r["status"] for r in b] == ["ok"] * 24
     with Store.open(store) as opened:
         kept = opened.series_columns(opened.find_series(), ["c", "sd_c", "Z0", "sigma0"])
     for name, column in kept.items():
@@ -54,15 +54,15 @@ def test_an_interrupted_replay_goes_on(recording, tmp_path):
     half.mkdir()
     for name in ("recording.yaml", "testfield.csv"):
         (half / name).write_bytes((recording / name).read_bytes())
-    (half / "epochs.csv").write_text("\n".join(whole[:21]) + "\n")
-    last = whole[20].split(",")[0]
+    (half / "epochs.csv").write_text("\n".join(whole[:13]) + "\n")
+    last = whole[12].split(",")[0]
     lines = (recording / "observations.csv").read_text().splitlines()
     kept = [lines[0]] + [line for line in lines[1:] if int(line.split(",")[0]) <= int(last)]
     (half / "observations.csv").write_text("\n".join(kept) + "\n")
     finish("replay", half, "--store", store)
-    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 20
+    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 12
     finish("replay", recording, "--store", store)
-    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 40
+    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 24
 
 
 @pytest.mark.parametrize("path", ["/proc/self/status", "/proc/1", "/sys", "/dev/null"])
@@ -222,21 +222,3 @@ def test_what_only_some_commands_need_is_imported_by_those():
         "print(*sorted(set(heavy) & set(sys.modules)))"
     )
     assert heavy == []
-
-
-def test_the_daemon_s_imports_stay_small():
-    """What the daemon needs, imported and waiting: 80 MB where numpy and cv2 alone are 41.
-
-    The kernel maps more or less of the libraries' files, 41 to 65 MB for the same two: what is ours
-    is the difference.
-    """
-    resident = (
-        "print([l for l in open('/proc/self/status') if l.startswith('VmRSS')][0].split()[1])"
-    )
-    libraries, ours = printed_by(
-        f"import numpy, cv2\n{resident}\n"
-        "import thermocald.acquisition.calibrator, thermocald.config, thermocald.hal\n"
-        "import thermocald.store.database.store, thermocald.acquisition.pipeline\n"
-        f"{resident}"
-    )
-    assert (int(ours) - int(libraries)) / 1024 < 80 - 41

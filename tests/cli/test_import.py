@@ -256,10 +256,7 @@ def test_a_copy_of_a_photograph_is_left_out(place):
 @pytest.mark.parametrize(
     ("taken", "words"),
     [
-        (
-            ["2000:01:01 00:00:05"],
-            "1.jpg: was taken at 2026-06-14T10:00:10.250Z, years",
-        ),
+        (["2000:01:01 00:00:05"], "1.jpg: was taken at 2026-06-14T10:00:10.250Z, years"),
         (["2026:06:14 12:00:00"] * 6, "0.jpg: all photographs have its time"),
     ],
 )

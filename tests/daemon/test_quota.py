@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from tests.commands import call
-from tests.daemon.conftest import make_recording
 from tests.marks import mostly_slow
 from thermocald.daemon.live_state import LiveState
 from thermocald.output.dashboard.view import View
@@ -150,37 +149,6 @@ def test_an_output_under_a_quota_goes_on_with_whole_lines_and_what_waited(daemon
     assert daemon.stop() == 0
     told = [r["epoch"] for r in daemon.results("home/two.jsonl")]
     assert told == list(range(1, len(told) + 1))
-
-
-COMMANDS = {
-    "export": ("export", "{recording}", "-o", "{out}"),
-    "export json": ("export", "{recording}", "--format", "json", "-o", "{out}"),
-    "export parquet": ("export", "{recording}", "--format", "parquet", "-o", "{out}"),
-    "replay json": ("replay", "{recording}", "--json", "{out}"),
-    "replay store": ("replay", "{recording}", "--store", "{out}.db"),
-    "simulate": ("simulate", "--preset", "rpi-v2.1-heating", "--out", "{out}"),
-    "testfield": ("testfield", "import", "--chessboard", "9x6", "--square", "30", "--out", "{out}"),
-}
-
-
-@pytest.fixture(scope="module")
-def few(tmp_path_factory):
-    """Ten epochs, of which each table has more than 200 bytes."""
-    return make_recording(tmp_path_factory.mktemp("few") / "small", 10)
-
-
-@pytest.mark.parametrize("case", COMMANDS)
-def test_a_command_under_a_quota_says_so_and_leaves_nothing_half(
-    case, quota, few, tmp_path, preloaded
-):
-    quota.fill(200)
-    command = [part.format(recording=few, out=quota.folder / "out") for part in COMMANDS[case]]
-    done = preloaded.start(tmp_path, *command, **quota.environment)
-    said = done.said()
-    assert done.returncode == 3
-    assert "error: " in said
-    assert "Traceback" not in said
-    assert not [path for path in quota.folder.rglob("*") if path.is_file()]
 
 
 @in_each(argvalues=["quota"])

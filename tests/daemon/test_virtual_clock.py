@@ -19,7 +19,7 @@ from thermocald.store.database.store import Store
 def run(tmp_path, small_camera, small_field):
     """A count, faults of camera and thermometer → the stored columns of that many epochs."""
 
-    def ran(epochs, camera=(), thermometer=()):
+    def ran(epochs, camera=(), thermometer=(), statuses=None):
         document = demo_config(tmp_path, 1).model_dump(mode="json", by_alias=True)
         document["cameras"][0]["options"] |= {
             "testfield": str(small_field), "model": str(small_camera), "faults": list(camera)
@@ -31,7 +31,8 @@ def run(tmp_path, small_camera, small_field):
         store = Store.open(config.store.path)
         series = store.find_series()
         names = ["frame_time", "temperature_time", "temperature", "sd_c"]
-        assert store.series_columns(series, ["status"])["status"].tolist() == ["ok"] * epochs
+        found = store.series_columns(series, ["status"])["status"].tolist()
+        assert found == (statuses or ["ok"] * epochs)
         return store, series, store.series_columns(series, names)
 
     return ran
@@ -66,8 +67,11 @@ def test_what_is_away_loses_its_own_and_gives_nothing_that_was_not_taken(run):
 
 
 def test_a_camera_that_repeats_its_frame_is_reported_once(run):
-    """Its epochs would count as independent measurements, with standard deviations too small."""
-    store, _, _ = run(8, [{"kind": "stuck", "at": 3, "count": 3}])
+    """Its epochs are no independent measurements; standard deviations would be too small."""
+    statuses = [*["ok"] * 2, *["repeated_frame"] * 3, *["ok"] * 3]
+    store, series, _ = run(8, [{"kind": "stuck", "at": 3, "count": 3}], statuses=statuses)
     with store:
+        seen = [stored.epoch.observations is not None for stored in store.epochs(series)]
+        assert seen == [status == "ok" for status in statuses]
         (frozen,) = [event for event in store.events() if event.kind == "frozen"]
     assert "its last 3 frames are identical" in frozen.text

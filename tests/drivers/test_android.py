@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from thermocald_drivers.android import exif, exposure_start, focus_state
+from thermocald_drivers.android import exif, exposure_start
 from thermocald_drivers.android_phone import AdbPhone
 
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph, wait_little
@@ -363,13 +363,6 @@ def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
         assert device.read().values == {"soc": 4.5}
 
 
-def test_a_phone_without_a_battery_sensor(server, phone):
-    phone.battery = "  voltage: 0\n  temperature: 0\n"
-    device = thermometer(server)
-    with device, pytest.raises(errors.BadReading, match="no battery temperature"):
-        device.read()
-
-
 def test_two_phones_by_their_serials(server, phone):
     server.phones["SECOND"] = FakePhone(battery="  voltage: 4000\n  temperature: 301\n")
     with thermometer(server) as one, thermometer(server, serial="SECOND") as two:
@@ -423,18 +416,6 @@ def test_the_load_is_a_lease_that_is_renewed(server, phone):
 # EXIF, and that focus and exposure did not change
 
 WHEN = 1_605_956_400.0
-DUMP = """    android.control.afState (10020): byte[1]
-        [%s ]
-      android.lens.focusDistance (80007): float[1]
-        [0.25 ]
-"""
-
-
-def test_tags():
-    tags = exif(photograph(WHEN, distance=1.5))
-    assert tags["exposure_s"] == pytest.approx(1 / 60, rel=1e-4)
-    assert (tags["iso"], tags["subject_distance_m"]) == (100, 1.5)
-    assert (tags["width"], tags["height"], tags["model"]) == (96, 64, "Phone 4a")
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff\xd9", b"GIF89a"])
@@ -456,9 +437,3 @@ def test_whole_seconds_are_coarse():
     assert exposure_start(exif(photograph(WHEN, subsecond=None)), "")[1] == 1.0
     assert exposure_start({"time": "0000:00:00 00:00:00"}, "") is None
     assert exposure_start({}, "") is None
-
-
-def test_focus_out_of_the_camera_service():
-    found = {"af_state": "INACTIVE", "focus_distance_dioptres": 0.25}
-    assert focus_state(DUMP % "INACTIVE") == found
-    assert focus_state("Camera service dump\n") == {}

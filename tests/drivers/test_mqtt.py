@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import socket
 import time
 
 import pytest
@@ -68,14 +67,6 @@ def test_username_and_password_file(broker, tmp_path):
     with output(broker, username="me", password_file=str(tmp_path / "password")):
         pass
     assert broker.credentials == ("me", "swordfish")
-
-
-def test_no_broker():
-    with socket.create_server(("127.0.0.1", 0)) as unused:
-        port = unused.getsockname()[1]
-    options = {"host": "127.0.0.1", "port": port, "timeout_s": 0.5}
-    with pytest.raises(DeviceGone, match="cannot connect"):
-        open_device("output", "mqtt", options, SystemClock()).open()
 
 
 def test_a_wrong_password(broker):

@@ -25,6 +25,7 @@ WRONG = {
         ({"device": None}, "either device"), ({"serial": "x"}, "either device"),
         ({"pixel_format": "PNG"}, "'PNG' is not one of"), ({"exposure_s": "long"}, "exposure_s"),
         ({"focus": "manual"}, "neither a number nor auto"),
+        ({"exposure_s": "long", "gain": "high"}, r"\(and 1 more\)"),
     ]),
     ("camera", "picamera2"): ({}, [
         ({"colour_gains": [1.0]}, "colour_gains"), ({"colour_gains": "warm"}, "colour_gains"),

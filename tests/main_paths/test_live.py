@@ -90,8 +90,7 @@ def test_real_cameras(shared, forker, tmp_path, camera):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "epochs"),
-    [("badly_surveyed", 40), *((kind, 70) for kind in crooked.KINDS)],
+    ("kind", "epochs"), [("badly_surveyed", 40), *((kind, 70) for kind in crooked.KINDS)]
 )
 def test_crooked_fields(forker, tmp_path, kind, epochs):
     """Errors of live rows about their mean agree with their sds."""

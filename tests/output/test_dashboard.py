@@ -136,7 +136,8 @@ def test_charts_csv_status_frame_and_events(client_of):
     lines = answer.text.splitlines()
     assert len(lines) == 1201
     first = dict(zip(lines[0].split(","), lines[1].split(","), strict=True))
-    assert (first["epoch"], first["c"], first["status"]) == ("1", "1", "ok")
+    assert (first["epoch"], first["c"], first["status"]) == ("1", "1.0", "ok")
+    assert first["n_observations"].isdigit()
     assert float(first["temperature"]) == 20.01
     assert 'filename="rpi-M1.csv"' in answer.headers["content-disposition"]
 

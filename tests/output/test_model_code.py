@@ -12,11 +12,7 @@ import pytest
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.output.thermal_model import code_of, write_code
-from thermocald.photogrammetry.camera.camera_model import (
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.physics.model import ModelEffect, ThermalModel
 
 SENSOR = Sensor(3280, 2464, 0.00112)

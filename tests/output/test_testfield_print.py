@@ -15,11 +15,7 @@ from thermocald.analysis.field import usual_station
 from thermocald.errors import UsageError
 from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
 from thermocald.output.testfield.print import default_diameter, print_testfield
-from thermocald.photogrammetry.camera.camera_model import (
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.store.recording.testfield_file import read_testfield
 
@@ -275,9 +271,3 @@ def test_impossible_designs_are_refused(design, reason, tmp_path):
 def test_unknown_paper_is_refused(text):
     with pytest.raises(UsageError, match="paper"):
         paper_size(text)
-
-
-def test_unwritable_folder_is_one_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="file"):
-        print_testfield(Design((210, 297), 7.0), tmp_path / "file")

@@ -50,10 +50,7 @@ def test_the_driver_is_really_looked_at():
 
 @pytest.mark.parametrize(
     ("kind", "stand_in"),
-    [
-        ("Picamera2", picamera2_stand_in.StandIn),
-        ("CompletedRequest", picamera2_stand_in.Request),
-    ],
+    [("Picamera2", picamera2_stand_in.StandIn), ("CompletedRequest", picamera2_stand_in.Request)],
 )
 def test_the_stand_in_has_no_method_that_picamera2_lacks(kind, stand_in):
     for name, method in vars(stand_in).items():

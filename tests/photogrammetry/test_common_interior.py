@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.exact_rendering import look_at
-from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, InteriorOrientation, project
+from tests.photogrammetry.network_cases import looking_at
+from thermocald.photogrammetry.camera.camera_model import (
+    PRINCIPAL,
+    InteriorOrientation,
+    Sensor,
+    project,
+)
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.network.common_interior import adjust_common_interior
+from thermocald.photogrammetry.targets.boards import chessboard
 
+SENSOR = Sensor(1280, 720, 0.003)
 STATIONS = [
     look_at(centre, [150, 180, 160], roll)
     for centre, roll in (
@@ -80,6 +88,28 @@ def test_the_camera_is_as_accurate_as_stated_if_the_focus_moves_between_photogra
         assert r.disagreement > 1.5
         assert r.sigma0 < 1.5
     assert np.sqrt(np.mean(np.square(z), axis=0)) == pytest.approx(np.ones(3), abs=0.6)
+
+
+def test_large_residuals_do_not_make_the_steps_overshoot():
+    """A board that bends by millimetres: whole steps went to and fro for 60 iterations."""
+    rng = np.random.default_rng(1)
+    board = chessboard(9, 6, 25.0)
+    middle = board.points.mean(axis=0)
+    u, v, _ = (board.points - middle).T / 225
+    stations, measured = [], []
+    for _ in range(4):
+        a, b, c = rng.normal(0, 20, 3)
+        bent = board.points + np.outer(a * u * u + b * v * v + c * u * v, [0, 0, 1])
+        tilt, azimuth = rng.uniform(0.1, 0.7), rng.uniform(0, 6.28)
+        across = np.sin(tilt) * np.array([np.cos(azimuth), np.sin(azimuth)])
+        centre = middle + 420 * np.array([*across, np.cos(tilt)])
+        stations.append(looking_at(centre, middle, rng.uniform(-1, 1)))
+        points = project(SENSOR, np.array([2.8, *[0] * 9]), stations[-1].as_array(), bent)
+        seen = np.flatnonzero(SENSOR.contains(points))
+        points = points[seen] + rng.normal(0, 0.1, (len(seen), 2))
+        measured.append(Observations(seen, points, np.full(points.shape, 0.1)))
+    r = adjust_common_interior(SENSOR, board, measured, InteriorOrientation(2.8), stations)
+    assert r.sigma0 > 3
 
 
 def test_gross_errors_are_rejected():

@@ -13,11 +13,7 @@ from tests.photogrammetry.fields import SMALL_CAMERA, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets.corner import measure_corners
-from thermocald.photogrammetry.targets.markers import (
-    locate_markers,
-    marker_rows,
-    parse_marker,
-)
+from thermocald.photogrammetry.targets.markers import locate_markers, marker_rows, parse_marker
 
 
 def measure_markers(image, field, missed=None):

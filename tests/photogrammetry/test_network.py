@@ -195,10 +195,36 @@ def test_sigmas_twice_too_small_show_in_sigma0_and_twenty_times_are_refused():
     assert _adjust(photos).sigma0 == pytest.approx(2.0, rel=0.1)
 
 
+def test_coordinates_are_as_accurate_as_stated_if_the_focus_moves_between_photographs():
+    """As if image points were independent, the errors are 2.3 standard deviations."""
+    field = cases.bent_sheet(6, 5)
+    stations = cases.convergent_stations(field, 8)
+    squares = []
+    for seed in range(4):
+        rng = np.random.default_rng([2, seed])
+        photos = {}
+        for i, station in enumerate(stations):
+            c = cases.INTERIOR.c * (1 + rng.normal(0, 2e-3))
+            camera = CameraModel(cases.SENSOR, cases.INTERIOR.with_values(c=c))
+            one = cases.photographs(field, [station], 0.05, rng, camera, loss=0.0)[0]
+            photos[f"photo{i}"] = one["photo0"]
+        network = adjust_network(
+            cases.SENSOR, photos, [f"t{i}" for i in range(30)],
+            [Distance("t0", "t29", float(np.linalg.norm(field[29] - field[0])), 0.05)],
+            interior=cases.INTERIOR, nominal=field,
+        )  # fmt: skip
+        assert network.disagreement > 1.5
+        assert any("photographs disagree" in note for note in advice(network))
+        rows = [int(name[1:]) for name in network.names]
+        squares.append(np.mean(cases.normalised_errors(network, field[rows])[1] ** 2))
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.4)
+
+
 def test_advice_names_the_missing_roll():
     flat = cases.convergent_stations(_BENT, 8, rolled=False)
     network, _, _ = _survey(_BENT, flat, 0.05, 0)
     assert any("turned about its axis" in note for note in advice(network))
+    assert network.disagreement == 1
     rolled, _, _ = _survey(_BENT, cases.convergent_stations(_BENT, 8), 0.05, 0)
     assert not any("turned about its axis" in note for note in advice(rolled))
     sd = [float(np.sqrt(n.interior_covariance[1, 1])) for n in (network, rolled)]

@@ -8,9 +8,11 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
+from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.covariances import with_excess
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 OWN = np.arange(8)
@@ -62,6 +64,23 @@ def test_target_offsets_halve_the_scatter():
         error = (r.values - truth)[:, 1]
         ratio[offsets] = error.std()
     assert ratio[True] < 0.5 * ratio[False]
+
+
+def test_excess_scatter_has_the_correlations_of_the_noise():
+    """Added to the variances alone, c and A1 were drawn as if independent."""
+    rng = np.random.default_rng(37)
+    roots = rng.normal(size=(5, 4, 4))
+    noise = roots @ np.swapaxes(roots, 1, 2)
+    noise[2] = 0.0  # an epoch without a result
+    excess = np.array([0.0, 1.0, 10.0, 100.0])
+
+    wide = with_excess(noise, excess)
+
+    good = [0, 1, 3, 4]
+    variances = np.diagonal(wide, axis1=1, axis2=2)
+    np.testing.assert_allclose(variances[good], np.diagonal(noise, axis1=1, axis2=2)[good] + excess)
+    np.testing.assert_allclose(correlations_of(wide[good]), correlations_of(noise[good]))
+    assert not wide[2].any()
 
 
 def test_an_epoch_that_moved_is_found():
@@ -234,6 +253,18 @@ def test_the_perspective_sd_is_that_of_a_single_epoch():
     assert (alike.perspective_sd[:3] > 5 * np.median(alike.sd[:, :3], axis=0)).any()
 
 
+def test_repeated_epochs_count_once():
+    """Each three times, they would be 90 independent epochs."""
+    field, _, observations = series(np.random.default_rng(38), epochs=30)
+    once = scene.adjusted_series(field, observations, exterior="series")
+    thrice = scene.adjusted_series(
+        field, [o for o in observations for _ in range(3)], exterior="series"
+    )
+    assert list(thrice.status) == ["ok", "no_observations", "no_observations"] * 30
+    np.testing.assert_allclose(thrice.sd[::3], once.sd, rtol=0.01)
+    assert (np.abs(thrice.values[::3] - once.values) < 0.1 * once.sd)[:, OWN].all()
+
+
 @pytest.mark.parametrize(("held", "moved"), [("C1", 2), ("C2", 1)])
 def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
     """The camera has an affinity of 1e-4 that is held at 0; there is no other error."""
@@ -241,8 +272,8 @@ def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
     values = replace(scene.INTERIOR, **{held: 1e-4}).as_array()
     seen = project(scene.SENSOR, values, scene.EXTERIOR.as_array(), field.points)
     observations = [
-        Observations(np.arange(len(seen)), seen, np.full(seen.shape, scene.SIGMA_PX))
-        for _ in range(12)
+        Observations(np.arange(len(seen)), seen + 1e-6 * k, np.full(seen.shape, scene.SIGMA_PX))
+        for k in range(12)
     ]
     plain = {"target_noise": False, "snooping_alpha": 0.0}
     r = scene.adjusted_series(field, observations, **plain)
@@ -269,11 +300,12 @@ def test_without_a_free_parameter_only_the_pose_is_estimated(exterior):
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
 def test_repeated_frames_have_positive_variances(exterior):
-    """A camera repeats its last frame, so the errors of whole markers seem to correlate."""
+    """A camera almost repeats its frame, so the errors of whole markers seem to correlate."""
     plain, _, observations = series(np.random.default_rng(4), 45, coordinate_error=0.02, hidden=0.0)
     names = [f"{i // 4}.{i % 4}" for i in range(len(plain))]
     field = TestField.build(names, plain.points, 0.02, kinds="marker_corner")
-    frames = [*observations, *(observations[-1:] * 90)]
+    last = observations[-1]
+    frames = [*observations, *(replace(last, points=last.points + 1e-6 * k) for k in range(90))]
     r = scene.adjusted_series(field, frames, exterior=exterior)
     assert r.pairs is not None
     own = list(OWN)

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.blind.outcome import Outcome
 from tests.real_corners import generator
 from tests.real_corners.generator import SHARED, RealCase
-from tests.real_corners.score import input_of, judge, missed
+from tests.real_corners.score import input_of, judge
 from thermocald.discovery.result import discover_series
 from thermocald.thermal.reduce import reduce_together
 
@@ -67,13 +66,3 @@ def test_a_moving_mount_does_not_hide_that_recordings_contradict_each_other():
 
     assert found.verdict == "unexplained"
     assert "recordings contradict each other" in found.effects[0].statement
-
-
-def test_a_missed_goal_is_reported():
-    case = RealCase("aviary-cam0", ("creep",), 500)
-    good = Outcome(case, ("creep",), "effects_found", (), True, True, {}, 0.95, 1.0)
-    bad = Outcome(case, ("slip",), "effects_found", (), False, False, {}, None, 1.0)
-
-    assert missed("nine", [good] * 19 + [bad]) == []
-    assert "80% named" in missed("nine", [good] * 4 + [bad])[0]
-    assert "100%" in missed("none", [good] * 99 + [bad])[0]

@@ -20,9 +20,7 @@ def test_one_body_pulse_of_power():
     T = network.solve(TIMES, 22.0, {"a": lamp}, AIR)["a"]
     peak = 10 * (1 - np.exp(-511.11 / 300))
     expected = np.where(
-        TIMES <= 511.11,
-        10 * (1 - np.exp(-TIMES / 300)),
-        peak * np.exp(-(TIMES - 511.11) / 300),
+        TIMES <= 511.11, 10 * (1 - np.exp(-TIMES / 300)), peak * np.exp(-(TIMES - 511.11) / 300)
     )
     np.testing.assert_allclose(T, 22 + expected, rtol=0, atol=1e-9)
 

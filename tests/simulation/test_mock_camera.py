@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, load_driver
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.targets.corner import measure_corners
@@ -57,44 +56,3 @@ def test_own_model_and_field(tmp_path, camera):
                     programme=[[0, 25.0]], testfield="plain") as device:  # fmt: skip
         before, after = device.truth(clock.monotonic() + 99), device.truth(clock.monotonic() + 101)
     assert after.iop[0, 1] - before.iop[0, 1] == pytest.approx(0.00112)
-
-
-def test_faults(camera):
-    camera.inject("timeout")
-    with pytest.raises(DeviceTimeout):
-        camera.capture()
-    camera.clear()
-    for kind in ("truncated", "wrong_size"):
-        camera.inject(kind)
-        with pytest.raises(BadReading):
-            camera.capture()
-        camera.clear()
-    camera.inject("unplugged", 2)
-    with pytest.raises(DeviceGone):
-        camera.capture()
-    with pytest.raises(DeviceGone):
-        camera.open()
-    camera.clear()
-    camera.open()
-    a = camera.capture()
-    camera.inject("stuck")
-    b = camera.capture()
-    assert np.array_equal(a.image, b.image)
-    assert b.monotonic > a.monotonic
-    camera.close()
-    with pytest.raises(DeviceGone):
-        camera.capture()
-
-
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
-        ({"programme": "hot"}, r"must be a list"),
-        ({"exposure_s": -1}, "exposure_s"),
-        ({"faults": [{"kind": "bored"}]}, "input should be 'timeout'"),
-    ],
-)
-def test_bad_options(options, reason):
-    with pytest.raises(ConfigurationError, match=reason):
-        MockCamera(clock=VirtualClock(), **options)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import thermocald as tc
+from thermocald.epoch import Epoch
 from thermocald.store.database.archive import archive_series, archive_store
 from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.series import clock_corrections
 
 
@@ -55,29 +58,12 @@ def test_a_clock_that_was_set_back_is_mended(filled, tmp_path, make_epoch):
     assert ahead == pytest.approx(0.75)
 
 
-def test_several_steps_and_a_glitch_are_corrected():
-    """Regression: the clock was 120 days ahead for some epochs, and the right ones were moved."""
-    times = np.array([100.0, 110, 50, 60, 0, 10])
-    corrected = times + clock_corrections(times, 10.0)
-    assert corrected.tolist() == [-40, -30, -20, -10, 0, 10]
+def test_a_camera_that_was_off_is_no_clock_that_was_set():
+    """Clocks that were set are in test_times."""
+    times = 1.75e9 + np.arange(20) * 10.0
+    times[9:] += 1.0e7
+    assert not clock_corrections(times, 10.0, np.ones(20), []).any()
     assert not clock_corrections(np.array([0.0, 10, 500]), 10.0).any()
-    right = np.arange(20) * 10.0
-    stamped = right.copy()
-    stamped[5:9] += 120 * 86400.0
-    assert (stamped + clock_corrections(stamped, 10.0)).tolist() == right.tolist()
-
-
-def test_what_was_taken_before_the_time_was_learned_moves_by_that_step():
-    right = 1.75e9 + np.arange(20) * 10.0
-    stamped, trusted = right.copy(), np.ones(20)
-    stamped[4:9] -= 1.0e7  # restarted with the time of the last shutdown, then set by NTP
-    trusted[4:9] = 0
-    corrected = stamped + clock_corrections(stamped, 10.0, trusted, [1.0e7])
-    assert corrected == pytest.approx(right)
-    # a camera that was off for as long is no clock step
-    off = right.copy()
-    off[9:] += 1.0e7
-    assert not clock_corrections(off, 10.0, trusted, []).any()
 
 
 def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):
@@ -92,3 +78,18 @@ def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):
         )
     assert found["recordings"] == []  # all exist already
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a--b-c", "a-b", "a-b--c"]
+
+
+@pytest.mark.parametrize(("place", "named"), [("", "M1/frames/000001.png"), ("away", None)])
+def test_a_replay_names_frames_in_the_folder_of_its_store_only(tmp_path, field, head, place, named):
+    """Regression: a store that named frames elsewhere could not be read."""
+    (tmp_path / "away").mkdir()
+    (tmp_path / "0.png").write_bytes(b"no image")
+    readings = dict.fromkeys(head.channels, 20.0)
+    epoch = Epoch(1, 0.0, 0.0, readings, frame=tmp_path / "0.png")
+    write_recording(tmp_path / "M1", head, field, [epoch])
+    path = tmp_path / place / "t.db"
+    assert tc.open(tmp_path / "M1").calibrate(store=path).status == ("bad_frame",)
+    with Store.open(path) as store:
+        (stored,) = store.epochs(store.find_series())
+    assert stored.epoch.frame == (named and Path(named))

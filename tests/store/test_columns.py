@@ -74,18 +74,6 @@ def test_any_length(store, series, size):
     assert read(store, series) == expected(numbers)
 
 
-def test_after_opening_again_chunks_go_on(store_path, head, field):
-    with Store.open(store_path, "append", durable=False) as store:
-        store.create_series(head, field)
-    for i in range(2 * CHUNK + 3):
-        with Store.open(store_path, "append", durable=False) as store:
-            series = store.find_series()
-            store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-    with Store.open(store_path) as store:
-        assert chunks(store) == 2
-        assert read(store, series) == expected(range(2 * CHUNK + 3))
-
-
 def test_later_calibrations_in_chunk_and_tail(store, series):
     for i in range(CHUNK + 5):
         store.append(series, epoch(i), None, extra={"blur": 0.5 * i})
@@ -140,22 +128,6 @@ def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
         assert read(store, series) == expected(range(4 * CHUNK))
 
 
-def late(store: Store, series) -> int:
-    return len(columns.SeriesColumns(store._db, series.id)._late_rows(0))
-
-
-def test_only_calibrations_after_their_chunk_are_looked_up(store, series):
-    """A daemon that is a little late must not make every later reading slow."""
-    for i in range(3 * CHUNK):
-        store.append(series, epoch(i), None, extra={"blur": 0.5 * i})
-        if i >= 3:
-            store.amend(series, i - 3, result(i - 3))
-    for i in range(3 * CHUNK - 3, 3 * CHUNK):
-        store.amend(series, i, result(i))
-    assert read(store, series) == expected(range(3 * CHUNK))
-    assert late(store, series) == 3 * 4  # of each chunk: three that waited and the current one
-
-
 def test_a_merged_chunk_holds_what_came_late(store, series):
     for i in range(MERGED * CHUNK):
         store.append(series, epoch(i), None if i == 5 else result(i), extra={"blur": 0.5 * i})
@@ -163,9 +135,7 @@ def test_a_merged_chunk_holds_what_came_late(store, series):
             store.amend(series, 5, result(3), extra={"contrast": 1.0})
             store.amend(series, 5, result(5), extra={"contrast": 2.0})
     assert chunks(store) == 1
-    assert late(store, series) == 0
     assert read(store, series) == expected(range(MERGED * CHUNK))
     assert store.series_columns(series, ["contrast"])["contrast"][[4, 5]].tolist()[1] == 2.0
     store.amend(series, 6, result(6))
-    assert late(store, series) == 1
     assert read(store, series) == expected(range(MERGED * CHUNK))

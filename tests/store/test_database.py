@@ -78,17 +78,6 @@ def test_covariances_by_number(filled, make_result):
     assert np.isnan(covariances[2]).all()
 
 
-def test_resume_where_it_stopped(filled, store_path, head, field):
-    store, series = filled
-    assert store.last_epoch(series) == 20
-    other = store.create_series(replace(head, series="M2"), field)
-    assert store.last_epoch(other) is None
-    store.close()
-    store.close()
-    with Store.open(store_path, "append") as again:
-        assert again.last_epoch(again.find_series("rpi", "M1")) == 20
-
-
 @pytest.mark.parametrize("number", [20, 5])
 def test_numbers_must_increase(filled, make_epoch, number):
     store, series = filled

@@ -10,7 +10,7 @@ import pytest
 
 from thermocald.errors import DataError, UsageError
 from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment, time_zone
-from thermocald.store.logger.dialect import stated_unit, without_unit
+from thermocald.store.logger.dialect import stated_unit
 from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
 from thermocald.store.recording.readings import interpolate_readings
@@ -236,11 +236,6 @@ def test_what_is_not_certain_is_refused_with_the_remedy(tmp_path, data, options,
         logged(tmp_path, data, **options)
 
 
-def test_blank_lines_after_the_rows_change_nothing(tmp_path):
-    long = PLAIN + "\n" * 900
-    assert logged(tmp_path, long).channels["temperature"].tolist() == [21.5, 21.75]
-
-
 def test_no_photographs_are_an_error():
     with pytest.raises(DataError, match="no photographs are given"):
         find_photographs([])
@@ -365,15 +360,6 @@ def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_
 )  # fmt: skip
 def test_one_pattern_reads_the_unit_of_a_head(head, unit):
     assert stated_unit(head) == unit
-
-
-@pytest.mark.parametrize(
-    ("head", "label"),
-    [("Temp (°F)", "Temp"), ("housing_f", "housing"), ("Celsius(C)", ""), ("T [K]", "T"),
-     ("TempF", "Temp"), ("温度(℃)", "温度"), ("Temp Fan", "Temp Fan")],
-)  # fmt: skip
-def test_what_is_converted_to_celsius_keeps_no_other_unit_in_its_name(head, label):
-    assert without_unit(head) == label
 
 
 TWO = """"Plot Title: x"

@@ -68,13 +68,6 @@ def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
         assert same(a.observations, b.observations)
 
 
-def test_epochs_without_observations_are_empty_not_missing(tmp_path, field, head, make_epoch):
-    epochs = [make_epoch(1), make_epoch(2, targets=0), make_epoch(3)]
-    write_recording(tmp_path / "r", head, field, epochs)
-    read = read_recording(tmp_path / "r").epochs
-    assert [len(epoch.observations) for epoch in read] == [12, 0, 12]
-
-
 def test_rows_in_any_order(recording_path):
     file = recording_path / "observations.csv"
     expected = read_recording(recording_path).epochs
@@ -159,15 +152,6 @@ def test_testfield_keeps_kinds_and_codes(tmp_path):
     assert (read.names, read.kinds, read.codes) == (field.names, field.kinds, field.codes)
     assert np.array_equal(read.points, field.points)
     assert np.array_equal(read.sigmas, field.sigmas)
-
-
-def test_extra_columns_are_kept_and_ignored(recording_path):
-    for name, column in (("epochs.csv", "weather"), ("testfield.csv", "remark")):
-        file = recording_path / name
-        header, *rows = file.read_text().splitlines()
-        file.write_text("\n".join([f"{header},{column}", *(f"{row},fine" for row in rows)]) + "\n")
-    recording = read_recording(recording_path)
-    assert recording.columns.extra == {"weather": ("fine",) * 5}
 
 
 def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):

@@ -21,6 +21,7 @@ EPOCHS = 40
 CLOCKS = {
     "a glitch of 120 days": ({(10, 14): 120 * 86400.0}, None),
     "a step back by an hour": ({(1, 20): 3600.0}, None),
+    "two steps back": ({(1, 10): 7200.0, (11, 20): 3600.0}, None),
     "NTP after a start without a clock": ({(1, 15): -2.0e7}, 2.0e7),
     "both": ({(1, 8): -2.0e7, (20, 22): 7200.0}, 2.0e7),
 }

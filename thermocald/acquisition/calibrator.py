@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol, Self
+from zlib import crc32
 
 import numpy as np
 
@@ -41,6 +42,11 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _WRONG_START = 5.0  # times the last sigma0; more: the camera has been knocked
+
+
+def fingerprint(frame: bytes | NDArray[Any]) -> int:
+    """Return a number that differs between any two frames, encoded or as values, by their noise."""
+    return crc32(frame if isinstance(frame, bytes) else frame.tobytes())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,8 +101,7 @@ class Calibrator:
         self._interior = interior
         self._floor = sigma_floor_px
         self._tracker = Tracker(testfield, CameraSpec("", sensor, nominal_c, interior))
-        self._last: Adjustment | None = None
-        self._usual = float("nan")
+        self.reset()
 
     @classmethod
     def of_recording(cls, recording: Any, settings: AdjustmentSettings | None = None) -> Self:
@@ -112,8 +117,9 @@ class Calibrator:
 
     def reset(self) -> None:
         """Forget where the camera was."""
-        self._last = None
+        self._last: Adjustment | None = None
         self._usual = float("nan")
+        self._seen: tuple[int | None, int] = None, 0  # fingerprint and number of the last epoch
         self._tracker.reset()
 
     def calibrate(
@@ -122,7 +128,8 @@ class Calibrator:
         """Measure the epoch's frame unless it has observations already, and adjust.
 
         image: the frame as grey values or encoded; by default the file that the epoch names. Never
-        raises for bad data: an epoch without a result has a status and a reason.
+        raises for bad data: an epoch without a result has a status and a reason. The same frame
+        again, or the same image points, is no new observation: the status is `repeated_frame`.
         """
         extra: dict[str, float] = {}
         searched = ""
@@ -135,6 +142,9 @@ class Calibrator:
                 if image is None:
                     assert epoch.frame is not None
                     image = EncodedImage(epoch.frame)
+                seen = fingerprint(image.data if isinstance(image, EncodedImage) else image)
+                if seen == self._seen[0]:
+                    return self._repeated(epoch)
                 measured = self._tracker.measure(image)
             except ImageError as error:
                 return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
@@ -145,7 +155,19 @@ class Calibrator:
             if not measured.status.ok:
                 bad = failed(measured.status.word, measured.status.reason, observations)
                 return CalibratedEpoch(epoch, bad, extra, searched)
+        else:
+            seen = crc32(observations.targets.tobytes() + observations.points.tobytes())
+            if seen == self._seen[0]:
+                return self._repeated(epoch)
+        if len(observations):
+            self._seen = seen, epoch.number
         return CalibratedEpoch(epoch, self.adjust(observations), extra, searched)
+
+    def _repeated(self, epoch: Epoch) -> CalibratedEpoch:
+        """Return the epoch of a repeated frame, without its observations: they count once."""
+        why = f"it repeats the frame of epoch {self._seen[1]}, and is no new observation"
+        bad = failed("repeated_frame", why)
+        return CalibratedEpoch(replace(epoch, observations=None), bad, {})
 
     def weighed(self, observations: Observations) -> Observations:
         """Return the observations with the sigmas used in the adjustment."""

@@ -151,7 +151,7 @@ def archive(
 
 
 def backup(
-    store: StoreArgument = None,
+    store: str | None = typer.Argument(None, help="The store; a daemon may be using it."),
     to: str | None = typer.Argument(
         None, metavar="[TO]", help="A file that does not exist yet, or a folder: FOLDER/ is made."
     ),
@@ -171,13 +171,12 @@ def backup(
     from thermocald.store.database.archive import back_up
 
     if config is not None:
-        to = to or (None if store is None else str(store))
-        store = load_config(config).store.path
+        to, store = to or store, str(load_config(config).store.path)
     if store is None or to is None:
         raise UsageError("give STORE and TO, or --config FILE and TO")
     if to.endswith("/"):
         make_folder(Path(to))
-    document = back_up(store, Path(to), keep)
+    document = back_up(Path(store), Path(to), keep)
     say(f"{document['backup']}: {document['epochs']} epochs, every row verified")
     for path in document["deleted"]:
         say(f"{path}: deleted; {keep} newer backups are left")

@@ -129,6 +129,7 @@ def export(
     Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
     """
     from thermocald.output import series_export
+    from thermocald.result import csv_text
     from thermocald.store.recording.parquet_table import write_parquet
 
     folder = source.is_dir()
@@ -153,7 +154,7 @@ def export(
     elif format_ == "json":
         write_parts(series_export.as_json(parts), output)
     else:
-        write_parts(series_export.as_csv(parts, style), output)
+        write_parts(csv_text(parts, style.separator, style.decimal), output)
     for sentence, count in sorted(table.without_result.items()):
         say(f"{count} epochs without a result: {sentence}")
 

@@ -14,14 +14,12 @@ import threading
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
-from zlib import crc32
 
-from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
+from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator, fingerprint
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import running_series
-from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.store.series import Event
@@ -101,7 +99,6 @@ _PREVIEW_EVERY_S = 5.0
 _SHOW_EVERY_S = 0.5
 _SWITCH_GRACE_S = 20.0
 _VIRTUAL_PATIENCE_S = 60.0  # real seconds that a tick of a virtual clock waits for room
-_SAMPLED_ROWS = 16  # every 16th row of an image tells two frames apart
 _FROZEN = 2  # repeats from which a camera counts as frozen
 _REMEMBERED = 200  # epochs, as many as a `RunningSeries` holds
 
@@ -320,11 +317,7 @@ class CameraLine:
 
     def check(self) -> None:
         """Check the next frame without storing it; `checked` then holds the result."""
-        if not isinstance(self.plan.calibrator, Calibrator):
-            raise ConfigurationError(
-                f"camera {self.plan.name!r}: the check needs its `testfield`; set it, or give "
-                "--no-check"
-            )
+        self.plan.calibrator_of_check()
         self.checked = None
         self._replace(None, checking=True)
 
@@ -349,8 +342,7 @@ class CameraLine:
         if runtime.fast:
             self.thermometers.read_now(self.plan.config.thermometers)
         if self._checking:
-            assert self.plan.calibrator is not None
-            found = check_frame(self.plan.name, self.plan.calibrator, frame)
+            found = check_frame(self.plan.name, self.plan.calibrator_of_check(), frame)
             if self._checking:
                 self._checking, self.checked = False, found
             return
@@ -364,8 +356,8 @@ class CameraLine:
 
     def _count_repeats(self, frame: Frame) -> None:
         """Count frames that are identical to the one before, as noise makes impossible."""
-        data = frame.encoded if frame.image is None else frame.image[::_SAMPLED_ROWS].tobytes()
-        sample = None if data is None else crc32(data)
+        data = frame.encoded if frame.image is None else frame.image
+        sample = None if data is None else fingerprint(data)
         repeated = sample is not None and sample == self._sample
         self._sample, self._repeats = sample, self._repeats + 1 if repeated else 0
         if self._repeats == _FROZEN:

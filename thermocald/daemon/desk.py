@@ -114,14 +114,12 @@ def _stored(config: Config, session: Session) -> int:
     if not config.store.path.exists():
         return 0
     with Store.open(config.store.path) as store:
-        wanted = (session.camera, session.series)
-        found = next((s for s in store.all_series() if (s.camera, s.name) == wanted), None)
+        found = store.series_of(session.camera, session.series)
         return 0 if found is None else store.last_epoch(found) or 0
 
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
-    from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.pipeline import check_frame
     from thermocald.daemon.plan import plan_cameras
     from thermocald.hal import SystemClock, open_device
@@ -132,13 +130,10 @@ def _check(config: Config, say: Callable[[str], None]) -> None:
             values = thermometer.read().values
         say(f"{one.name}: " + ", ".join(f"{k} {v:.2f} °C" for k, v in values.items()))
     plan = plan_cameras(config, clock)[0]
-    if not isinstance(plan.calibrator, Calibrator):
-        raise ConfigurationError(
-            f"camera {plan.name!r}: the check needs its `testfield`; set it, or give --no-check"
-        )
+    calibrator = plan.calibrator_of_check()
     with plan.camera as camera:
         frame = camera.capture()
-    found, why = check_frame(plan.name, plan.calibrator, frame)
+    found, why = check_frame(plan.name, calibrator, frame)
     for sentence in found:
         say(sentence)
     if why:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.daemon.plan import check_series, series_head
 from thermocald.daemon.store_guard import Row
 from thermocald.errors import ImageError, StoreError
-from thermocald.names import WITH_VALUES
+from thermocald.names import UNEVENTFUL
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event, StoredSeries
 
@@ -130,7 +130,7 @@ class EpochKeeper:
         epoch = acquired.epoch if calibrated is None else calibrated.epoch
         deferred = calibrated is None and self.plan.calibrator is not None
         eventful = calibrated is not None and (
-            calibrated.adjustment.status not in WITH_VALUES or "event" in calibrated.extra
+            calibrated.adjustment.status not in UNEVENTFUL or "event" in calibrated.extra
         )
         result = None
         extra = {
@@ -172,7 +172,7 @@ class EpochKeeper:
             log.log(level, "the calibration of epoch %d waits: %s", epoch.number, error)
             self._searched_to = min(self._searched_to, epoch.number - 1)
             return
-        failed = calibrated.adjustment.status not in WITH_VALUES
+        failed = calibrated.adjustment.status not in UNEVENTFUL
         frame = next((s.epoch.frame for s in self._read(epoch.number, epoch.number)), None)
         if frame is not None and not self._frames.wanted(epoch.number, failed):
             self._frames.delete(frame)

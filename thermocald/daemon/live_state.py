@@ -15,9 +15,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from thermocald.addresses import without_secrets
+from thermocald.arrays import eight_bit
 from thermocald.errors import DataError
 from thermocald.files import overwrite_json, read_json
 from thermocald.numbers import counted
@@ -115,11 +114,9 @@ def _preview(frame: Frame) -> bytes | None:
         image = frame.image if frame.image is not None else decode_grey(frame.encoded or b"")
     except DataError:
         return None
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
     scale = min(1.0, _PREVIEW_PX / image.shape[1])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(eight_bit(image), size, interpolation=cv2.INTER_AREA)
     done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _PREVIEW_QUALITY])
     return data.tobytes() if done else None
 

@@ -60,6 +60,14 @@ class CameraPlan:
     def name(self) -> str:
         return self.config.name
 
+    def calibrator_of_check(self) -> Calibrator:
+        """Return the calibrator that checks a frame; ConfigurationError without a test field."""
+        if isinstance(self.calibrator, Calibrator):
+            return self.calibrator
+        raise ConfigurationError(
+            f"camera {self.name!r}: the check needs its `testfield`; set it, or give --no-check"
+        )
+
 
 def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
     """Plan the cameras without opening them; raises ConfigurationError."""
@@ -302,9 +310,11 @@ def _played_until(path: Path, camera: str, series: str) -> float | None:
     if not path.exists() or not path.stat().st_size:
         return None
     with Store.open(path) as store:
-        found = [s for s in store.all_series() if (s.camera, s.name) == (camera, series)]
-        times = [store.series_columns(s, ["frame_time"])["frame_time"] for s in found]
-    return max((float(t.max()) for t in times if len(t)), default=None)
+        found = store.series_of(camera, series)
+        if found is None:
+            return None
+        times = store.series_columns(found, ["frame_time"])["frame_time"]
+    return float(times.max()) if len(times) else None
 
 
 def _name(text: str) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
-from thermocald.hal import SystemClock, driver_names, load_driver, open_device
+from thermocald.hal import SystemClock, driver_names, load_driver, open_device, option_names
 from thermocald.names import file_name
 
 if TYPE_CHECKING:
@@ -225,10 +225,10 @@ def calibration_doubts(recording: Recording) -> list[str]:
 
 
 def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
+    from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.thermometers import Thermometers
     from thermocald.config import load_config
     from thermocald.daemon.plan import plan_cameras
-    from thermocald.hal import SystemClock, open_device, option_names
 
     config = load_config(path, option_names)
     lines = [f"{path}: a valid configuration"]
@@ -247,8 +247,6 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
             if not probe or kind == "output":
                 lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
             lines += [f"  {kind} {entry.name}: warning: {text}" for text in device.warnings()]
-    from thermocald.acquisition.calibrator import Calibrator
-
     Thermometers(config, clock)  # raises for channels that conflict
     for plan in plan_cameras(config, clock):
         if plan.calibrator is not None and not isinstance(plan.calibrator, Calibrator):

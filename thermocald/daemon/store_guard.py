@@ -25,7 +25,7 @@ import numpy as np
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import OutputError, StoreError, StoreFullError
-from thermocald.files import cannot_write, is_unmounted, make_folder, mount_point
+from thermocald.files import cannot_write, is_unmounted, make_folder, mount_point, utc_stamp
 from thermocald.store.database.file import HELPERS, StoreFile, helper, read_wal_tail
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
@@ -94,7 +94,7 @@ class FollowedStore:
 
     def _keep_damaged_wal(self) -> str:
         """Copy the damaged -wal file for examination; return the copy's path."""
-        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{_stamp()}")
+        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{utc_stamp()}")
         try:
             shutil.copyfile(helper(self.path, "wal"), copy)
         except OSError as error:
@@ -168,7 +168,7 @@ class FollowedStore:
     def _rescued(self) -> Path:
         """Copy the open store's content to a file beside it; return the copy's path."""
         target = self.path.resolve()
-        copy = target.with_name(f"{target.stem}-rescued-{_stamp()}.db")
+        copy = target.with_name(f"{target.stem}-rescued-{utc_stamp()}.db")
         target.parent.mkdir(parents=True, exist_ok=True)
         self.store.copy_to(copy)
         return copy
@@ -210,10 +210,6 @@ def _aside(path: Path) -> Path:
 def _device(path: Path) -> int:
     """Return the number of the disk of a path, which need not exist."""
     return next(folder for folder in path.resolve().parents if folder.exists()).stat().st_dev
-
-
-def _stamp() -> str:
-    return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
 
 
 # results alone take about 1.2 kB an epoch: enough for more than a day at one every 10 s
@@ -314,8 +310,7 @@ class StoreGuard:
     def find(self, camera: str, name: str) -> StoredSeries | None:
         """Return a camera's series of this name, None if there is none."""
         with self._lock:
-            found = (s for s in self.store.all_series() if (s.camera, s.name) == (camera, name))
-            return next(found, None)
+            return self.store.series_of(camera, name)
 
     def stored_events(self) -> list[Event]:
         """Return all events in the store, oldest first."""

@@ -57,7 +57,7 @@ def require_other_series(series: Sequence[SeriesInput]) -> None:
                 f"{b.name}: the reference temperature is {next(iter(b.readings), 'missing')!r}, in "
                 f"{a.name} it is {reference!r}; both series need the same thermometer"
             )
-    refuse_copies(series)
+    refuse_copies([(one.name, one.grid.points) for one in series])
 
 
 _PASSES = 2

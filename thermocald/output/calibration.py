@@ -48,7 +48,7 @@ def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
         f"Calibration of {name}",
         _answer(result, posed, sensor),
         tuple(s for s in sections if s.figures or s.tables),
-        (f"{name}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm.",),
+        (f"{name}, {sensor}.",),
     ).page()
 
 
@@ -263,7 +263,6 @@ def _photographs(result: Photographs) -> Table:
 def render_field_check(result: FieldCheck, title: str = "") -> str:
     """Return the report as HTML text."""
     field, model = result.field, result.camera
-    pitch = model.sensor.pixel_pitch
     sds = result.sds_px
     expected = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
     if result.weak:
@@ -315,7 +314,7 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
                 text=() if reasons else ("All are seen.",),
             ),
         ),
-        (f"{model.sensor.width} × {model.sensor.height} px of {pitch * 1000:g} µm.",),
+        (f"{model.sensor}.",),
     ).page()
 
 

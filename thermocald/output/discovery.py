@@ -139,10 +139,9 @@ def _names(d: Discovery) -> list[str]:
 def _origin(d: Discovery) -> list[str]:
     lines = []
     for name, e in zip(_names(d), d.examination.fitter.series, strict=True):
-        source, sensor = e.source, e.source.sensor
+        source = e.source
         lines.append(
-            f"{source.camera}, {sensor.width} × {sensor.height} px of "
-            f"{sensor.pixel_pitch * 1000:g} µm; {name} measured "
+            f"{source.camera}, {source.sensor}; {name} measured "
             f"{day(float(source.frame_times[0]))}, {int(source.per_row.sum())} epochs."
         )
     return lines

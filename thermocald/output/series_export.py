@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.series.epochs import csv_text
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError, UsageError
 from thermocald.files import write_text
@@ -37,9 +36,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.analysis.camera.camera import Camera
-    from thermocald.analysis.series.epochs import Columns, Epochs
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
+    from thermocald.result import Columns
 
 
 UNITS = ("px", "um", "deg")
@@ -119,11 +119,6 @@ def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float
 def _iso(seconds: float) -> str:
     moment = datetime.fromtimestamp(seconds, UTC)
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
-
-
-def as_csv(parts: Iterable[Columns], style: ExportStyle) -> Iterator[str]:
-    """Yield the columns as CSV; numbers have all digits, unknown values are empty."""
-    return csv_text(parts, style.separator, style.decimal)
 
 
 def as_json(parts: Iterable[Columns]) -> Iterator[str]:

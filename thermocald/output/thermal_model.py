@@ -69,8 +69,7 @@ def _section(title: str, *tables: Table) -> Section:
 
 
 def _about(camera: ThermalCamera, document: Mapping[str, Any]) -> str:
-    sensor = camera.model.sensor
-    text = f"{sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm"
+    text = camera.model.sensor
     series = ", ".join(str(s["name"]) for s in document.get("series", ()))
     return f"{text}; fitted to {series}." if series else f"{text}."
 

@@ -209,6 +209,7 @@ class Survey:
             "redundancy": n.redundancy,
             "relative_accuracy": n.relative_accuracy,
             "sd_scale": n.sd_scale,
+            "disagreement": n.disagreement,
             "camera": {**asdict(n.camera.sensor), "free": list(n.free), **interior},
             "targets": targets,
             "stations": stations,

@@ -231,6 +231,10 @@ class SeriesReader(ABC):
         """The store's name in messages: a path, or an address without its password."""
         return str(self.path)
 
+    def series_of(self, camera: str, name: str) -> StoredSeries | None:
+        """Return a camera's series of this name, None if there is none."""
+        return next((s for s in self.all_series() if (s.camera, s.name) == (camera, name)), None)
+
     def only_series(self, name: str | None) -> StoredSeries:
         """Return the series `CAMERA/SERIES` or `SERIES` that --series names; None: the only one.
 

@@ -306,18 +306,22 @@ def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: st
     return replace(whole, grid=grid)
 
 
-def refuse_copies(series: Sequence[SeriesInput]) -> None:
-    """Raise DataError if two series hold the same observations, but for a store's rounding."""
-    for k, other in enumerate(series):
-        points = other.grid.points
-        for before in series[:k]:
-            if before.grid.points.shape == points.shape and np.allclose(
-                before.grid.points, points, rtol=0.0, atol=1e-4, equal_nan=True
+_COPY = (
+    "holds the same observations as {}; give a separate measurement (if simulated, with another "
+    "--seed)"
+)
+
+
+def refuse_copies(
+    series: Sequence[tuple[str, Array]], fault: str = _COPY, rtol: float = 0.0, atol: float = 1e-4
+) -> None:
+    """Raise DataError if two series, (name, numbers), are equal but for a store's rounding."""
+    for k, (name, numbers) in enumerate(series):
+        for before, others in series[:k]:
+            if others.shape == numbers.shape and np.allclose(
+                others, numbers, rtol, atol, equal_nan=True
             ):
-                raise DataError(
-                    f"{other.name} holds the same observations as {before.name}; give a separate "
-                    "measurement (if simulated, with another --seed)"
-                )
+                raise DataError(f"{name} {fault.format(before)}")
 
 
 def series_input(

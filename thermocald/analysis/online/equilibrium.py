@@ -1,8 +1,8 @@
 """Thermal equilibrium of a camera: how fast it drifts, and when it will be steady.
 
 The interior orientation of a static camera, given its exterior orientation, is determined to
-hundredths of a pixel in every epoch. Its drift per minute is the slope over the last minutes; the
-time to steady comes from an exponential approach, averaged over the plausible time constants.
+hundredths of a pixel in every epoch. Its drift now and the time to steady come from one exponential
+approach, averaged over the plausible time constants; both sds hold for one time constant only.
 """
 
 from __future__ import annotations
@@ -19,21 +19,23 @@ if TYPE_CHECKING:
 State = Literal["unknown", "drifting", "ready"]
 
 _FEWEST = 8
-# the shortest past for the drift; up to four times as long if a straight line describes it
+# the shortest past for the drift; up to four times as long if one exponential describes it
 _WINDOW_S = 180.0
 _STEADY = 0.05  # px/min below which the camera counts as steady
 _GROUP_S = 1.0  # epochs closer to each other are averaged
-_TAUS = 60
+_RATES = 60
+_SLOW = 2.5  # rate up to which a drift may as well accelerate
+_STRAIGHT = 0.1  # rate of what cannot be told from a straight line
 _NARROWINGS = 6
 _WEIGHTY = 9  # points of a fine enough grid that have a weight above 1 %
 _SETTLED_SD = 2.0
-_CURVED_SD = 3.0
+_WORSE = 1.0  # misfit of a longer past over that of the shortest, in sds of the ratio
 _WORST_MISFIT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Equilibrium:
-    """A thermal state; drift px/min of (c, x0, y0) together, ready_in s, NaN if unknown."""
+    """A thermal state; drift px/min now of (c, x0, y0) together, ready_in s, NaN if unknown."""
 
     state: State
     drift: float = float("nan")
@@ -63,59 +65,58 @@ def _two_digits(value: float, sd: float) -> str:
     return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
 
 
-def slope(times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
-    """Fit straight lines to values (n, k) with sds (n, k); return slopes (k,) and sds (k,) per s.
-
-    The sds are scaled up if the line does not fit within them, never down.
-    """
-    w = 1.0 / sds**2
-    mean_t = (w * times[:, None]).sum(0) / w.sum(0)
-    dt = times[:, None] - mean_t
-    sxx = (w * dt**2).sum(0)
-    slopes = (w * dt * values).sum(0) / sxx
-    mean = (w * values).sum(0) / w.sum(0)
-    rest = values - mean - dt * slopes
-    factor = np.maximum(1.0, (w * rest**2).sum(0) / max(len(times) - 2, 1))
-    result: Array = np.sqrt(factor / sxx)
-    return slopes, result
-
-
 def fit_approach(
     times: Array, values: Array, sds: Array, bound: float
-) -> tuple[float, float, float] | None:
-    """Fit a + b·exp(-t/tau) to values (n,) at times (n,) s; return None if there is no approach.
+) -> tuple[float, float, float, float, float]:
+    """Fit a + b·exp(-t/tau) with a common tau to values (n, k) with sds (n, k) at times (n,) s.
 
-    bound: speed per s below which the camera counts as steady. Returns the time in s from the last
-    epoch until it is steady, its sd, and the misfit: reduced chi-square. tau runs over a grid from
-    a few epochs to ten times the span; every tau is weighted by its likelihood.
+    bound: speed per s below which the camera counts as steady. Returns the speed at the last epoch
+    per s and its sd, the time in s from there until the camera is steady and its sd, NaN if a
+    straight line fits as well, and the misfit: reduced chi-square. The rate span/tau runs over a
+    grid from an accelerating drift to an approach within few epochs, weighted by its likelihood.
     """
     span = float(times[-1] - times[0])
-    step = span / (len(times) - 1)
-    taus = np.geomspace(2.0 * step, 10.0 * span, _TAUS)
+    s = (times - times[0]) / span
+    slow = np.linspace(-_SLOW, _SLOW, _RATES)
+    rates = np.append(slow, np.geomspace(_SLOW, 0.5 * len(times), _RATES // 2)[1:])
     w = 1.0 / sds**2
-    mean = float(w @ values / w.sum())
+    off = values - (w * values).sum(0) / w.sum(0)
+    straight = False
     for narrowing in range(_NARROWINGS):
-        # chi-square, time to steady s and its variance for every tau, with the best a and b
-        E = np.exp(-(times - times[0]) / taus[:, None])
-        D = E - (E @ w / w.sum())[:, None]
-        see = D**2 @ w
-        b = D @ (w * (values - mean)) / see
-        chi2 = ((values - mean - D * b[:, None]) ** 2) @ w
-        with np.errstate(divide="ignore"):
-            ready = np.maximum(0.0, taus * np.log(np.abs(b) * E[:, -1] / taus / bound))
-        variance = (taus / (np.sqrt(see) * np.maximum(np.abs(b), 1e-300))) ** 2
-        factor = max(1.0, float(chi2.min()) / max(len(times) - 3, 1))
+        # chi-square, and slopes now with their variances for every rate, with the best a and b
+        E = np.expm1(-s * rates[:, None])
+        see = E**2 @ w - (E @ w) ** 2 / w.sum(0)
+        b = E @ (w * off) / see
+        chi2 = np.sum(w * off**2) - np.sum(b**2 * see, axis=1)
+        factor = max(1.0, float(chi2.min()) / max(off.size - 2 * off.shape[1] - 1, 1))
         weight = np.exp(-0.5 * (chi2 - chi2.min()) / factor)
-        if narrowing == 0 and weight[-1] > 0.25:
-            return None  # a straight line fits as well: the end cannot be predicted
-        if np.sum(weight > 0.01) >= _WEIGHTY:
+        to_slope = (-rates * np.exp(-rates) / span)[:, None]
+        slopes, variances = b * to_slope, factor * to_slope**2 / see
+        approaching = rates > _STRAIGHT
+        straight = straight or (narrowing == 0 and weight[~approaching].max() > 0.25)
+        weighty = np.flatnonzero(weight > 0.01)
+        if len(weighty) >= _WEIGHTY:
             break
-        best = int(weight.argmax())
-        taus = np.geomspace(taus[max(best - 1, 0)], taus[min(best + 1, _TAUS - 1)], _TAUS)
-    weight /= weight.sum()
-    ready_in = float(weight @ ready)
-    sd = float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance)))
-    return ready_in, sd, factor
+        ends = np.clip([weighty[0] - 1, weighty[-1] + 1], 0, len(rates) - 1)
+        rates = np.linspace(rates[ends[0]], rates[ends[1]], _RATES)
+    slope = weight @ slopes / weight.sum()
+    speed = float(np.linalg.norm(slope))
+    direction = slope / max(speed, 1e-300)
+    along, variance = slopes @ direction, variances @ direction**2
+    _, sd = _mean_and_sd(along, variance, weight)
+    if straight:
+        return speed, sd, float("nan"), float("nan"), factor
+    speeds = np.maximum(np.linalg.norm(slopes, axis=1), 1e-300)[approaching]
+    taus = span / rates[approaching]
+    ready = np.maximum(0.0, taus * np.log(speeds / bound))
+    variance = variance[approaching] * (taus / speeds) ** 2
+    return speed, sd, *_mean_and_sd(ready, variance, weight[approaching]), factor
+
+
+def _mean_and_sd(values: Array, variances: Array, weights: Array) -> tuple[float, float]:
+    """Return mean and sd of a mixture of distributions."""
+    mean = float(weights @ values / weights.sum())
+    return mean, float(np.sqrt(weights @ ((values - mean) ** 2 + variances) / weights.sum()))
 
 
 class EquilibriumWatch:
@@ -165,40 +166,25 @@ class EquilibriumWatch:
         if not good.any():
             return Equilibrium("unknown")
         values, sds = values[:, good], sds[:, good]
-        # over the longest past that straight lines describe, or else over the window
-        pasts = [times >= times[-1] - windows * _WINDOW_S for windows in (4.0, 2.0, 1.0)]
-        for past in pasts:
-            recent = past.copy()
-            recent[-_FEWEST:] = True
-            if past is pasts[-1] or _straight(times[recent], values[recent], sds[recent]):
+        # over the longest past that one exponential describes as well as the last minutes: heating
+        # may have begun just now
+        fits: list[tuple[float, ...]] = []
+        sizes: list[int] = []
+        for windows in (1.0, 2.0, 4.0):
+            past = times >= times[-1] - windows * _WINDOW_S
+            past[-_FEWEST:] = True
+            sizes.append(int(past.sum()))
+            fits.append(fit_approach(times[past], values[past], sds[past], _STEADY / 60.0))
+            worse = 1.0 + _WORSE * np.sqrt(1.0 / sizes[0] + 1.0 / sizes[-1])
+            if fits[-1][-1] > worse * fits[0][-1]:
+                fits.pop()
                 break
-        rate, sd_rate = slope(times[recent], values[recent], sds[recent])
-        size = float(np.linalg.norm(rate))
-        direction = rate / max(size, 1e-300)
-        speed, sd_speed = 60.0 * size, 60.0 * float(np.sqrt(np.sum((direction * sd_rate) ** 2)))
+        speed, sd_speed, *ready_in, misfit = fits[-1]
+        speed, sd_speed = 60.0 * speed, 60.0 * sd_speed
         if speed + _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("ready", speed, sd_speed)
         if speed - _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("unknown", speed, sd_speed)
-        along, sd_along = values @ direction, np.sqrt((sds**2) @ direction**2)
-        # over the longest past that one exponential describes: heating may have begun just now
-        for past in pasts:
-            if past.sum() < _FEWEST:
-                break
-            found = fit_approach(times[past], along[past], sd_along[past], _STEADY / 60.0)
-            if found is None:
-                break
-            ready_in, sd_ready_in, misfit = found
-            if misfit < _WORST_MISFIT:
-                return Equilibrium("drifting", speed, sd_speed, ready_in, sd_ready_in)
+        if misfit < _WORST_MISFIT:
+            return Equilibrium("drifting", speed, sd_speed, *ready_in)
         return Equilibrium("drifting", speed, sd_speed)
-
-
-def _straight(times: Array, values: Array, sds: Array) -> bool:
-    """Return whether a parabola shows no significant curvature in any of the columns (n, k)."""
-    t = (times - times.mean()) / max(float(np.ptp(times)), 1e-9)
-    A = np.stack([np.ones_like(t), t, t * t], axis=1) / sds.T[..., None]
-    transposed = np.swapaxes(A, 1, 2)
-    cofactors = np.linalg.inv(transposed @ A)
-    curvatures = (cofactors @ transposed @ (values / sds).T[..., None])[:, 2, 0]
-    return bool(np.all(np.abs(curvatures) <= _CURVED_SD * np.sqrt(cofactors[:, 2, 2])))

@@ -39,7 +39,7 @@ from thermocald.photogrammetry.series.long_series import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period, image_px
 from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS
+from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS, slow_course
 
 if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import CalibratedEpoch
@@ -140,7 +140,8 @@ class _Together:
         if self.moved:
             grid = taken_off(grid, self.moved, slice(-1, None))
         seen = grid.targets(self.seen)
-        _, block = self.known.adjusted(seen, epochs, np.array([self.sample.last_course]))
+        last = slow_course(len(self.sample.status), self.sample.step)[-1:]
+        _, block = self.known.adjusted(seen, epochs, last)
         return self.epoch(0, block.spread(self.seen, grid.points.shape[1]))
 
 

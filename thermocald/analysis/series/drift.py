@@ -19,7 +19,7 @@ from thermocald.analysis.series.course import LEVEL, Course
 from thermocald.analysis.statistics.dependence import dependence, holm, slope_noise
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
-from thermocald.photogrammetry.series.target_noise import slow_errors
+from thermocald.photogrammetry.series.target_noise import slow_course, slow_errors
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
@@ -44,6 +44,20 @@ def _thin(*columns: Array) -> list[Array]:
     return [c[: n // size * size].reshape(-1, size).mean(axis=1) for c in columns]
 
 
+def _p_value(change: float, sd: float) -> float:
+    """Return the two-sided p-value of no change, 0 if it is known exactly."""
+    from scipy.special import ndtr
+
+    return float(2 * ndtr(-abs(change) / sd)) if sd > 0 else 0.0
+
+
+def _slow_errors(table: Epochs) -> tuple[Array, Array]:
+    """Return the course (E,) of the targets' slow errors, and their variances (16,)."""
+    if table.adjustment is None:
+        return slow_course(len(table), 0), np.zeros(16)
+    return slow_course(len(table), table.adjustment.step), np.diag(table.adjustment.slow)
+
+
 def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """Fit straight lines to the estimated parameters; p is corrected for their number (Holm).
 
@@ -51,15 +65,11 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     but not at the beginning, their coordinate errors tilt the line. All epochs share that part of
     the change's sd, and a slow change that it explains is no drift.
     """
-    from scipy.special import ndtr
-
     found, ok = [], table.ok
     time = table.frame_time[ok]
-    of_targets = np.zeros(16)
-    if table.adjustment is not None:
-        # targets' slow errors have opposite signs in the first and the last epoch
-        last = table.adjustment.last_course
-        of_targets = 2.0 * last * (1.0 - last) * np.diag(table.adjustment.slow)
+    course, slow = _slow_errors(table)
+    # targets' slow errors have opposite signs in the first and the last epoch
+    of_targets = -2.0 * course[0] * course[-1] * slow
     for name in names:
         column = IOP_NAMES.index(name)
         values, sds = table.values[ok, column], table.sd[ok, column]
@@ -74,8 +84,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         p = 1.0 if test is None else test.p_value
         span, tilt_sd = float(np.ptp(time)), float(table.trend_sd[column])
         if tilt_sd > 0:
-            slow = float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t)))
-            p = max(p, float(2 * ndtr(-slow / tilt_sd)))
+            p = max(p, _p_value(float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t))), tilt_sd))
         line = Course(
             name, float(values.mean()), float(values.std(ddof=1)),
             float(np.sqrt(np.mean(sds**2))), slope * span,
@@ -96,13 +105,19 @@ def courses(table: Epochs) -> list[Course]:
     have = np.flatnonzero(ok)[np.isfinite(table.temperature[ok])]
     temperature, time = table.temperature[have], table.frame_time[have]
     if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
+        warming = temperature - temperature.mean()
+        course, slow = _slow_errors(table)
+        per_kelvin = float(warming @ course[have] / (warming @ warming))
         for name, line in lines.items():
             column = IOP_NAMES.index(name)
             values, sds = table.values[have, column], table.sd[have, column]
+            of_targets = abs(per_kelvin) * float(np.sqrt(slow[column]))
             t, y, sd, times = _thin(temperature, values, sds, time)
             on = dependence(y, sd, t, estimate_reading_noise(times, t, None), times)
+            p = max(on.p_value, _p_value(on.slope, of_targets))
+            sd_slope = float(np.hypot(on.sd_slope, of_targets))
             lines[name] = replace(
-                line, per_kelvin=on.slope, sd_per_kelvin=on.sd_slope, p_temperature=on.p_value
+                line, per_kelvin=on.slope, sd_per_kelvin=sd_slope, p_temperature=p
             )
 
     @cache
@@ -147,7 +162,7 @@ def _single_support(
     """
     if table.without is None or table.adjustment is None or len(table.groups) < 3:
         return None
-    slow, *_ = slow_errors(table.adjustment.residuals, table.adjustment.observed)
+    slow, _ = slow_errors(table.adjustment.residuals, table.adjustment.observed)
     size = {first: float(np.nansum(slow[rows] ** 2)) for first, rows in table.groups.items()}
     best, least = None, _SHRUNK * abs(line.change)
     for first in sorted(size, key=lambda first: -size[first])[:_SUSPECTS]:

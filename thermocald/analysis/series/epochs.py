@@ -6,8 +6,6 @@ from their observations (`adjusted`).
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -28,7 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.covariances import AFFINITY
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.result import Result, document_of, jsonable, new_figure
+from thermocald.result import Result, csv_text, document_of, jsonable, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -44,9 +42,9 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.photogrammetry.series.result import SeriesAdjustment
+    from thermocald.result import Columns
     from thermocald.store.recording.head import Head
 
-    Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
 
 MATERIAL = 0.1
 """Excess of sigma0 over 1 that is explained in the output."""
@@ -545,29 +543,3 @@ def calibrate_epochs(
         tuple(a.status for a in found), tuple(a.reason for a in found), "per_epoch",
     )  # fmt: skip
     return table, observations
-
-
-def csv_text(parts: Iterable[Columns], separator: str = ",", decimal: str = ".") -> Iterator[str]:
-    """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
-    for number, columns in enumerate(parts):
-        text = io.StringIO()
-        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
-        if not number:
-            writer.writerow(columns)
-        cells = [_cells(name, values, decimal) for name, values in columns.items()]
-        writer.writerows(zip(*cells, strict=True))
-        yield text.getvalue()
-
-
-def _cells(
-    name: str, values: NDArray[np.integer] | Array | Sequence[str], decimal: str
-) -> Sequence[str]:
-    if not isinstance(values, np.ndarray):
-        return values
-    if np.issubdtype(values.dtype, np.integer):
-        return [str(v) for v in values.tolist()]
-    digits = [
-        "" if not isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
-        for v in values.tolist()
-    ]
-    return [d.replace(".", decimal) for d in digits] if decimal != "." else digits

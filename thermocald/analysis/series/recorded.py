@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -155,11 +156,15 @@ def replay_into(
         stored = 0 if last is None else int(np.searchsorted(recording.columns.numbers, last + 1))
         stored -= stored % EPOCHS_OF_A_BLOCK
         advance(stored)
+        home = path.resolve().parent  # a store names frames in its own folder only
         epochs = islice(recording.iter_epochs(), stored, None)
         for done in calibrated_epochs(calibrator, epochs, jobs):
             if last is None or done.epoch.number > last:
                 result = EpochResult.from_adjustment(done.adjustment)
-                store.append(series, done.epoch, result, extra=done.extra)
+                frame = done.epoch.frame and done.epoch.frame.resolve()
+                inside = frame and frame.is_relative_to(home) and frame.relative_to(home)
+                epoch = replace(done.epoch, frame=inside or None)
+                store.append(series, epoch, result, extra=done.extra)
             advance(1)
         # inside `with`: to leave targets out of a long series, the store is read again
         source = StoredRecording(store, series)
@@ -169,23 +174,22 @@ def replay_into(
 def _open_series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
     """Return the store's series of a recording, created if there is none."""
     wanted = {"exterior": "per_epoch", "free": list(settings.free)}
-    for series in store.all_series():
-        if (series.camera, series.name) != (recording.camera.name, recording.series):
-            continue
-        if series.head != recording.head or series.testfield.names != recording.testfield.names:
-            raise DataError(
-                f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
-                "use another store, or change `series` in recording.yaml"
-            )
-        if series.settings.get("free") != wanted["free"]:
-            raise UsageError(
-                f"{store.path}: series {series.name!r} was calibrated with --free "
-                f"{','.join(series.settings.get('free', []))}; use the same, or another store"
-            )
-        return series
-    return store.create_series(
-        recording.head, recording.testfield, settings=wanted, created_utc=time.time()
-    )
+    series = store.series_of(recording.camera.name, recording.series)
+    if series is None:
+        return store.create_series(
+            recording.head, recording.testfield, settings=wanted, created_utc=time.time()
+        )
+    if series.head != recording.head or series.testfield.names != recording.testfield.names:
+        raise DataError(
+            f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
+            "use another store, or change `series` in recording.yaml"
+        )
+    if series.settings.get("free") != wanted["free"]:
+        raise UsageError(
+            f"{store.path}: series {series.name!r} was calibrated with --free "
+            f"{','.join(series.settings.get('free', []))}; use the same, or another store"
+        )
+    return series
 
 
 def table_of_stored(

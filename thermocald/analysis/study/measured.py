@@ -26,7 +26,7 @@ from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -131,20 +131,6 @@ class MeasuredSeries:
 _MOST_MATRICES = 5000
 
 
-def refuse_copies(series: Sequence[MeasuredSeries]) -> None:
-    """Raise DataError if two series have the same epochs."""
-    for i, one in enumerate(series):
-        for other in series[:i]:
-            if (
-                len(one) > 1
-                and one.values.shape == other.values.shape
-                and np.allclose(one.values, other.values, rtol=1e-9, atol=0.0)
-            ):  # a store's numbers are rounded
-                raise DataError(
-                    f"{one.source} has the same epochs as {other.source}; give each series once"
-                )
-
-
 def measured_series(
     source: Recording | StoredRecording,
     table: Epochs,
@@ -176,9 +162,7 @@ def measured_series(
         of = np.arange(len(ok)) if table.sampled is None else table.sampled
         some = np.flatnonzero(ok[of] & adjustment.ok)
         some = some[spread_rows(len(some), _MOST_MATRICES)]
-        # the excess scatter has sds only: with it, the parameters would seem independent
         covariances = adjustment.covariance[some][:, :10, :10]
-        covariances = covariances - np.diag(np.square(adjustment.excess_sd[:10]))
     time_s, thermometers = table.frame_time[ok], []
     for name, channel in source.head.channels.items():
         read, readings = source.columns.readings_of(name)

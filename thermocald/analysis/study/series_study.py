@@ -30,7 +30,7 @@ from thermocald.analysis.statistics.dependence import (
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.errors import GeometryError
 from thermocald.numbers import parameter_label
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -98,6 +98,20 @@ def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array
     scene = directions(sensor, first, points)
     seen = project(sensor, later, np.zeros((*later.shape[:-1], 6)), scene)
     return np.asarray(seen - points)
+
+
+def displacement_covariance(series: MeasuredSeries, points: Array) -> Array:
+    """Return the covariance (k, 2, 2) px² of `image_displacement` from the first to the last epoch.
+
+    It is zero if the series has no correlations.
+    """
+    if not len(series.correlations):
+        return np.zeros((len(points), 2, 2))
+    scene = directions(series.sensor, series.values[0], points)
+    J = partials(series.sensor, series.values[-1], np.zeros(6), scene)[1][..., :10]
+    sds = np.nan_to_num(series.sds[[0, -1]])
+    covariance = series.correlations[[0, -1]] * sds[:, :, None] * sds[:, None, :]
+    return np.asarray(J @ covariance.sum(axis=0) @ np.swapaxes(J, 1, 2))
 
 
 def circle_of_confusion(sensor: Sensor) -> float:
@@ -206,7 +220,8 @@ class SeriesStudy:
     """The study of one series.
 
     deviations: of the IOP, `sigma0` and the thermometers; grid, displacement (k, 2) px: image
-    points of a static scene and their shifts from the first to the last epoch, y down; columns,
+    points of a static scene and their shifts from the first to the last epoch, y down;
+    displacement_covariance (k, 2, 2) px²: of the shifts, zero if unknown; columns,
     matrix (n, n): Pearson's r among free IOP, sigma0 and thermometers; noise_ratio: scatter between
     neighbouring epochs over the stated standard deviations, NaN if it could not be estimated.
     """
@@ -216,6 +231,7 @@ class SeriesStudy:
     focus: FocusChange | None
     grid: Array
     displacement: Array | None
+    displacement_covariance: Array
     significance: Mapping[str, Significance]
     channels: tuple[ChannelStudy, ...]
     columns: tuple[str, ...]
@@ -243,12 +259,13 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         if (short := [parameter_label(n) for n, d in c.dependences.items() if d.too_short])
     ]
     grid = image_grid(series.sensor)
-    displacement = None
+    displacement, covariance = None, np.zeros((len(grid), 2, 2))
     if len(series) > 1:
         try:
             displacement = image_displacement(
                 series.sensor, series.values[0], series.values[-1], grid
             )
+            covariance = displacement_covariance(series, grid)
         except GeometryError as error:
             notes.append(f"The displacement of the image cannot be computed: {error}.")
     names = (*series.free, "sigma0", *(t.name for t in series.thermometers))
@@ -262,7 +279,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     ratios = [one.drift.noise_ratio for one in significance.values() if one.drift is not None]
     noise_ratio = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
     return SeriesStudy(
-        series, deviations, focus, grid, displacement, significance, channels, names,
+        series, deviations, focus, grid, displacement, covariance, significance, channels, names,
         correlation_matrix(columns), tuple(notes), noise_ratio,
     )  # fmt: skip
 

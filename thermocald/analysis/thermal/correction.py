@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import Maps, ideal_points
+from thermocald.arrays import eight_bit
 from thermocald.errors import DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -194,9 +195,7 @@ class FrameCorrector:
         result = calibrated.adjustment
         if result.interior is None:
             raise ImageError(f"{result.status}: {result.reason}")
-        image = EncodedImage(encoded).as_it_is()
-        if image.dtype != np.uint8:
-            image = (image >> 8).astype(np.uint8)
+        image = eight_bit(EncodedImage(encoded).as_it_is())
         sensor = self.sensor
         if image.shape[:2] != (sensor.height, sensor.width):
             raise ImageError(

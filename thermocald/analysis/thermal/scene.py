@@ -26,6 +26,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from thermocald.analysis.thermal.scene_recording import Track, write_scene
+from thermocald.arrays import eight_bit
 from thermocald.errors import DataError, ImageError
 from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, partials
@@ -82,7 +83,7 @@ class SceneMovement:
 def detect_features(reference: NDArray[Any]) -> NDArray[np.float32]:
     """Detect features (F, 2) px in a reference frame (H, W). Raises DataError for too few."""
     corners = cv2.goodFeaturesToTrack(
-        _eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
+        eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
     )
     found = np.zeros((0, 2)) if corners is None else np.asarray(corners).reshape(-1, 2)
     last = np.array(reference.shape[::-1]) - _WINDOW_PX
@@ -99,7 +100,7 @@ def track_features(
     reference: NDArray[Any], points: NDArray[np.float32], image: NDArray[Any]
 ) -> tuple[NDArray[np.int64], Array]:
     """Track features (F, 2) px; return the rows of those found again and their shifts (n, 2) px."""
-    first, now, start = _eight_bit(reference), _eight_bit(image), None
+    first, now, start = eight_bit(reference), eight_bit(image), None
     options: dict[str, Any] = {
         "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3),
@@ -438,7 +439,3 @@ def _f_bound(rank: int, factor: float, free: float) -> float:
     if factor < fdtri(free, _KNOWN, 0.75):
         free = _KNOWN
     return float(fdtri(rank, free, 1.0 - _MISSED_ALPHA / 2))
-
-
-def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
-    return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)

@@ -488,9 +488,9 @@ class ThermalCamera(Result):
 
 def _require_known(log: Array, readings: Array, times: Array) -> None:
     """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
-    from thermocald.store.recording.readings import interpolate_readings
+    from thermocald.store.recording.readings import TemperatureLog
 
-    outside = ~np.isfinite(interpolate_readings(times, log, readings))
+    outside = ~TemperatureLog(log, {"": readings}).known_at(times)
     if outside.any():
         from thermocald.store.logger.clock import iso
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -20,17 +18,17 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
+from thermocald.result import csv_text
 from thermocald.store.database.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from thermocald.store.series import StoredSeries
-
 _SHOWN = ("c", "x0", "y0")
+_COUNTS = ("n_observations", "n_rejected")
 _MOST_POINTS = 2000
 _ROWS_AT_ONCE = 500
 _OLD_S = 30.0
@@ -206,11 +204,14 @@ class View:
         """Yield a series as CSV: epoch, times, temperatures, parameters with sds, status."""
         with Store.open(self._store) as store:
             found = store.find_series(camera, series)
-            names = _csv_names(found)
-            yield _line(names)
-            for page in store.column_pages(found, names, _ROWS_AT_ONCE):
-                columns = [page[name].tolist() for name in names]
-                yield "".join(_line(map(_cell, row)) for row in zip(*columns, strict=True))
+            names = [
+                "epoch", "frame_time", "temperature_time", *found.head.channels, *PARAMETER_NAMES,
+                *(f"sd_{n}" for n in PARAMETER_NAMES), "sigma0", *_COUNTS, "status",
+            ]  # fmt: skip
+            yield from csv_text(
+                page | {n: page[n].astype(np.int64) for n in ("epoch", *_COUNTS)}
+                for page in store.column_pages(found, names, _ROWS_AT_ONCE)
+            )
 
     def require(self, camera: str, series: str) -> None:
         """Raise StoreError if there is no such series."""
@@ -222,27 +223,6 @@ class View:
         if camera not in self.status().get("cameras", {}):
             raise DataError(f"there is no camera {camera!r}")
         return self._live / f"{camera}.{suffix}"
-
-
-def _csv_names(series: StoredSeries) -> list[str]:
-    return [
-        "epoch", "frame_time", "temperature_time", *series.head.channels, *PARAMETER_NAMES,
-        *(f"sd_{n}" for n in PARAMETER_NAMES), "sigma0", "n_observations", "n_rejected", "status",
-    ]  # fmt: skip
-
-
-def _line(cells: Iterable[Any]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(cells)
-    return text.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    if isinstance(value, float):
-        if value != value:
-            return ""
-        return int(value) if value.is_integer() and abs(value) < 1e9 else repr(value)
-    return value
 
 
 def _means(values: NDArray[Any], bins: list[NDArray[np.int64]]) -> list[float | None]:

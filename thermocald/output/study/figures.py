@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, GREY, PALETTE, Arrows, Curve, Figure, Panel, draw_matrix, thin
-from thermocald.numbers import UNITS, parameter_label, percent, plain, superscript
+from thermocald.numbers import UNITS, parameter_label, percent, plain, superscript, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
@@ -146,19 +146,23 @@ def _direction(x: float, y: float) -> str:
 def _movement_figure(camera: CameraStudy) -> Figure | None:
     """Draw the directional zoom: the movement of the image of a static scene (Figures 4 and 6)."""
     moved = [
-        (study.series, colour, study.grid, study.displacement)
+        (study.series, colour, study.grid, study.displacement, study.displacement_covariance)
         for study, colour in _coloured(camera)
         if study.displacement is not None and np.any(study.displacement)
     ]
     if not moved:
         return None
-    lengths = [float(np.max(np.linalg.norm(vectors, axis=1))) for *_, vectors in moved]
+    longest = max(float(np.linalg.norm(vectors, axis=1).max()) for *_, vectors, _ in moved)
     panels, words = [], []
-    for (s, colour, grid, vectors), length in zip(moved, lengths, strict=True):
+    for s, colour, grid, vectors, covariance in moved:
         frame = (s.sensor.width, s.sensor.height)
-        arrows = Arrows(grid, vectors, frame, colour, max(lengths))
+        arrows = Arrows(grid, vectors, frame, colour, longest)
         panels.append(Panel(s.name, "x in px", "y in px, down", (), arrows=arrows))
-        words.append(f"{plain(length, 'px', 3)} in {s.name}")
+        lengths = np.linalg.norm(vectors, axis=1)
+        k = int(lengths.argmax())
+        length, along = float(lengths[k]), vectors[k] / lengths[k]
+        sd = float(np.sqrt(along @ covariance[k] @ along))
+        words.append(f"{with_sd(length, sd, 'px')} in {s.name}")
     return Figure(
         "movement", "Movement of the image",
         "Movement of the points of a static scene in the image from the first to the last epoch, "

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.arrays import eight_bit
 from thermocald.errors import ImageError
 from thermocald.figures import Figure, draw_figure, save
 from thermocald.files import make_folder
@@ -117,13 +118,9 @@ def _answer(camera: CameraStudy) -> Answer:
 def _device(camera: CameraStudy) -> str:
     """Describe the camera, its sensor, and when each series was measured."""
     series = [study.series for study in camera.series]
-    sensor = series[0].sensor
     names = ", ".join(dict.fromkeys(s.camera for s in series))
     measured = "; ".join(f"{s.name} {day(s.start_utc)}" for s in series)
-    return (
-        f"{names}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm. "
-        f"Measured: {measured}."
-    )
+    return f"{names}, {series[0].sensor}. Measured: {measured}."
 
 
 def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
@@ -206,8 +203,7 @@ def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.u
 
     Raises ImageError for a file that is not an image.
     """
-    image = decode_grey(path)
-    image = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    image = eight_bit(decode_grey(path))
     left, top = (round(v - (size - 1) / 2) for v in centre)
     clip = np.zeros((size, size), dtype=np.uint8)
     height, width = image.shape

@@ -303,7 +303,9 @@ def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
 
 def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
+    sds = np.sqrt(np.diagonal(study.displacement_covariance, axis1=1, axis2=2))
     moved = {"points": study.grid, "displacement": study.displacement}
+    moved["sd_displacement"] = sds if sds.any() else None
     return {name: getattr(s, name) for name in _OF_SERIES} | {
         **{name: getattr(study, name) for name in _OF_STUDY},
         "epochs": len(s),

@@ -46,10 +46,6 @@ def overview_table(camera: CameraStudy) -> Table:
         lost, count = sum(study.series.without_result.values()), len(study.series)
         return f"{count} of {count + lost}" if lost else str(count)
 
-    def sensor(study: SeriesStudy) -> str:
-        one = study.series.sensor
-        return f"{one.width} × {one.height} px of {one.pixel_pitch * 1000:g} µm"
-
     def noise(study: SeriesStudy) -> str:
         ratio = f"{study.noise_ratio:.2f}" if np.isfinite(study.noise_ratio) else "–"
         return f"{np.sqrt(np.mean(np.square(study.series.sigma0))):.2f}; {ratio}"
@@ -60,7 +56,7 @@ def overview_table(camera: CameraStudy) -> Table:
         {
             "series": lambda s: s.series.name,
             "camera": lambda s: s.series.camera,
-            "sensor": sensor,
+            "sensor": lambda s: str(s.series.sensor),
             "epochs": epochs,
             "duration": lambda s: duration(float(s.series.time_s[-1] - s.series.time_s[0])),
             "interval": lambda s: f"{s.series.interval_s:.1f} s" if len(s.series) > 1 else "–",

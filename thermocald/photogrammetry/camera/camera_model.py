@@ -90,6 +90,9 @@ class Sensor:
         width, height = (reader.whole(side, "px", high=_MOST_PX) for side in ("width", "height"))
         return cls(width, height, pitch)
 
+    def __str__(self) -> str:
+        return f"{self.width} × {self.height} px of {self.pixel_pitch * 1000:g} µm"
+
     @property
     def centre(self) -> Array:
         """The image centre in px, (2,)."""

@@ -36,6 +36,7 @@ from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.network.bundle import (
     Bundle,
     BundleAdjustment,
+    Cofactors,
     ImageRays,
     inner_constraints,
     point_tests,
@@ -78,7 +79,8 @@ class Network:
     names: of the m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,)
     rad: largest angle of intersection of each target; interior_covariance (10, 10): zero for held
     parameters; free: names of the estimated ones; unused: targets and photographs left out, with
-    reasons; sd_scale: relative.
+    reasons; sd_scale: relative; disagreement: of the photographs (`BundleAdjustment.scatter`),
+    which the covariances include.
     """
 
     names: tuple[str, ...]
@@ -96,6 +98,7 @@ class Network:
     unused: dict[str, str]
     datum: str
     sd_scale: float
+    disagreement: float
 
     @property
     def sigmas(self) -> Array:
@@ -155,23 +158,18 @@ def refuse_before(
     _refuse(reasons)
 
 
-def refuse_weak(network: Network, weakest: tuple[str, ...]) -> None:
-    """Refuse a result with weak geometry or large residuals.
-
-    weakest: names of the parameters that the network determines worst.
-    """
+def refuse_weak(network: Network, found: Cofactors) -> None:
+    """Refuse a result with weak geometry or large residuals."""
     reasons = []
-    if len(network.stations) < MIN_PHOTOS:
-        reasons.append(
-            f"only {len(network.stations)} photographs could be oriented, {MIN_PHOTOS} are needed"
-        )
     if network.redundancy < 10:
         reasons.append(f"a redundancy of {network.redundancy} is too small for any check")
-    c, sd_c = network.camera.interior.c, float(np.sqrt(network.interior_covariance[0, 0]))
-    if "c" in network.free and sd_c > MAX_RELATIVE_SD_C * c:
+    # how weak the geometry is, whatever the photographs disagree in
+    sds = dict(zip(network.free, network.sigma0 * np.sqrt(found.cameras.diagonal()), strict=False))
+    sd_c = float(sds.get("c", 0.0)) / network.camera.interior.c
+    if sd_c > MAX_RELATIVE_SD_C:
         reasons.append(
-            f"the principal distance is uncertain by {100 * sd_c / c:.1f} % (weakest: "
-            f"{', '.join(weakest)}): photograph obliquely, turn the camera, bring depth into "
+            f"the principal distance is uncertain by {100 * sd_c:.1f} % (weakest: "
+            f"{', '.join(found.weakest)}): photograph obliquely, turn the camera, bring depth into "
             "the field, or give a calibrated camera and hold it"
         )
     if network.relative_accuracy > MAX_RELATIVE_SD:
@@ -202,6 +200,13 @@ def advice(network: Network) -> list[str]:
     low = np.degrees(network.angles) < 30
     if low.any():
         notes.append(f"{int(low.sum())} targets have rays that intersect at less than 30°")
+    if network.disagreement > 1:
+        notes.append(
+            "the photographs disagree: without one of them the targets move "
+            f"{network.disagreement:.1f} times as far as the noise of image points explains "
+            "(another focus or zoom, a field that bends, a rolling shutter?); the standard "
+            "deviations include this: hold the focus, or take more photographs"
+        )
     return notes
 
 
@@ -342,7 +347,7 @@ def adjust_network(
     kept_names = tuple(names[int(t)] for t in targets)
 
     angles = _intersection_angles(bundle, final)
-    angle = float(np.median(angles)) if len(angles) else 0.0
+    angle = float(np.median(angles))
     if angle < MIN_ANGLE:
         meet, least = f"{np.degrees(angle):.0f}°", f"{np.degrees(MIN_ANGLE):.0f}°"
         where = "take photographs from further to the left, right, above, and below"
@@ -352,7 +357,8 @@ def adjust_network(
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
-    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows)
+    disagreement, more = adjustment.scatter(bundle, found, variance)
+    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, more)
     placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,
         of_points * variance,
@@ -392,8 +398,9 @@ def adjust_network(
         unused=left_out,
         datum=datum,
         sd_scale=sd_scale,
+        disagreement=disagreement,
     )
-    refuse_weak(network, found.weakest)
+    refuse_weak(network, found)
     return network
 
 

@@ -11,7 +11,10 @@ Rotations are updated in object space (`R ← exp([w]×) R`), so that there is n
 
 Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
 adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56); Triggs, B. et al.
-(2000): Bundle adjustment — a modern synthesis, sections 6 and 9.
+(2000): Bundle adjustment — a modern synthesis, sections 6 and 9; Johnstone, I. M. (2001): On the
+distribution of the largest eigenvalue in principal components analysis, Annals of Statistics 29;
+Armijo, L. (1966): Minimization of functions having Lipschitz continuous first partial derivatives,
+Pacific Journal of Mathematics 16.
 """
 
 from __future__ import annotations
@@ -50,6 +53,8 @@ _SEPARATE_NOTHING = (
 )
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
+_LEAST_DECREASE = 0.5  # of what the step predicts
+_DISAGREE = 5.0  # standard deviations of the largest eigenvalue
 _CONTROLLED = 1e-3  # cofactor of a residual below which no other observation controls it
 
 
@@ -200,7 +205,9 @@ class BundleAdjustment:
                     if trial.interior[0] > 0:
                         v_new = self.residuals(trial)
                         new = self.cost(trial, v_new, w)
-                        if new <= cost * (1 + 1e-12):
+                        # a whole step overshoots where residuals are large
+                        least = 0.0 if gauge else _LEAST_DECREASE * fraction * step[2]
+                        if new + least <= cost * (1 + 1e-12):
                             break
                 elif not gauge:
                     raise GeometryError(_SEPARATE_NOTHING)
@@ -223,7 +230,12 @@ class BundleAdjustment:
                 break
         else:
             if not gauge:
-                raise GeometryError(f"the adjustment did not converge in {iterations} iterations")
+                size = np.sqrt(np.mean(v * v))
+                raise GeometryError(
+                    f"the adjustment did not converge in {iterations} iterations; residuals are "
+                    f"{size:.1f} times their sigmas: is it one camera with one focus, and a field "
+                    "that does not bend? If so, take more photographs, some of them oblique"
+                )
         # orthonormal to the last bit
         U, _, Vt = np.linalg.svd(bundle.rotations)
         return replace(bundle, rotations=U @ Vt)
@@ -285,16 +297,53 @@ class BundleAdjustment:
         """
         f, moves, cofactors = len(self.free), [], []
         for photo in range(len(bundle.centres)):
-            rest = replace(self, rays=self.rays.select(self.rays.photo != photo))
-            normals = rest._normal_equations(bundle, np.ones(len(rest.rays)))
-            pose = f + 6 * photo + np.arange(6)
-            normals[0][pose, pose] = 1.0  # nothing else determines it
-            S, s, _ = _reduce(normals)
+            S, s, _ = _reduce(self._without(bundle, photo))
             np.linalg.cholesky(unit_diagonal(S)[0])
             Q = scaled_inverse(S)
             moves.append(Q[:f] @ s)
             cofactors.append((Q - found.cameras)[:f, :f])
         return np.array(moves), np.array(cofactors)
+
+    def scatter(
+        self, bundle: Bundle, found: Cofactors, variance: float
+    ) -> tuple[float, tuple[Array, Array]]:
+        """Return how many times farther than by chance the unknowns of a free network move if a
+        photograph is left out, 1 if that may be chance, and roots (k, u), (k, 3m) of what the
+        cofactors lack then, by the jackknife.
+
+        variance: of unit weight. Errors that image points of one photograph share make few large
+        combinations of moves: the largest is compared with that of independent image points.
+        """
+        k, m, f = len(bundle.centres), len(bundle.points), len(self.free)
+        cameras, targets, by_points = np.zeros((k, f + 6 * k)), np.zeros((k, 3 * m)), np.zeros(k)
+        nothing = 1.0, (0 * cameras, 0 * targets)
+        for photo in range(k):
+            step = self._step(bundle, self._without(bundle, photo), 0.0)
+            if step is None:  # the others are too few
+                return nothing
+            cameras[photo], targets[photo], by_points[photo] = step[0], step[1].ravel(), step[2]
+        A, B, D, *_ = self._normal_equations(bundle, np.ones(len(self.rays)))
+        mixed, by_target = cameras @ B @ targets.T, targets.reshape(k, m, 3)
+        squares = cameras @ A @ cameras.T + mixed + mixed.T
+        squares += np.einsum("kmi,mij,lmj->kl", by_target, D, by_target)
+        # by chance each scaled move has a square of n, however unequal the photographs' weights are
+        n = f + 3 * m - 7
+        own = np.trace(self.explained(bundle, found), axis1=1, axis2=2)
+        expected = variance * (np.bincount(self.rays.photo, own) - 6)
+        scale = np.sqrt(n * by_points / expected / squares.diagonal())
+        largest = float(np.linalg.eigvalsh(squares * np.outer(scale, scale))[-1])
+        root = np.sqrt(n) + np.sqrt(k)
+        sd = root * np.cbrt(1 / np.sqrt(n) + 1 / np.sqrt(k))
+        if not largest > root**2 + _DISAGREE * sd:
+            return nothing
+        values, vectors = np.linalg.eigh(squares * ((k - 1) / k / variance))
+        excess = np.maximum(1 - (1 + n / (k - 1)) / np.maximum(values, 1), 0)
+        roots = (np.sqrt(excess * (k - 1) / k / variance) * vectors).T
+        return float(np.sqrt(largest) / root), (roots @ cameras, roots @ targets)
+
+    def _without(self, bundle: Bundle, photo: int) -> _Normals:
+        """Return the normal equations without a photograph, but for a trace that gives its pose."""
+        return self._normal_equations(bundle, np.where(self.rays.photo == photo, 1e-9, 1.0))
 
     def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""
@@ -403,21 +452,27 @@ def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Arra
     return A - BD @ B.T, a - BD @ d.ravel(), inverses
 
 
-def inner_constraints(bundle: Bundle, found: Cofactors, free: Index) -> tuple[Array, Array, Array]:
+def inner_constraints(
+    bundle: Bundle, found: Cofactors, free: Index, scatter: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
     """Return the cofactors of a free network with inner constraints over the targets: of the
     interior orientation (10, 10), zero if held, the centres (k, 3, 3) mm² and the targets (3m, 3m)
     mm².
+
+    scatter: roots of the additional cofactors (`BundleAdjustment.scatter`).
     """
     f, k, m = len(free), len(bundle.centres), len(bundle.points)
-    Qp = found.follow.T @ found.mixed
+    more_c, more_p = scatter
+    Qp = found.follow.T @ found.mixed + more_p.T @ more_p
     blocks = np.einsum("mimj->mij", Qp.reshape(m, 3, m, 3))  # a view
     blocks += found.own
     null_c, null_p = null_space(bundle.centres, bundle.points, f)
     K = np.linalg.solve(null_p.T @ null_p, null_p.T)
     KQ = K @ Qp
     inner = Qp - null_p @ KQ - KQ.T @ null_p.T + null_p @ (KQ @ K.T) @ null_p.T
-    KQc = K @ found.mixed.T
-    cameras = found.cameras - null_c @ KQc - KQc.T @ null_c.T + null_c @ (KQ @ K.T) @ null_c.T
+    KQc = K @ (found.mixed.T + more_p.T @ more_c)
+    cameras = found.cameras + more_c.T @ more_c
+    cameras = cameras - null_c @ KQc - KQc.T @ null_c.T + null_c @ (KQ @ K.T) @ null_c.T
     interior = np.zeros((_N_IOP, _N_IOP))
     interior[np.ix_(free, free)] = cameras[:f, :f]
     poses = cameras[f:, f:].reshape(k, 6, k, 6)

@@ -51,7 +51,7 @@ _ITERATIONS = 60
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 _FEWEST_TO_COMPARE = 3  # photographs
-_DISAGREE = 4.0  # standard deviations of the mean square of the moves
+_DISAGREE = 3.0  # standard deviations of the mean square of the moves
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
 
@@ -141,7 +141,7 @@ def adjust_common_interior(
     # how weak the geometry is, whatever the photographs disagree in
     weak = _weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)
     disagreement = 1.0
-    if f and len(photographs) >= _FEWEST_TO_COMPARE:
+    if len(photographs) >= _FEWEST_TO_COMPARE:
         with suppress(np.linalg.LinAlgError):  # the others may be too few without one of them
             moves, cofactors = part.without_each(bundle, found)
             disagreement, own = _between(moves, cofactors * variance, Q[:f, :f])
@@ -220,8 +220,6 @@ def _weaknesses(
 ) -> list[str]:
     """Return the reasons why the photographs do not determine the free parameters."""
     reasons: list[str] = []
-    if not s.free:
-        return reasons
     _, axes, flat = plane_fit(places[np.unique(rays.target)])
     if flat and "c" in s.free:
         angles = [obliqueness_deg(eop, axes[2]) for eop in eops]

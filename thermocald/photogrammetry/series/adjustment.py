@@ -46,6 +46,7 @@ from thermocald.photogrammetry.series.covariances import (
     slow_target_covariance,
     stillness,
     typical_sensitivity,
+    with_excess,
 )
 from thermocald.photogrammetry.series.estimator import (
     NOISE_SHOWN,
@@ -74,6 +75,7 @@ from thermocald.photogrammetry.series.target_noise import (
     excess_scatter,
     neighbours_variance,
     noise_by_radius,
+    slow_course,
     slow_errors,
 )
 
@@ -243,19 +245,19 @@ def result(
     if many:
         # only of few targets is it unknown which have moved
         few = 2 * np.median(use.sum(axis=1)) - s.carried < TRUSTED_REDUNDANCY
-        changes, course, step = slow_errors(
+        changes, step = slow_errors(
             estimate.residuals, use & estimate.solved[:, None], bool(few) and not series.windows
         )
-        slow = slow_target_covariance(system, changes, series.testfield.groups, step > 0)
+        slow = slow_target_covariance(system, changes, series.testfield.groups, bool(few))
         trend += slow
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
         excess[own] = _excess(series, estimate.values[:, own], variances, sound)
-        relative[:, own, own] += excess[own] * sound[:, None]
+        relative[block] = with_excess(relative[block], excess[own])
     # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends,
     # or a step
     if slow.any():
-        relative += course[:, None, None] ** 2 * slow
+        relative += slow_course(len(use), step)[:, None, None] ** 2 * slow
     relative[~sound] = 0.0
     still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
@@ -354,7 +356,7 @@ def judge_epochs(
 
     few = 2 * offered - s.carried < TRUSTED_REDUNDANCY
     most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
-    fail(offered == 0, "no_observations", "no target was measured")
+    fail(offered == 0, "no_observations", "no target was measured, or the frame before again")
     fail(
         ~enough_targets(grid, s),
         "too_few_targets",

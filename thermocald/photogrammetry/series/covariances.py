@@ -71,6 +71,17 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
     return relative, level, trend
 
 
+def with_excess(covariance: Array, excess: Array) -> Array:
+    """Add excess variances (p,) to covariances (E, p, p), whose correlations remain.
+
+    Scatter beyond the noise is that of image points: real series show the noise's correlations.
+    """
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    ratio = np.divide(excess, variances, out=np.zeros_like(variances), where=variances > 0)
+    factor = np.sqrt(1.0 + ratio)
+    return covariance * factor[:, :, None] * factor[:, None, :]
+
+
 def slow_target_covariance(
     system: SeriesSystem, errors: Array, group: Index, together: bool
 ) -> Array:
@@ -78,8 +89,8 @@ def slow_target_covariance(
 
     errors (T, 2) px: from the residuals. The parameters have absorbed a part of the error of a
     group of targets with a common error; it is restored as in the jackknife (HC3):
-    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups. together: whether some targets moved
-    with one another. A camera absorbs the targets' mean movement: residuals do not show it, but
+    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups. together: whether many targets may
+    have moved alike. A camera absorbs the targets' mean movement: residuals do not show it, but
     most targets, which stood still, have as large an error.
     """
     design = system.design

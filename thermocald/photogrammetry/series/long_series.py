@@ -39,6 +39,7 @@ from thermocald.photogrammetry.series.covariances import (
     line_weights,
     prior_cofactors,
     stillness,
+    with_excess,
 )
 from thermocald.photogrammetry.series.normals import (
     ObservationBlocks,
@@ -317,7 +318,7 @@ class KnownSeries:
         mine *= unit[:, None, None]
         mine += pooled * bound
         mine += added
-        mine += np.diag(self.excess[own])
+        mine = with_excess(mine, self.excess[own])
         mine[~system.good] = 0.0
         return among_all(mine, own)
 

@@ -82,7 +82,7 @@ class ObservationGrid:
         sigmas: Array,
         covariances: Array | None = None,
     ) -> ObservationGrid:
-        """Build the grid of n image points.
+        """Build the grid of n image points; an epoch that repeats the one before stays empty.
 
         shape: numbers of epochs and targets; epochs, targets (n,): of the points; measured, sigmas
         (n, 2) px; covariances (n,) px²: of x and y.
@@ -100,6 +100,8 @@ class ObservationGrid:
             inverse[:, 2] = -covariances / determinant
         points[epochs, targets] = measured
         weights[epochs, targets] = inverse
+        again = ((points[1:] == points[:-1]) == (weights[1:, :, :2] > 0)).all(axis=(1, 2))
+        points[1:][again], weights[1:][again] = np.nan, 0.0
         return cls(points, weights)
 
     def __len__(self) -> int:

@@ -170,11 +170,6 @@ class SeriesAdjustment:
     pairs: CorrelatedPairs | None = None
 
     @property
-    def last_course(self) -> float:
-        """The part of the slow change, of range 1 and mean 0, that the last epoch has."""
-        return self.step / len(self.status) or 0.5
-
-    @property
     def exterior(self) -> Exterior:
         """How the exterior orientation was estimated."""
         return self.settings.exterior

@@ -179,12 +179,19 @@ def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, flo
     return ratio, ratio * 0.5 * outermost * float(sd)
 
 
-def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array, Array, int]:
+def slow_course(epochs: int, step: int) -> Array:
+    """Return the course (epochs,), centred and of range 1, of a step at a row, 0 for a line."""
+    if not step:
+        return np.linspace(-0.5, 0.5, epochs, dtype=np.float64)
+    return np.where(np.arange(epochs) >= step, step / epochs, step / epochs - 1.0)
+
+
+def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array, int]:
     """Estimate the slow change (T, 2) px of each target's error over a series.
 
     residuals (E, T, 2) px; used (E, T); steps: whether the change may be a step. Returns the
-    changes, their common course (E,), centred and of range 1, and the first epoch (row) after a
-    step, 0 for a straight line. Light that wanders over a marker, or a board that gives way, moves
+    changes, whose course is `slow_course`, and the first epoch (row) after a step, 0 for a straight
+    line. Light that wanders over a marker, or a board that gives way, moves
     single targets slowly; a knock moves a part of the field. A change is less its noise, and 0 if
     it is no larger than that.
     """
@@ -205,16 +212,14 @@ def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array
         return np.where(enough, slope, 0.0), variance, np.where(enough, slope**2 * sxx, 0.0)
 
     row = 0
-    course: Array = np.linspace(-0.5, 0.5, E, dtype=np.float64)
-    slope, variance, explained = fit(course)
+    slope, variance, explained = fit(slow_course(E, 0))
     if steps and E >= 2 * _SMOOTH:
         before = np.cumsum(w, axis=0)[:-1]
         sxx = before * (n - before) / n
         gains = np.cumsum(v, axis=0)[:-1] ** 2 / np.maximum(sxx, 1.0)
         gains = np.where(sxx > 0.01 * E, gains, 0.0).sum(axis=(1, 2))
         at = 1 + int(np.argmax(gains))
-        stair: Array = np.where(np.arange(E) >= at, at / E, at / E - 1.0)
-        step = fit(stair)
+        step = fit(slow_course(E, at))
         rest = float((v**2).sum() - step[2].sum()) / max(2.0 * float(w.sum()), 1.0)
         sides = [slice(max(at - _SIDE, 0), at), slice(at, at + _SIDE)]
         earlier, later = (v[k].sum(axis=0) / np.maximum(w[k].sum(axis=0), 1.0) for k in sides)
@@ -223,10 +228,10 @@ def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array
         gain, moving = float(step[2].sum() - explained.sum()), np.count_nonzero(step[2])
         large = size > moving * _LEAST_STEP_PX**2
         if large and abrupt and gain > _STEP_GAIN * np.sqrt(moving) * rest:
-            (slope, variance, _), row, course = step, at, stair
+            (slope, variance, _), row = step, at
     squares = slope**2
     noise = np.divide(variance, squares, out=np.ones_like(squares), where=squares > variance)
-    return slope * np.sqrt(1.0 - noise), course, row
+    return slope * np.sqrt(1.0 - noise), row
 
 
 def neighbours_variance(unit: Array, known: Mask) -> Array:

@@ -271,7 +271,7 @@ class EncodedImage:
 
     def __init__(self, source: Path | bytes) -> None:
         self.name = str(source) if isinstance(source, Path) else "the frame"
-        self._data = data = _read(source, self.name) if isinstance(source, Path) else source
+        self.data = data = _read(source, self.name) if isinstance(source, Path) else source
         if not data:
             raise ImageError(f"{self.name}: is empty (0 bytes)")
         self._size = image_size(data)
@@ -293,7 +293,7 @@ class EncodedImage:
         """
         if self._is_jpeg:
             try:
-                grey: NDArray[Any] = simplejpeg.decode_jpeg(self._data, colorspace="GRAY")[..., 0]
+                grey: NDArray[Any] = simplejpeg.decode_jpeg(self.data, colorspace="GRAY")[..., 0]
                 return grey
             except ValueError:
                 pass  # another colour space, or damage that OpenCV tolerates or reports
@@ -309,7 +309,7 @@ class EncodedImage:
 
     def _decode(self, flags: int) -> NDArray[Any]:
         try:
-            image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(self._data, np.uint8), flags)
+            image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(self.data, np.uint8), flags)
         except cv2.error as error:
             raise ImageError(
                 f"{self.name}: is not an image that can be decoded ({error.err})"
@@ -325,7 +325,7 @@ class EncodedImage:
         """
         if not self._is_jpeg or self._size is None or self._size[::-1] != tuple(shape):
             return None
-        return decode_parts(self._data, boxes)
+        return decode_parts(self.data, boxes)
 
 
 def decode_grey(source: Path | bytes) -> NDArray[Any]:

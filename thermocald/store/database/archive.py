@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, StoreError, UsageError
-from thermocald.files import make_folder, new_file
+from thermocald.files import make_folder, new_file, utc_stamp
 from thermocald.names import FileFolder
 from thermocald.store.database.store import Store
 from thermocald.store.recording.writer import RecordingWriter
@@ -130,8 +129,7 @@ def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
     folder does not, StoreError for a damaged store, which is not copied.
     """
     if target.is_dir():
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        target = target / f"{store.stem}-{stamp}.db"
+        target = target / f"{store.stem}-{utc_stamp()}.db"
     elif keep:
         raise UsageError(f"--keep is for a folder of backups; {target} is not a folder")
     if target.exists():

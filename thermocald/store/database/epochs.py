@@ -28,7 +28,7 @@ import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.names import WITH_VALUES, file_name, relative_path
+from thermocald.names import UNEVENTFUL, file_name, relative_path
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.store.database.columns import (
@@ -45,7 +45,7 @@ from thermocald.store.recording.head import head_document, parse_head
 from thermocald.store.recording.observation_file import ObservationRows
 from thermocald.store.recording.testfield_file import parse_testfield, testfield_csv
 from thermocald.store.schema import sql_name
-from thermocald.store.series import NOT_CALIBRATED, EpochResult, StoredEpoch, StoredSeries
+from thermocald.store.series import EpochResult, StoredEpoch, StoredSeries
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -530,7 +530,7 @@ def frames_after(connection: sqlite3.Connection, after: int, limit: int) -> Iter
         path, eventful = None, False
         try:
             path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
-            eventful = status not in (*WITH_VALUES, NOT_CALIBRATED) or "event" in json.loads(extra)
+            eventful = status not in UNEVENTFUL or "event" in json.loads(extra)
         except (StoreError, ValueError) as error:
             log.warning("%s; its frame is left out", error)
         yield KeptFrame(id_, series, number, time, path, eventful)

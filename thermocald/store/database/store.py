@@ -326,8 +326,7 @@ class Store(SeriesReader):
         file_name(head.camera.name, "camera", StoreError)
         file_name(head.series, "series", StoreError)
         with self._transaction(f"series {head.series!r} was not begun"):
-            names = {(one.camera, one.name) for one in self.all_series()}
-            if (head.camera.name, head.series) in names:
+            if self.series_of(head.camera.name, head.series) is not None:
                 raise StoreError(
                     f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
                     "already; choose another name"

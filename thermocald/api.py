@@ -304,7 +304,6 @@ def discover(
     >>> found.verdict
     'effects_found'
     """
-    from thermocald.discovery.entries import terms_of
     from thermocald.discovery.evidence import require_other_series
     from thermocald.discovery.result import discover_series
     from thermocald.results import Discovery
@@ -323,7 +322,7 @@ def discover(
     require_other_series(inputs)
     tell("reducing the epochs to normal equations")
     evidence = reduce_together(inputs, None if start is None else start.T0)
-    found = discover_series(evidence, say, () if start is None else terms_of(start), jobs)
+    found = discover_series(evidence, say, () if start is None else start.effects, jobs)
     values = vars(found) | {"doubts": tuple(_doubts(every, evidence))}
     return Discovery(**values, name=series.source.rsplit("/", 1)[-1], before=start)
 

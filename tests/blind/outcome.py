@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from thermocald.discovery import criteria
 from thermocald.discovery.result import Discovery
+
+EXCESS = 0.02  # of reduced χ²: a smaller excess is its own scatter and cannot be closed
 
 
 @dataclass
@@ -32,7 +33,7 @@ class Outcome:
 def excess_closed(discovery: Discovery) -> float | None:
     """Return the share of reduced χ²'s excess over the floor in M2 that the effects explain."""
     before, after = discovery.stages[0].verify, discovery.stages[-1].verify
-    if before is None or after is None or before.chi2_reduced - before.floor < criteria.EXCESS:
+    if before is None or after is None or before.chi2_reduced - before.floor < EXCESS:
         return None
     return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 

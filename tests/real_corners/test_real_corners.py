@@ -65,3 +65,4 @@ def test_a_moving_mount_does_not_hide_that_recordings_contradict_each_other():
     found = discover_series(reduce_together([input_of(s, "aviary-cam1") for s in (first, cooled)]))
 
     assert found.verdict == "unexplained"
+    assert "recordings contradict each other" in found.effects[0].statement

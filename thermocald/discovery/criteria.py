@@ -56,4 +56,3 @@ SHIFT_OR_TILT = 18.5  # quantile 0.999 of χ² with the four coefficients of shi
 LOOSE = 0.5  # sd over value above which a time constant is not determined: 2 sd
 NAMED_SHARE = 0.95  # share of an unnamed movement that the named parameters must explain
 NAMED_WORTH = 0.02  # share of it that one more of them must add
-EXCESS = 0.02  # of reduced χ²: a smaller excess is its own scatter and cannot be closed

@@ -23,7 +23,7 @@ from thermocald.photogrammetry.linalg import explained, inverse_of_determined, u
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
 from thermocald.physics.formula import known_together
-from thermocald.physics.model import ModelEffect, ThermalModel
+from thermocald.physics.model import ModelEffect
 from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.scan import normals_of_term
@@ -163,15 +163,6 @@ def effects_of(found: EffectFound) -> list[ModelEffect]:
     return [ModelEffect(name, {k: e["value"] for k, e in numbers.items()}, sds)]
 
 
-def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
-    """List a model's effects that act on the parameters' trajectories, with their values."""
-    return [
-        (e.name, dict(e.values))
-        for e in model.effects
-        if catalogue.get(e.name).seen_in == "trajectory"
-    ]
-
-
 _SHIFT = ("x0", "y0")
 _TILT = ("omega", "phi")
 _BOTH = ("c", "kappa")  # a scale and a rotation about the axis are always determined
@@ -294,7 +285,7 @@ def list_image_effects(x: Examination) -> list[EffectFound]:
     out = []
     if "targets" in x.image_places:
         out.append(_describe_moved_targets(x))
-    if x.noise_growth:
+    if x.noise_growth and "noise" in x.image_places:
         out.append(_describe_noise_growth(x.fitter.series[0], x.noise_growth))
     return out
 
@@ -303,7 +294,7 @@ def _describe_moved_targets(x: Examination) -> EffectFound:
     e = x.fitter.series[0]
     names = e.source.field.names
     group = max(x.displaced[0], key=lambda g: g.gain)
-    effect = catalogue.seen_in("targets")
+    effect = catalogue.find(lambda e: e.seen_in == "targets")
     lengths = np.linalg.norm(group.vectors, axis=1)
     sd = np.sqrt(np.mean(group.sd_vectors**2)) / np.sqrt(len(lengths))
     estimates: dict[str, Estimate] = {
@@ -337,7 +328,7 @@ def _describe_moved_targets(x: Examination) -> EffectFound:
 
 
 def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound:
-    effect = catalogue.seen_in("noise")
+    effect = catalogue.find(lambda e: e.seen_in == "noise")
     estimates = {"factor": _make_estimate(growth.factor, growth.sd, "1/K")}
     where = {
         "parameters": ["sigma0"],

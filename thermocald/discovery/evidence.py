@@ -226,17 +226,10 @@ def _keep_whole_markers(
     return out
 
 
-def left_by_cameras(e: ReducedSeries, rows: NDArray[np.int64]) -> Array:
-    """Return the targets' residuals about the free cameras, (E, n, 2) px, used in them or not."""
-    misclosure = e.source.grid.points[:, rows] - e.at.predicted[rows]
-    left: Array = misclosure - np.einsum("ek,tik->eti", e.values, e.columns[rows])
-    return left
-
-
 def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) -> list[Displaced]:
     """Measure the steps against the camera from the other targets; one group per time."""
     rows = np.array(sorted(jumps))
-    v = left_by_cameras(cleaned, rows)
+    v = cleaned.left_by_cameras(rows)
     w = cleaned.weights[..., 0]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     v = np.where(np.abs(v - np.nanmedian(v, axis=0)).max(axis=2, keepdims=True) < 1e6, v, np.nan)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,9 @@ from thermocald.discovery.validation import (
     measure_block_gains,
 )
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
+from thermocald.thermal.hypothesis import targets_of
 from thermocald.thermal.movement import (
     WAVES,
     add_jumps_to_noise,
@@ -40,6 +42,7 @@ from thermocald.thermal.movement import (
 from thermocald.thermal.noise import (
     NoiseGrowth,
     calibrate_thermometers,
+    estimate_noise_slope,
     noise_growth,
     weight_slow_noise,
 )
@@ -52,6 +55,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.series.field_motion import FieldMovement
+    from thermocald.physics.model import ModelEffect
     from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.movement import Mount
     from thermocald.thermal.scan import Adequacy
@@ -74,6 +78,7 @@ class Examination:
     mount, as terms of the base; as_slips: whether a slip inside the camera explains each equally
     well. unblocked: the series as examined, not averaged in blocks. field_movements: of boards and
     targets, per series. distortion_sigmas: significance of what the distortion follows.
+    knows_noise: whether the model has the growth of the noise already.
     """
 
     base: Solution
@@ -86,6 +91,7 @@ class Examination:
     cross_validation: tuple[Array, ...] = ()
     displaced: tuple[tuple[Displaced, ...], ...] = ()
     noise_growth: NoiseGrowth | None = None
+    knows_noise: bool = False
     surrogates: tuple[SurrogateTest, ...] = ()
     mount: Mount | None = None
     knocks: tuple[Term, ...] = ()
@@ -103,21 +109,23 @@ class Examination:
     def image_places(self) -> list[str]:
         """The places of effects that move no trajectory, in the document's order."""
         places = ["targets"] if self.displaced[0] else []
-        return [*places, "noise"] if self.noise_growth else places
+        return [*places, "noise"] if self.noise_growth and not self.knows_noise else places
 
 
 def examine_series(
     series: Sequence[ReducedSeries],
     progress: Callable[[str], None] | None = None,
-    given: Sequence[tuple[str, dict[str, Any]]] = (),
+    given: Sequence[ModelEffect] = (),
     jobs: int = 1,
 ) -> Examination:
     """Examine one series, or M1 and further series with the same physical constants.
 
-    given: effects that the model has already, with values; they are fitted again and stay. jobs:
-    number of candidates tested with surrogates at a time.
+    given: effects that the model has already; they are fitted again and stay. jobs: number of
+    candidates tested with surrogates at a time.
     """
     say = progress or (lambda _: None)
+    known, loose = {catalogue.get(m.name).seen_in for m in given}, set(targets_of(given))
+    given = [m for m in given if catalogue.get(m.name).seen_in == "trajectory"]
     say("targets that moved")
     displaced, cleaned, field = [], [], []
     for e in series:
@@ -125,13 +133,14 @@ def examine_series(
         groups, without = find_displaced_targets(still)
         wandering, without = drop_wandering_targets(without)
         field.append((*boards, *wandering))
-        displaced.append(tuple(groups))
+        names = e.source.field.names
+        displaced.append(tuple(g for g in groups if not {names[r] for r in g.rows} <= loose))
         cleaned.append(without)
     # only after the movements of the field are removed
     distortion, sure = choose_distortion(cleaned)
     cleaned = [e.in_basis(distortion) for e in cleaned]
     say("measuring noise")
-    growth = noise_growth(cleaned)
+    growth = (estimate_noise_slope if "noise" in known else noise_growth)(cleaned)
     if growth is not None:
         cleaned = [reweight(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
     calibrated = calibrate_thermometers(cleaned)
@@ -144,8 +153,8 @@ def examine_series(
         shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
         result = _examine_standing(ready, shaking, say, given, jobs)
     return replace(
-        result, displaced=tuple(displaced), noise_growth=growth, unblocked=tuple(cleaned),
-        field_movements=tuple(field), distortion_sigmas=sure,
+        result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
+        unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
     )  # fmt: skip
 
 
@@ -153,7 +162,7 @@ def _examine_standing(
     ready: list[ReducedSeries],
     shaking: list[ReducedSeries],
     say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]],
+    given: Sequence[ModelEffect],
     jobs: int,
 ) -> Examination:
     """Search with a mount that stands still, and again with what the effects found show.
@@ -335,7 +344,7 @@ def _is_adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
 def _examine_beside_mount(
     calibrated: list[ReducedSeries],
     say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]],
+    given: Sequence[ModelEffect],
     jobs: int,
 ) -> Examination | None:
     """Search beside a moving mount; None if that explains no movement as smooth as this one.

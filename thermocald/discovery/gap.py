@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.discovery.evidence import left_by_cameras
 from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 from thermocald.thermal.scan import examine
 
@@ -127,7 +126,7 @@ def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: fl
     moved, count = _measure_moved(e, x.displaced[series], "targets" in in_model)
     total, image, free = total + moved, image + moved, free + count
     chi2 = total / free
-    if x.noise_growth and "noise" not in in_model:
+    if x.noise_growth and "noise" in x.image_places[known:]:
         noise = x.noise_growth.noise[series]
         chi2 *= float(np.mean(noise**2)) / float(np.min(noise) ** 2)
     rms = e.sigma_px * float(np.sqrt(image / free))
@@ -150,7 +149,7 @@ def _measure_moved(
     w = evidence.weights[..., 0]
     weight = float(np.mean(w[w > 0]))
     for group in displaced:
-        v = left_by_cameras(evidence, group.rows)
+        v = evidence.left_by_cameras(group.rows)
         after = evidence.times >= group.time
         if known:
             v = np.where(after[:, None, None], v - group.steps, v)

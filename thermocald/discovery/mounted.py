@@ -10,7 +10,8 @@ size.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from itertools import islice
+from typing import TYPE_CHECKING
 
 from thermocald.discovery import criteria
 from thermocald.discovery.search import Search, Solution
@@ -28,6 +29,7 @@ from thermocald.thermal.movement import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from thermocald.physics.model import ModelEffect
     from thermocald.thermal.fit import HypothesisFitter
 
 _WIDTH = 4  # solutions of a level whose movement is estimated
@@ -46,7 +48,7 @@ _SETTLED = 0.1
 def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
-    given: Sequence[tuple[str, dict[str, Any]]] = (),
+    given: Sequence[ModelEffect] = (),
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks one by one while the penalised likelihood improves.
 
@@ -90,12 +92,8 @@ def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
 
     A scan without the movement of the mount may miss it.
     """
-    for solution in solutions:
-        other = search.with_other_delay(solution)
-        if other is not None:
-            names = [s.names for s in solutions]
-            return solutions if other.names in names else [*solutions, other]
-    return solutions
+    others = (o for s in solutions if (o := search.with_other_delay(s)) is not None)
+    return solutions + [o for o in islice(others, 1) if o.names not in [s.names for s in solutions]]
 
 
 def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
@@ -221,8 +219,7 @@ def contradict(best: Solution) -> bool:
     """
     count = len(best.fitter.series)
     shared = _profile(best, best).fit.objective
-    kinds = {n: catalogue.get(n) for n in catalogue.names()}
-    along_T = next(n for n, k in kinds.items() if isinstance(k, Proportional) and k.power == 1)
+    along_T = catalogue.find(lambda k: isinstance(k, Proportional) and k.power == 1).name
     for s in range(1, count):
         fresh = tuple(() if k == s else None for k in range(count))
         own = Term(along_T, BASE, fresh=fresh, through_drive=True)

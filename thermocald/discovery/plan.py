@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.entries import terms_of
 from thermocald.discovery.examination import examine_series
 from thermocald.discovery.search import list_candidates
 from thermocald.errors import UsageError
@@ -134,7 +133,7 @@ def plan_power(
     found: dict[str, dict[str, int]] = {}
     rng = np.random.default_rng(0)
     for source, simulation in inputs:
-        given = [] if simulation is None else terms_of(simulation.model)
+        given = () if simulation is None else simulation.model.effects
         evidence = reduce_series(source)
         fitter = HypothesisFitter([evidence])
         done: set[str] = set()
@@ -153,7 +152,7 @@ def plan_power(
     return Plan(found, len(inputs), strength_px)
 
 
-def _examine(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
+def _examine(evidence: ReducedSeries, given: Sequence[ModelEffect]) -> str:
     """Return the effects that an examination finds beyond the model's own."""
     x = examine_series([evidence], given=given)
     if not x.adequate:

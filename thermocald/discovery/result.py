@@ -43,6 +43,7 @@ from thermocald.physics.model import ModelEffect
 from thermocald.result import jsonable
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.noise import sharpen_trajectories
 from thermocald.thermal.scan import examine, examine_all
 
 if TYPE_CHECKING:
@@ -200,7 +201,7 @@ class Discovery:
 def discover_series(
     series: Sequence[ReducedSeries],
     progress: Callable[[str], None] | None = None,
-    given: Sequence[tuple[str, dict[str, Any]]] = (),
+    given: Sequence[ModelEffect] = (),
     jobs: int = 1,
 ) -> Discovery:
     """Examine M1, or M1 and further series, and describe the effects found.
@@ -219,20 +220,34 @@ def discover_series(
         stages.append(measure_stage(x, entry.effect, fits[0], k))
     if not x.adequate:
         return _conclude_unexplained(x, fits[0], stages, n, progress)
+    estimated = estimate_first(x, fits[-1].terms)[1] if len(terms) > known else fits[-1]
     for k in range(known, len(terms)):
         stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
-        found.append(_describe_effect(x, fits[-1], k))
+        found.append(_describe_effect(x, fits[-1], estimated, k))
     blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
 
 
-def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
-    """Describe a term beyond the base model; fit: constants from M1 alone."""
+def estimate_first(x: Examination, terms: Sequence[Term]) -> tuple[HypothesisFitter, Fit]:
+    """Estimate a hypothesis from M1 alone, as `fit` does.
+
+    A delay is an exception: where it puts the frames half-way between readings, the temperature
+    estimated from the images would seem to determine it.
+    """
+    fitter = HypothesisFitter(x.fitter.series[:1])
+    fit = fitter.fit([replace(t, fresh=t.fresh[:1]) for t in terms])
+    fit = fitter.refine(fit, 20, least_squares=True)
+    delayed = any(p.role == "delay" for t in terms for p in t.kind.nonlinear.values())
+    return fitter.refine_in(fit, () if delayed else (sharpen_trajectories,))
+
+
+def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> EffectFound:
+    """Describe a term beyond the base model; both fits are of M1 alone."""
     term = fit.terms[k]
     e = x.fitter.series[0]
     number = k - len(x.base.terms)
-    estimates = _widen_estimates(x, fit, k, estimate_term(fit, k, e))
+    estimates = _widen_estimates(x, estimated, k, estimate_term(estimated, k, e))
     others = x.fitter.refine(x.fitter.fit([t for i, t in enumerate(x.best.terms) if i != k]))
     without = others.objective + sum(p for i, p in enumerate(x.best.penalties) if i != k)
     blocks = [float(g) for g in x.cross_validation[number]]
@@ -286,8 +301,7 @@ def _find_lagging_thermometer(x: Examination, fit: Fit, k: int) -> dict[str, Any
     term = fit.terms[k]
     if float(dict(term.nonlinear).get(term.kind.delay, 0.0)) < 0.0:
         rate = next(n for n in catalogue.names() if catalogue.get(n).follows_rate)
-        fit = x.fitter.fit([Term(rate) if t is term else t for t in fit.terms])
-        fit = x.fitter.refine(fit)
+        fit = x.fitter.refine(x.fitter.fit([Term(rate) if t is term else t for t in fit.terms]))
         if fit.chi2 > x.best.fit.chi2 + criteria.DRIVES_BAND:
             return None
     return lagging_thermometer(fit, k)
@@ -305,7 +319,7 @@ def _widen_estimates(
     if richer is None:
         return estimates
     terms = (*fit.terms[:k], richer, *fit.terms[k + 1 :])
-    other = estimate_term(fit_first(x.fitter, terms), k, x.fitter.series[0])
+    other = estimate_term(estimate_first(x, terms)[1], k, x.fitter.series[0])
     return {
         name: {**e, "sd": max(e["sd"], other[name]["sd"])} if e["sd"] is not None else e
         for name, e in estimates.items()
@@ -376,7 +390,7 @@ def _conclude_unexplained(
         fits = fit_first(fitter, x.base.terms), fit_first(fitter, best.terms)
         added = (stages[-1].added, "unnamed")
         stages[-1:] = [measure_stage(x, a, f, known) for a, f in zip(added, fits, strict=True)]
-        entry = describe_proposal(described, proposal, x, fits[1])
+        entry = describe_proposal(described, proposal, x, estimate_first(x, best.terms)[1])
     else:
         before = measure_stage(x, "unnamed", base, known)
         gaps = (measure_gap(x, base, 0, known, alone.excess), *before.gaps[1:])
@@ -411,15 +425,15 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
     x = discovery.examination
     own = [t for t in discovery.final_fit.terms if t not in x.knocks]
     # an effect before the knocks, which may have its name
-    terms = [replace(t, fresh=t.fresh[:1]) for t in (*own, *x.knocks) if t.values(0) is not None]
-    fitter = HypothesisFitter(x.fitter.series[:1])
-    fit = fitter.refine(fitter.fit(terms))
+    fitter, fit = estimate_first(x, [t for t in (*own, *x.knocks) if t.values(0) is not None])
     listed = [m for e in discovery.effects if e.term is None for m in effects_of(e)]
+    found = {t.effect for t in own} | {m.name for m in listed}
+    listed += [m for m in (old.effects if old else ()) if m.name not in found]
     moved = [
         Moved(
             float(m.values["time"]),
             np.array([m.values[k] for k in kind.linear]),
-            np.diag([m.sds[k] ** 2 for k in kind.linear]),
+            np.diag([m.sds.get(k, 0.0) ** 2 for k in kind.linear]),
         )
         for m in listed
         if (kind := catalogue.get(m.name)).seen_in == "targets"

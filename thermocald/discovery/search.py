@@ -28,6 +28,7 @@ from thermocald.thermal.scan import Scanner
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from thermocald.physics.model import ModelEffect
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.movement import Mount
@@ -138,10 +139,10 @@ class Search:
         self._refined: dict[tuple[Term, ...], Fit] = {}
         self._known: dict[frozenset[tuple[str, tuple[str, ...]]], Solution] = {}
 
-    def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
+    def base(self, given: Sequence[ModelEffect] = ()) -> Solution:
         """Fit the base model with the effects that the model has already."""
         count = len(self.fitter.series)
-        terms = [make_known_term(name, values, count) for name, values in given]
+        terms = [make_known_term(e.name, e.values, count) for e in given]
         fit = self.fitter.fit(terms)
         fit = self.fitter.refine(fit) if terms else fit
         return Solution(fit, (0.0,) * len(terms), self.fitter)

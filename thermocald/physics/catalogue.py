@@ -82,11 +82,6 @@ def find(wanted: Callable[[Effect], bool]) -> Effect:
     raise ConfigurationError("no installed effect has the property that was asked for")
 
 
-def seen_in(place: str) -> Effect:
-    """Return the effect that shows in a place: in the "noise", or in single "targets"."""
-    return find(lambda effect: effect.seen_in == place)
-
-
 def driven_history(history: History, drives: Drives) -> History:
     """Return the history with its reference's readings passed through drives [(effect, values)]."""
     for name, values in drives:

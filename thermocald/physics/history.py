@@ -31,19 +31,28 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from scipy.sparse import csr_array
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
 
 
 @dataclass(frozen=True, eq=False)
 class Polygon:
     """A temperature as a polygon: times (K,) s ascending, values (K,) °C.
 
-    matrix (K, R): values = matrix @ readings, with missing readings as 0.
+    weights: weight, knot and reading of each entry of `matrix`; readings: their number R.
     """
 
     times: Array
     values: Array
-    matrix: csr_array
+    weights: tuple[Array, Index, Index]
+    readings: int
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """∂ values / ∂ readings (K, R)."""
+        from scipy.sparse import csr_array
+
+        weight, *place = self.weights
+        return csr_array((weight, tuple(place)), shape=(len(self.times), self.readings))
 
     def at(self, times: ArrayLike) -> Array:
         """Return the temperature (...,) °C at some times; constant beyond the ends."""
@@ -110,8 +119,6 @@ class History:
 
 def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
     """Lay knots at the valid readings; extrapolate the outer edges by at most their own length."""
-    from scipy.sparse import csr_array
-
     rows = np.flatnonzero(np.isfinite(readings) & np.isfinite(times))
     if not len(rows):
         raise DataError("the temperature was never read: every reading of the column is empty")
@@ -131,12 +138,10 @@ def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
             column.append(rows[[first, second]])
             weight.append(np.array([1.0 + share, -share]))
             knot.append(np.full(2, place))
-    matrix = csr_array(
-        (np.concatenate(weight), (np.concatenate(knot), np.concatenate(column))),
-        shape=(n + early + late, len(times)),
-    )
+    weights, places, columns = (np.concatenate(x) for x in (weight, knot, column))
     knots = np.concatenate([[begin], t, [end]])[1 - early : n + 1 + late]
-    return Polygon(knots, matrix @ np.where(np.isfinite(readings), readings, 0.0), matrix)
+    values = np.bincount(places, weights * readings[columns]).astype(float, copy=False)
+    return Polygon(knots, values, (weights, places, columns), len(times))
 
 
 Follower = Callable[[float, float], float]

@@ -203,13 +203,10 @@ class ThermalModel:
 
         They do not if a drive that looks ahead comes before another: it changes its past values.
         """
-        for name, values in self.drives[:-1]:
-            delay = catalogue.get(name).delay
-            if delay and float(values[delay]) < 0:
-                return False
+        if any(float(v.get(catalogue.get(n).delay, 0.0)) < 0 for n, v in self.drives[:-1]):
+            return False
         kinds = [catalogue.get(e.name) for e in self.effects]
-        signals = [kind for kind in kinds if not kind.is_drive]
-        return all(kind.of_now or not set(kind.linear) & set(IOP_NAMES) for kind in signals)
+        return all(k.is_drive or k.of_now or not set(k.linear) & set(IOP_NAMES) for k in kinds)
 
     def carried(self, linear: Array) -> Array:
         """Return the interior orientations (…, 10) for linear ones, in the distortion's basis."""

@@ -438,6 +438,21 @@ class HypothesisFitter:
         A, _, searched = self.normal_equations(fit, only)
         return replace(fit, covariance=scaled_inverse(A, _RIDGE), searched=tuple(searched))
 
+    def refine_in(
+        self,
+        fit: Fit,
+        steps: Sequence[Callable[[HypothesisFitter, Fit], list[ReducedSeries] | None]],
+    ) -> tuple[HypothesisFitter, Fit]:
+        """Refine a fit by least squares in the series that each step returns, if it returns any."""
+        fitter = self
+        for step in steps:
+            better = step(fitter, fit)
+            if better is not None:
+                fitter = HypothesisFitter(better)
+                fitter.held, fitter.priors = self.held, self.priors
+                fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), 20, least_squares=True)
+        return fitter, fit
+
 
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:
     """Return the drives among some terms, as `catalogue.drive` takes them."""

@@ -362,6 +362,15 @@ def effect_with(name: str, values: Mapping[str, Any]) -> ModelEffect:
     return ModelEffect(name, {**usual, **values})
 
 
+def targets_of(listed: Iterable[ModelEffect]) -> tuple[str, ...]:
+    """Return the targets that effects name as moving."""
+    names: list[str] = []
+    for effect in listed:
+        targets = effect.values.get("targets", ())
+        names += [targets] if isinstance(targets, str) else list(targets)
+    return tuple(names)
+
+
 def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) -> None:
     """Raise UsageError if an effect names a channel or a target that a series does not have."""
     effects = list(listed)
@@ -373,8 +382,7 @@ def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) 
                     f"effect {effect.name}: {s.source.name} has no temperature column {channel!r}; "
                     f"{_suggest(channel, s.source.readings)}"
                 )
-            targets = effect.values.get("targets", ())
-            for target in (targets,) if isinstance(targets, str) else targets:
+            for target in targets_of([effect]):
                 if target not in s.source.field.index:
                     raise UsageError(
                         f"effect {effect.name}: the test field of {s.source.name} has no target "

@@ -233,8 +233,8 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
     direction = fit.direction(fit.blocks[0])[0]
     out = []
     for s, e in enumerate(fitter.series):
-        if e.blocks is not None:
-            out.append(e)
+        if e.blocks is not None or e.movement is not None or e.tremble is not None:
+            out.append(e)  # means have little noise; a camera that moves measures no temperature
             continue
         name = e.history.reference
         old = e.thermometers[name]

@@ -220,6 +220,12 @@ class ReducedSeries:
         squares: Array = np.einsum("ep,epq,eq->e", r, self.N, r)
         return squares
 
+    def left_by_cameras(self, rows: NDArray[np.int64]) -> Array:
+        """Return targets' residuals about the free cameras, (E, n, 2) px, used in them or not."""
+        misclosure = self.source.grid.points[:, rows] - self.at.predicted[rows]
+        left: Array = misclosure - np.einsum("ek,tik->eti", self.values, self.columns[rows])
+        return left
+
     def with_values(self, values: Array) -> ReducedSeries:
         """Return the series with other free cameras (E, 19)."""
         b = np.einsum("epq,eq->ep", self.N, values)

@@ -166,10 +166,8 @@ def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
 
     A direction that the rays do not determine stays 0 and has no variance.
     """
-    grid = others.source.grid
-    left = grid.points[:, rows] - others.at.predicted[rows]
-    left = left - np.einsum("ek,tik->eti", others.values, others.columns[rows])
-    seen = (grid.weights[:, rows, 0] > 0) & (others.n > 0)[:, None]
+    left = others.left_by_cameras(rows)
+    seen = (others.source.grid.weights[:, rows, 0] > 0) & (others.n > 0)[:, None]
     left[~seen] = np.nan
     sd = others.sigma_px
     half = _WINDOW // 2

@@ -25,7 +25,7 @@ from thermocald.analysis.thermal.level import (
     estimate_step,
     project_targets,
 )
-from thermocald.analysis.thermal.thermal_model import event_threshold, targets_of
+from thermocald.analysis.thermal.thermal_model import event_threshold
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
@@ -35,7 +35,13 @@ from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive_matrix
 from thermocald.thermal.fit import HypothesisFitter
-from thermocald.thermal.hypothesis import BASE, Term, make_candidate, make_known_term
+from thermocald.thermal.hypothesis import (
+    BASE,
+    Term,
+    make_candidate,
+    make_known_term,
+    targets_of,
+)
 from thermocald.thermal.reduce import without_targets
 from thermocald.thermal.scan import Scanner
 from thermocald.thermal.series import COLUMNS

@@ -387,9 +387,8 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
 
 def _span(series: Sequence[ReducedSeries], channel: str) -> tuple[float, float]:
     values = [s.source.readings[channel] for s in series if channel in s.source.readings]
-    both = np.concatenate(values)
-    low, high = float(np.nanmin(both)), float(np.nanmax(both))
-    return float(np.floor(low * 10) / 10), float(np.ceil(high * 10) / 10)
+    both = 10 * np.concatenate(values)
+    return float(np.floor(np.nanmin(both)) / 10), float(np.ceil(np.nanmax(both)) / 10)
 
 
 def _rms(series: ReducedSeries, model: ThermalModel) -> float:

@@ -22,7 +22,7 @@ from thermocald.analysis.thermal.result import build_camera
 from thermocald.errors import DataError
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
-from thermocald.thermal.hypothesis import BASE, Term, make_candidate
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
 from thermocald.thermal.movement import add_jumps_to_noise
 from thermocald.thermal.noise import (
     calibrate_thermometers,
@@ -84,15 +84,6 @@ def fit_thermal_model(
     return build_camera(fitter, fit, others, listed, growth, moved, sure)
 
 
-def targets_of(listed: Sequence[ModelEffect]) -> tuple[str, ...]:
-    """Return the targets that effects name as moving."""
-    names: list[str] = []
-    for effect in listed:
-        targets = effect.values.get("targets", ())
-        names += [targets] if isinstance(targets, str) else list(targets)
-    return tuple(names)
-
-
 def _fit_hypothesis(
     series: Sequence[ReducedSeries],
     listed: Sequence[ModelEffect],
@@ -112,13 +103,8 @@ def _fit_hypothesis(
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
         fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
-    for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
-        better = again(fitter, fit)
-        if better is not None:
-            fitter = HypothesisFitter(better)
-            fitter.held, fitter.priors = held, priors
-            fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), 20, least_squares=True)
-    return fitter, fit
+    twice = (sharpen_trajectories, sharpen_trajectories)
+    return fitter.refine_in(fit, (*twice, remove_curvature, add_jumps_to_noise))
 
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:

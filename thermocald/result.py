@@ -11,8 +11,6 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from thermocald.files import write_text
 
 if TYPE_CHECKING:
@@ -151,6 +149,8 @@ def csv_text(
 
 
 def _cells(name: str, values: NDArray[Any] | Sequence[str], decimal: str) -> Sequence[str]:
+    import numpy as np  # the command line's list of commands does without
+
     if not isinstance(values, np.ndarray):
         return values
     if values.dtype.kind in "iU":

@@ -242,9 +242,10 @@ def result(
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
     slow, step = np.zeros((16, 16)), 0
-    if many:
+    if many and estimate.solved.any():
         # only of few targets is it unknown which have moved
-        few = 2 * np.median(use.sum(axis=1)) - s.carried < TRUSTED_REDUNDANCY
+        targets = np.median(use[estimate.solved].sum(axis=1))
+        few = 2 * targets - s.carried < TRUSTED_REDUNDANCY
         changes, step = slow_errors(
             estimate.residuals, use & estimate.solved[:, None], bool(few) and not series.windows
         )

@@ -139,24 +139,30 @@ def csv_text(
 ) -> Iterator[str]:
     """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
     for number, columns in enumerate(parts):
-        text = io.StringIO()
-        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
-        if not number:
-            writer.writerow(columns)
-        cells = [_cells(name, values, decimal) for name, values in columns.items()]
-        writer.writerows(zip(*cells, strict=True))
-        yield text.getvalue()
+        yield _csv_part(columns, not number, separator, decimal)
 
 
-def _cells(name: str, values: NDArray[Any] | Sequence[str], decimal: str) -> Sequence[str]:
+def _csv_part(
+    columns: Mapping[str, NDArray[Any] | Sequence[str]], first: bool, separator: str, decimal: str
+) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+    if first:
+        writer.writerow(columns)
+    cells = [_cells(name, values, decimal) for name, values in columns.items()]
+    writer.writerows(zip(*cells, strict=True))
+    return text.getvalue()
+
+
+def _cells(name: str, values: NDArray[Any] | Sequence[str], decimal: str) -> Iterable[str]:
     import numpy as np  # the command line's list of commands does without
 
     if not isinstance(values, np.ndarray):
         return values
     if values.dtype.kind in "iU":
-        return [str(v) for v in values.tolist()]
-    digits = [
+        return map(str, values.tolist())
+    digits = (
         "" if not math.isfinite(v) else f"{v:.6f}" if name == "frame_time" else repr(v)
         for v in values.tolist()
-    ]
-    return [d.replace(".", decimal) for d in digits] if decimal != "." else digits
+    )
+    return (d.replace(".", decimal) for d in digits) if decimal != "." else digits

@@ -245,11 +245,11 @@ def result(
     if many and estimate.solved.any():
         # only of few targets is it unknown which have moved
         targets = np.median(use[estimate.solved].sum(axis=1))
-        few = 2 * targets - s.carried < TRUSTED_REDUNDANCY
+        few = bool(2 * targets - s.carried < TRUSTED_REDUNDANCY)
         changes, step = slow_errors(
-            estimate.residuals, use & estimate.solved[:, None], bool(few) and not series.windows
+            estimate.residuals, use & estimate.solved[:, None], few and not series.windows
         )
-        slow = slow_target_covariance(system, changes, series.testfield.groups, bool(few))
+        slow = slow_target_covariance(system, changes, series.testfield.groups, few)
         trend += slow
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]

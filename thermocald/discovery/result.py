@@ -239,7 +239,7 @@ def estimate_first(x: Examination, terms: Sequence[Term]) -> tuple[HypothesisFit
     fit = fitter.fit([replace(t, fresh=t.fresh[:1]) for t in terms])
     fit = fitter.refine(fit, 20, least_squares=True)
     delayed = any(p.role == "delay" for t in terms for p in t.kind.nonlinear.values())
-    return fitter.refine_in(fit, () if delayed else (sharpen_trajectories,))
+    return fitter, fit if delayed else fitter.refine_in(sharpen_trajectories(fitter, fit), fit)
 
 
 def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> EffectFound:

@@ -438,20 +438,12 @@ class HypothesisFitter:
         A, _, searched = self.normal_equations(fit, only)
         return replace(fit, covariance=scaled_inverse(A, _RIDGE), searched=tuple(searched))
 
-    def refine_in(
-        self,
-        fit: Fit,
-        steps: Sequence[Callable[[HypothesisFitter, Fit], list[ReducedSeries] | None]],
-    ) -> tuple[HypothesisFitter, Fit]:
-        """Refine a fit by least squares in the series that each step returns, if it returns any."""
-        fitter = self
-        for step in steps:
-            better = step(fitter, fit)
-            if better is not None:
-                fitter = HypothesisFitter(better)
-                fitter.held, fitter.priors = self.held, self.priors
-                fit = fitter.refine(fitter.fit(fit.terms, fit.coefficients), 20, least_squares=True)
-        return fitter, fit
+    def refine_in(self, better: Sequence[ReducedSeries] | None, fit: Fit) -> Fit:
+        """Refine a fit in better series, if there are any; they replace the fitter's."""
+        if better is None:
+            return fit
+        self.series, self.thermometer_factor, self._caches = tuple(better), 1.0, {}
+        return self.refine(self.fit(fit.terms, fit.coefficients), 20, least_squares=True)
 
 
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:

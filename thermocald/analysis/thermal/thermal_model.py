@@ -103,8 +103,9 @@ def _fit_hypothesis(
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
         fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
-    twice = (sharpen_trajectories, sharpen_trajectories)
-    return fitter.refine_in(fit, (*twice, remove_curvature, add_jumps_to_noise))
+    for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
+        fit = fitter.refine_in(again(fitter, fit), fit)
+    return fitter, fit
 
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:

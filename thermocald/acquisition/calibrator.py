@@ -46,7 +46,7 @@ _WRONG_START = 5.0  # times the last sigma0; more: the camera has been knocked
 
 def fingerprint(frame: bytes | NDArray[Any]) -> int:
     """Return a number that differs between any two frames, encoded or as values, by their noise."""
-    return crc32(frame if isinstance(frame, bytes) else frame.tobytes())
+    return crc32(frame if isinstance(frame, bytes) else np.ascontiguousarray(frame).data)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

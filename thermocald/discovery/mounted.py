@@ -10,7 +10,6 @@ size.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import islice
 from typing import TYPE_CHECKING
 
 from thermocald.discovery import criteria
@@ -92,8 +91,12 @@ def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
 
     A scan without the movement of the mount may miss it.
     """
-    others = (o for s in solutions if (o := search.with_other_delay(s)) is not None)
-    return solutions + [o for o in islice(others, 1) if o.names not in [s.names for s in solutions]]
+    for solution in solutions:
+        other = search.with_other_delay(solution)
+        if other is not None:
+            names = [s.names for s in solutions]
+            return solutions if other.names in names else [*solutions, other]
+    return solutions
 
 
 def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:

@@ -31,6 +31,7 @@ from typing import (
     Self,
     runtime_checkable,
 )
+from zlib import crc32
 
 from pydantic import ConfigDict, Field, ValidationError
 
@@ -65,6 +66,7 @@ class Frame:
     settings: {name: value} of the settings that can move the image, read back with this frame:
     focus, exposure, gain, white balance in the device's own units; 1.0 and 0.0 for automatic modes
     on and off. They are stored with the epoch in the columns `camera_<name>`.
+    fingerprint: a number that differs between any two images by their noise; None without one.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -75,12 +77,17 @@ class Frame:
     encoded: bytes | None = None
     observations: Mapping[str, Any] | None = None
     settings: Mapping[str, float] = field(default_factory=dict)
+    fingerprint: int | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         if self.image is None and self.encoded is None and self.observations is None:
             raise ValueError("a frame needs an image, encoded bytes, or observations")
+        data: bytes | memoryview | None = self.encoded
         if self.image is not None:
             self.image.setflags(write=False)
+            data = self.image.data if self.image.flags.c_contiguous else self.image.tobytes()
+        if data is not None:
+            object.__setattr__(self, "fingerprint", crc32(data))
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, calibrated_epochs
 from thermocald.epoch import Epoch
@@ -38,6 +39,24 @@ def test_a_repeated_frame_is_no_new_observation():
     assert [d.adjustment.status for d in done] == statuses
     assert "epoch 1" in done[3].adjustment.reason
     assert [d.epoch.observations is None for d in done[2:5]] == [True, True, False]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_block_knows_the_frame_before_it(jobs):
+    """A daemon calibrates without blocks, and says of a replayed series what a replay says."""
+    calibrator, epochs = scene(EPOCHS_OF_A_BLOCK + 2)
+    first = EPOCHS_OF_A_BLOCK
+    epochs[first] = replace(epochs[first - 1], number=first)
+    done = list(calibrated_epochs(calibrator(), epochs, jobs))[first - 1 :]
+    assert [d.adjustment.status for d in done] == ["ok", "repeated_frame", "ok"]
+
+
+def test_an_epoch_that_is_calibrated_late_is_not_the_last_one():
+    calibrator, (a, b, c) = scene(3)
+    one = calibrator()
+    late = [replace(a, number=7), replace(b, number=3), replace(a, number=8), replace(c, number=9)]
+    statuses = [one.calibrate(epoch).adjustment.status for epoch in late]
+    assert statuses == ["ok", "ok", "repeated_frame", "ok"]
 
 
 def test_processes_do_not_matter():

@@ -25,7 +25,7 @@ class SlowCalibrator:
         self.testfield = None
         self.seen: list[int] = []
 
-    def calibrate(self, epoch: Epoch, image=None) -> CalibratedEpoch:
+    def calibrate(self, epoch: Epoch, image=None, fingerprint=None) -> CalibratedEpoch:
         self.gate.wait(10.0)
         self.seen.append(epoch.number)
         if epoch.number == 666:

@@ -246,6 +246,21 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
     assert found == 10
 
 
+def test_a_repeated_frame_is_no_second_pose():
+    """Two different poses in a row are a movement: one wrong frame, delivered twice, is not."""
+    world = World(208)
+    gauge = GaugeCalibrator(thermal_camera(), world.field)
+    epochs = [world.epoch(k, 20.0) for k in range(1, 8)]
+    seen = epochs[4].observations
+    moved = replace(seen, points=seen.points + np.array([1.0, 0.0]))
+    epochs[4:6] = (replace(epoch, observations=moved) for epoch in epochs[4:6])
+    results, statuses, events = followed(gauge, epochs)
+    assert statuses == [*["resected"] * 5, "repeated_frame", "resected"]
+    assert results[5].epoch.observations is None
+    assert "epoch 5" in results[5].adjustment.reason
+    assert not events
+
+
 def test_a_missing_effect_is_reported_unlike_a_knock():
     """c has a quadratic term that the model lacks, which no single frame shows."""
     world = World(700)

@@ -260,7 +260,7 @@ def test_repeated_epochs_count_once():
     thrice = scene.adjusted_series(
         field, [o for o in observations for _ in range(3)], exterior="series"
     )
-    assert list(thrice.status) == ["ok", "no_observations", "no_observations"] * 30
+    assert list(thrice.status) == ["ok", "repeated_frame", "repeated_frame"] * 30
     np.testing.assert_allclose(thrice.sd[::3], once.sd, rtol=0.01)
     assert (np.abs(thrice.values[::3] - once.values) < 0.1 * once.sd)[:, OWN].all()
 

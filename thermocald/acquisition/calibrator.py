@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 from zlib import crc32
 
 import numpy as np
@@ -44,11 +44,6 @@ if TYPE_CHECKING:
 _WRONG_START = 5.0  # times the last sigma0; more: the camera has been knocked
 
 
-def fingerprint(frame: bytes | NDArray[Any]) -> int:
-    """Return a number that differs between any two frames, encoded or as values, by their noise."""
-    return crc32(frame if isinstance(frame, bytes) else np.ascontiguousarray(frame).data)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedEpoch:
     """An epoch with its observations and its adjustment.
@@ -63,21 +58,63 @@ class CalibratedEpoch:
     searched: str = ""
 
 
-class EpochCalibrator(Protocol):
-    """A calibrator as a pipeline calls it: this module's, or one that predicts the camera."""
+class EpochCalibrator:
+    """A calibrator as a pipeline calls it: this module's, or one that predicts the camera.
+
+    The same frame again, or the same image points, is no new observation: the epoch has the status
+    `repeated_frame`, and no observations.
+    """
 
     testfield: TestField
+    _seen: tuple[int | None, int] = None, 0
+    """Fingerprint and number of the last epoch with observations."""
 
     def calibrate(
-        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
+        self,
+        epoch: Epoch,
+        image: NDArray[Any] | EncodedImage | None = None,
+        fingerprint: int | None = None,
     ) -> CalibratedEpoch:
-        """Calibrate an epoch; never raises for bad data."""
+        """Calibrate an epoch from its observations, or from its frame; never raises for bad data.
+
+        image: the frame as grey values or encoded, with its fingerprint; by default the file that
+        the epoch names.
+        """
+        raise NotImplementedError
 
     def reset(self) -> None:
-        """Forget where the camera was."""
+        """Forget the last epoch."""
+        self._seen = None, 0
+
+    def _look(
+        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None, fingerprint: int | None
+    ) -> tuple[NDArray[Any] | EncodedImage | None, int | None]:
+        """Return the image to be measured, None if there is none, and the epoch's fingerprint.
+
+        Raises ImageError.
+        """
+        if (points := epoch.observations) is not None:
+            return None, crc32(points.targets.tobytes() + points.points.tobytes())
+        if image is None and epoch.frame is not None:
+            image = EncodedImage(epoch.frame)
+            fingerprint = crc32(image.data)
+        return image, fingerprint
+
+    def _repeated(self, epoch: Epoch, fingerprint: int | None) -> CalibratedEpoch | None:
+        """Return the result of an epoch that repeats the last one, None for any other."""
+        if fingerprint is None or fingerprint != self._seen[0]:
+            return None
+        why = f"it repeats the frame of epoch {self._seen[1]}, and is no new observation"
+        bad = failed("repeated_frame", why)
+        return CalibratedEpoch(replace(epoch, observations=None), bad, {})
+
+    def _remember(self, epoch: Epoch, fingerprint: int | None) -> None:
+        """Remember an epoch with observations, unless a later one was calibrated before it."""
+        if epoch.number >= self._seen[1]:
+            self._seen = fingerprint, epoch.number
 
 
-class Calibrator:
+class Calibrator(EpochCalibrator):
     """Measures and adjusts the epochs of one camera, one after the other.
 
     nominal_c: mm, from the data sheet; interior: an earlier calibration, for the start and for the
@@ -116,58 +153,55 @@ class Calibrator:
         )
 
     def reset(self) -> None:
-        """Forget where the camera was."""
+        """Forget the last epoch, and where the camera was."""
+        super().reset()
+        self._start_anew()
+
+    def _start_anew(self) -> None:
         self._last: Adjustment | None = None
         self._usual = float("nan")
-        self._seen: tuple[int | None, int] = None, 0  # fingerprint and number of the last epoch
         self._tracker.reset()
 
+    def begin_block(self, before: Epoch | None) -> None:
+        """Start anew, knowing of the epoch before only whether the next one repeats it."""
+        self.reset()
+        if before is not None:
+            self.calibrate(before)
+            self._start_anew()
+
     def calibrate(
-        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
+        self,
+        epoch: Epoch,
+        image: NDArray[Any] | EncodedImage | None = None,
+        fingerprint: int | None = None,
     ) -> CalibratedEpoch:
         """Measure the epoch's frame unless it has observations already, and adjust.
 
-        image: the frame as grey values or encoded; by default the file that the epoch names. Never
-        raises for bad data: an epoch without a result has a status and a reason. The same frame
-        again, or the same image points, is no new observation: the status is `repeated_frame`.
+        Never raises for bad data: an epoch without a result has a status and a reason.
         """
         extra: dict[str, float] = {}
         searched = ""
-        observations = epoch.observations
-        if observations is None:
-            if image is None and epoch.frame is None:
-                why = epoch.note or "neither a frame nor observations"
-                return CalibratedEpoch(epoch, failed("no_frame", why), extra)
-            try:
-                if image is None:
-                    assert epoch.frame is not None
-                    image = EncodedImage(epoch.frame)
-                seen = fingerprint(image.data if isinstance(image, EncodedImage) else image)
-                if seen == self._seen[0]:
-                    return self._repeated(epoch)
+        try:
+            image, fingerprint = self._look(epoch, image, fingerprint)
+            if repeated := self._repeated(epoch, fingerprint):
+                return repeated
+            if image is not None:
                 measured = self._tracker.measure(image)
-            except ImageError as error:
-                return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
-            searched = measured.searched
-            observations = measured.observations
-            epoch = replace(epoch, observations=observations)
-            extra = frame_figures(observations, self.sensor)
-            if not measured.status.ok:
-                bad = failed(measured.status.word, measured.status.reason, observations)
-                return CalibratedEpoch(epoch, bad, extra, searched)
-        else:
-            seen = crc32(observations.targets.tobytes() + observations.points.tobytes())
-            if seen == self._seen[0]:
-                return self._repeated(epoch)
-        if len(observations):
-            self._seen = seen, epoch.number
-        return CalibratedEpoch(epoch, self.adjust(observations), extra, searched)
-
-    def _repeated(self, epoch: Epoch) -> CalibratedEpoch:
-        """Return the epoch of a repeated frame, without its observations: they count once."""
-        why = f"it repeats the frame of epoch {self._seen[1]}, and is no new observation"
-        bad = failed("repeated_frame", why)
-        return CalibratedEpoch(replace(epoch, observations=None), bad, {})
+                searched = measured.searched
+                epoch = replace(epoch, observations=measured.observations)
+                extra = frame_figures(measured.observations, self.sensor)
+                if not measured.status.ok:
+                    status = measured.status.word, measured.status.reason
+                    bad = failed(*status, measured.observations)
+                    return CalibratedEpoch(epoch, bad, extra, searched)
+        except ImageError as error:
+            return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
+        if epoch.observations is None:
+            why = epoch.note or "neither a frame nor observations"
+            return CalibratedEpoch(epoch, failed("no_frame", why), extra)
+        if len(epoch.observations):
+            self._remember(epoch, fingerprint)
+        return CalibratedEpoch(epoch, self.adjust(epoch.observations), extra, searched)
 
     def weighed(self, observations: Observations) -> Observations:
         """Return the observations with the sigmas used in the adjustment."""
@@ -209,18 +243,28 @@ def calibrated_epochs(
     for bad data: an epoch without a result has a status and a reason.
     """
     if jobs <= 1:
+        before = None
         for number, epoch in enumerate(epochs):
-            if number and number % EPOCHS_OF_A_BLOCK == 0:
-                calibrator.reset()
+            if number % EPOCHS_OF_A_BLOCK == 0:
+                calibrator.begin_block(before)
             yield calibrator.calibrate(epoch)
+            before = epoch
         return
-    source = iter(epochs)
-    blocks = iter(lambda: list(islice(source, EPOCHS_OF_A_BLOCK)), [])
-    for block in in_order(_calibrate_block, calibrator, blocks, jobs):
+    for block in in_order(_calibrate_block, calibrator, _blocks(epochs), jobs):
         yield from block
 
 
-def _calibrate_block(calibrator: Calibrator, epochs: list[Epoch]) -> list[CalibratedEpoch]:
+def _blocks(epochs: Iterable[Epoch]) -> Iterator[tuple[Epoch | None, list[Epoch]]]:
+    """Yield blocks of epochs, each with the epoch before it."""
+    source, before = iter(epochs), None
+    while block := list(islice(source, EPOCHS_OF_A_BLOCK)):
+        yield before, block
+        before = block[-1]
+
+
+def _calibrate_block(
+    calibrator: Calibrator, block: tuple[Epoch | None, list[Epoch]]
+) -> list[CalibratedEpoch]:
     """Calibrate a block anew with the calibrator of this process."""
-    calibrator.reset()
-    return [calibrator.calibrate(epoch) for epoch in epochs]
+    calibrator.begin_block(block[0])
+    return [calibrator.calibrate(epoch) for epoch in block[1]]

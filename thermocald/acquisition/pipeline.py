@@ -51,7 +51,7 @@ def calibrate_frame(calibrator: EpochCalibrator, epoch: Epoch, frame: Frame) -> 
         image = EncodedImage(frame.encoded or b"") if frame.image is None else frame.image
     except DataError as error:
         return CalibratedEpoch(epoch, failed("bad_frame", str(error)), {})
-    return calibrator.calibrate(epoch, image)
+    return calibrator.calibrate(epoch, image, frame.fingerprint)
 
 
 @dataclass(eq=False)

@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator, fingerprint
+from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper
@@ -273,7 +273,7 @@ class CameraLine:
         self.run: SeriesRun | None = None
         self._checking = False
         self._started = False
-        self._sample: int | None = None  # of the last frame
+        self._fingerprint: int | None = None  # of the last frame
         self._repeats = 0  # frames since then that are identical to it
         self._swap = threading.Lock()
         self.link = Link(
@@ -312,6 +312,8 @@ class CameraLine:
         """
         run = None if series is None else SeriesRun(self, series, start, limit)
         self._replace(run, checking=False)
+        if self.plan.calibrator is not None:
+            self.plan.calibrator.reset()  # a frame of the check or of another series is no repeat
         if run is not None and self._started:
             run.pipeline.start()
 
@@ -356,10 +358,9 @@ class CameraLine:
 
     def _count_repeats(self, frame: Frame) -> None:
         """Count frames that are identical to the one before, as noise makes impossible."""
-        data = frame.encoded if frame.image is None else frame.image
-        sample = None if data is None else fingerprint(data)
-        repeated = sample is not None and sample == self._sample
-        self._sample, self._repeats = sample, self._repeats + 1 if repeated else 0
+        mark, last = frame.fingerprint, self._fingerprint
+        self._fingerprint = mark
+        self._repeats = self._repeats + 1 if mark is not None and mark == last else 0
         if self._repeats == _FROZEN:
             text = f"camera {self.plan.name}: {self._frozen()[0]}"
             log.warning(text, extra={"event": "frozen"})

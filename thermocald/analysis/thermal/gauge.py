@@ -12,6 +12,7 @@ no row has the status `ok`, so that a study or a fit does not take a prediction 
     outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
                    all if too far
     no_temperature the last reading is too old, or there is none
+    repeated_frame the frame of the epoch before again, which says nothing of the present
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.acquisition.calibrator import CalibratedEpoch
+from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.predictor import GAP_S, Predictor
 from thermocald.errors import ConfigurationError, DataError, ImageError
@@ -40,7 +41,6 @@ from thermocald.photogrammetry.epoch.measuring import resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 from thermocald.photogrammetry.frame.tracking import Tracker
-from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
+    from thermocald.photogrammetry.targets.image_file import EncodedImage
     from thermocald.store.series import StoredEpoch
 
 _FEWEST = 3  # control points, if there is an earlier pose
@@ -110,7 +111,7 @@ class Movement:
         )
 
 
-class GaugeCalibrator:
+class GaugeCalibrator(EpochCalibrator):
     """A calibrator that predicts and poses the epochs of one camera in turn.
 
     control, finder: the control points and what measures them, or None; mount_sd_deg: the random
@@ -161,7 +162,8 @@ class GaugeCalibrator:
         )
 
     def reset(self) -> None:
-        """Forget where the control points were, so that they are searched for anew."""
+        """Forget the last frame and where its control points were: they are searched for anew."""
+        super().reset()
         if self._finder is not None:
             self._finder.reset()
 
@@ -185,14 +187,20 @@ class GaugeCalibrator:
                     self.pose, self._reference = pose, self._reference or pose
 
     def calibrate(
-        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
+        self,
+        epoch: Epoch,
+        image: NDArray[Any] | EncodedImage | None = None,
+        fingerprint: int | None = None,
     ) -> CalibratedEpoch:
         """Predict and pose the camera of an epoch. Never raises because of data."""
         self.predictor.take(epoch.temperature_time, epoch.temperatures)
         in_order = epoch.number > self._number
         self._number = max(self._number, epoch.number)
         now = self.predictor.at(epoch.frame_time)
-        epoch, measured, why = self._measured(epoch, image)
+        repeated, measured, why = self._measured(epoch, image, fingerprint)
+        if repeated is not None:
+            return repeated
+        epoch = replace(epoch, observations=measured)
         if now is None:
             names = next(iter(epoch.temperatures), "the reference thermometer")
             bad = failed("no_temperature", f"no reading of {names} so far", measured)
@@ -220,23 +228,28 @@ class GaugeCalibrator:
         return CalibratedEpoch(epoch, result, extra)
 
     def _measured(
-        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None
-    ) -> tuple[Epoch, Observations | None, str]:
-        """Return an epoch with its control points, these alone, and why there are none."""
+        self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None, fingerprint: int | None
+    ) -> tuple[CalibratedEpoch | None, Observations | None, str]:
+        """Return the result if the frame is a repeated one, else control points or why none."""
         self.movement = None
-        if self._finder is None or epoch.observations is not None:
-            return epoch, epoch.observations, "no control point is seen"
-        if image is None and epoch.frame is None:
-            return epoch, None, epoch.note or "there is no frame"
+        seen, why = epoch.observations, "no control point is seen"
+        if seen is None and self._finder is None:
+            return None, None, why
         try:
-            if image is None:
-                assert epoch.frame is not None
-                image = EncodedImage(epoch.frame)
-            found = self._finder.measure(image)
+            image, fingerprint = self._look(epoch, image, fingerprint)
+            if (repeated := self._repeated(epoch, fingerprint)) is not None:
+                return repeated, None, why
+            if seen is None:
+                assert self._finder is not None
+                if image is None:
+                    return None, None, epoch.note or "there is no frame"
+                found = self._finder.measure(image)
+                seen, why = found.observations, found.status.reason or found.status.word
         except ImageError as error:
-            return epoch, None, str(error)
-        why = found.status.reason or found.status.word
-        return replace(epoch, observations=found.observations), found.observations, why
+            return None, None, str(error)
+        if len(seen):
+            self._remember(epoch, fingerprint)
+        return None, seen, why
 
     def _posed(
         self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str,
@@ -381,6 +394,8 @@ class GaugeObserver:
     def observe(self, calibrated: CalibratedEpoch, *_: object) -> dict[str, float]:
         """Observe an epoch; returns no columns to store, as a gauge has no series to adjust."""
         epoch, result = calibrated.epoch, calibrated.adjustment
+        if result.status == "repeated_frame":  # the camera's own event is `frozen`
+            return {}
         if (moved := self._gauge.movement) is not None:
             self._tell("camera_moved", moved.sentence(), moved.since, epoch.number)
         if result.status != self._status and (self._status or result.status not in _USUAL):

@@ -42,7 +42,8 @@ class ObservationGrid:
     """The observations of many epochs on one grid of epochs × targets of the test field.
 
     points (E, T, 2) px: NaN if a target was not observed; weights (E, T, 3) px⁻²: the elements xx,
-    yy, xy of each point's inverse covariance, 0 if it was not observed or is rejected.
+    yy, xy of each point's inverse covariance, 0 if it was not observed, is rejected, or repeats the
+    epoch before.
     """
 
     points: Array
@@ -82,7 +83,7 @@ class ObservationGrid:
         sigmas: Array,
         covariances: Array | None = None,
     ) -> ObservationGrid:
-        """Build the grid of n image points; an epoch that repeats the one before stays empty.
+        """Build the grid of n image points; an epoch that repeats the one before has no weight.
 
         shape: numbers of epochs and targets; epochs, targets (n,): of the points; measured, sigmas
         (n, 2) px; covariances (n,) px²: of x and y.
@@ -100,9 +101,9 @@ class ObservationGrid:
             inverse[:, 2] = -covariances / determinant
         points[epochs, targets] = measured
         weights[epochs, targets] = inverse
-        again = ((points[1:] == points[:-1]) == (weights[1:, :, :2] > 0)).all(axis=(1, 2))
-        points[1:][again], weights[1:][again] = np.nan, 0.0
-        return cls(points, weights)
+        grid = cls(points, weights)
+        weights[grid.repeated] = 0.0
+        return grid
 
     def __len__(self) -> int:
         return len(self.points)
@@ -126,6 +127,16 @@ class ObservationGrid:
     def observed(self) -> Mask:
         """Mask (E, T) of the points with a weight."""
         return self.weights[..., 0] > 0
+
+    @property
+    def repeated(self) -> Mask:
+        """Mask (E,) of the epochs with the image points of the last epoch before that has any."""
+        there = np.isfinite(self.points[..., 0])
+        again, some = np.zeros(len(there), dtype=bool), np.flatnonzero(there.any(axis=1))
+        now, then = some[1:], some[:-1]
+        same = (self.points[now] == self.points[then]).all(axis=-1) == there[now]
+        again[now] = (same & (there[now] == there[then])).all(axis=1)
+        return again
 
     def targets(self, columns: Index) -> ObservationGrid:
         """Return the grid of some targets."""

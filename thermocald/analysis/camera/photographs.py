@@ -195,6 +195,8 @@ def calibrate_observations(
     reason = "no photograph shows enough targets"
     if not settings.free:
         reason = "the interior orientation is held (--free none)"
+        if camera.interior is None:
+            reason += ", and no --camera gives it"
     elif usable:
         try:
             start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)

@@ -156,14 +156,17 @@ def replay_into(
         stored = 0 if last is None else int(np.searchsorted(recording.columns.numbers, last + 1))
         stored -= stored % EPOCHS_OF_A_BLOCK
         advance(stored)
-        home = path.resolve().parent  # a store names frames in its own folder only
+        # a store names frames in its own folder only, relative to it
+        home, folder = path.resolve().parent, recording.path.resolve()
+        inside = folder.relative_to(home) if folder.is_relative_to(home) else None
         epochs = islice(recording.iter_epochs(), stored, None)
         for done in calibrated_epochs(calibrator, epochs, jobs):
             if last is None or done.epoch.number > last:
                 result = EpochResult.from_adjustment(done.adjustment)
-                frame = done.epoch.frame and done.epoch.frame.resolve()
-                inside = frame and frame.is_relative_to(home) and frame.relative_to(home)
-                epoch = replace(done.epoch, frame=inside or None)
+                frame = done.epoch.frame
+                if frame is not None:
+                    frame = inside and inside / frame.relative_to(recording.path)
+                epoch = replace(done.epoch, frame=frame)
                 store.append(series, epoch, result, extra=done.extra)
             advance(1)
         # inside `with`: to leave targets out of a long series, the store is read again

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.statistics.dependence import correlations_of
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.covariances import with_excess
@@ -296,6 +296,20 @@ def test_without_a_free_parameter_only_the_pose_is_estimated(exterior):
     assert r.ok.all()
     assert (r.values[:, :10] == scene.INTERIOR.as_array()).all()
     assert (r.sd[:, 10:] > 0).all()
+
+
+@pytest.mark.parametrize(("turn", "exterior"), [(0.0, "series"), (1e-4, "mount"), (1e-3, "mount")])
+def test_a_drift_is_the_mounts_if_the_camera_is_held(turn, exterior):
+    """Regression: it was kept from the poses, whose errors were five to ten sds."""
+    rng, field, epochs = np.random.default_rng(71), scene.corner_field(per_side=4), 60
+    poses = scene.EXTERIOR.as_array() + np.linspace(0, turn, epochs)[:, None] * np.eye(6)[1]
+    seen = [
+        scene.observe(field, rng, exterior=ExteriorOrientation.from_array(pose)) for pose in poses
+    ]
+    r = scene.adjusted_series(field, seen, free=(), exterior="auto")
+    assert (r.exterior, r.ok.all()) == (exterior, True)
+    ratio = (r.values[:, 10:13] - poses[:, :3]) / r.sd[:, 10:13]
+    assert (ratio - ratio.mean(axis=0)).std() < 1.3
 
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])

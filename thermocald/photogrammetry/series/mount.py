@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PRINCIPAL
 from thermocald.photogrammetry.linalg import (
     mad_sd,
     stacked_inverses,
@@ -58,12 +58,14 @@ _LEAST_PER_DEGREE = 20  # fast frequencies; with fewer much of the mount's movem
 _END = 15  # epochs at each end that give the slope there
 
 
-def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
+def components(trajectory: Array, period: float, held: bool = False) -> tuple[Array, Array, float]:
     """Estimate the variance components of every column of a trajectory.
 
     trajectory (E, k): in units of its noise; period: shortest period of the drift in epochs, 0 for
-    none. Returns the variances (k,) of the white part and of the part with memory, about its mean,
-    and the memory in epochs, 0 without one. A component without support by the likelihood is 0.
+    none; held: there is none as c, x0 and y0 are held, in a series of any length.
+
+    Returns the variances (k,) of the white part and of the part with memory, about its mean, and
+    the memory in epochs, 0 without one. A component without support by the likelihood is 0.
     """
     levelled = _remove_leak(_level_ends(trajectory), period) if period else trajectory
     power = _cosines(levelled) ** 2
@@ -77,7 +79,8 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
     drift = _drift(omega, period)
     memories = _PHI if period else _LONG_PHI
     evidence = np.empty((len(memories), 3, power.shape[1]))  # still, white, with memory
-    _, evidence[:, 0] = _fit(power, count, np.stack([drift]))
+    _, walking = _fit(power, count, np.stack([drift]))
+    evidence[:, 0] = walking
     (_, trembling), likelihood = _fit(power, count, np.stack([drift, one]))
     evidence[:, 1] = likelihood - _WHITE_COST
     phi = memories[:, None]
@@ -98,6 +101,8 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
     by_memory *= np.array([1.0 - mean_variance(phi, n) for phi in memories])[:, None]
     if not period:  # without a drift of the camera all slow movement is the mount's
         missing = (count @ power) / n - 1.0 - white - by_memory.sum(axis=0)
+        if held:  # a still camera's noise is not a movement
+            missing[walking + 0.5 * (count @ power) < _WHITE_COST] = 0.0
         by_memory[-1] = np.maximum(by_memory[-1] + missing, 0.0)
     negligible = white + by_memory.sum(axis=0) < _NEGLIGIBLE
     white[negligible], by_memory[:, negligible] = 0.0, 0.0
@@ -425,7 +430,9 @@ def estimate_movement(
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
     jumped, stairs, of_jumps = find_jumps(trajectory, back.T @ M @ back, g @ back)
     trajectory = trajectory - stairs
-    period = min(period, len(trajectory) / _PERIODS)
+    # what c, x0 and y0 do not follow, as they are held, is the mount's, however slow
+    held = not (own < PRINCIPAL.stop).any()
+    period = 0.0 if held else min(period, len(trajectory) / _PERIODS)
     if period:
         smooth = _smooth(trajectory, int(_CUBIC * period))
     else:
@@ -435,7 +442,7 @@ def estimate_movement(
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
     rough = np.clip(rough, -limit, limit)
     directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
-    white, slow, memory = components((smooth + rough) @ directions, period)
+    white, slow, memory = components((smooth + rough) @ directions, period, held)
     axes = back @ directions
     if jumped:
         memory = max(memory, len(trajectory) / 2.0)

@@ -199,8 +199,10 @@ class Calibrator(EpochCalibrator):
         if epoch.observations is None:
             why = epoch.note or "neither a frame nor observations"
             return CalibratedEpoch(epoch, failed("no_frame", why), extra)
-        if len(epoch.observations):
-            self._remember(epoch, fingerprint)
+        if not len(epoch.observations):
+            bad = failed("no_observations", "no target was measured", epoch.observations)
+            return CalibratedEpoch(epoch, bad, extra, searched)
+        self._remember(epoch, fingerprint)
         return CalibratedEpoch(epoch, self.adjust(epoch.observations), extra, searched)
 
     def weighed(self, observations: Observations) -> Observations:

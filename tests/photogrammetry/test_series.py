@@ -13,6 +13,7 @@ from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, p
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.covariances import with_excess
+from thermocald.photogrammetry.series.mount import drift_gaps
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 OWN = np.arange(8)
@@ -310,6 +311,27 @@ def test_a_drift_is_the_mounts_if_the_camera_is_held(turn, exterior):
     assert (r.exterior, r.ok.all()) == (exterior, True)
     ratio = (r.values[:, 10:13] - poses[:, :3]) / r.sd[:, 10:13]
     assert (ratio - ratio.mean(axis=0)).std() < 1.3
+
+
+@pytest.mark.parametrize("knock", [0.0, 1e-4])
+def test_a_drift_during_a_gap_is_no_movement_of_the_mount(knock):
+    """Regression: sds were three times too large; a knock during the gap is still the mount's."""
+    field = scene.corner_field(0.02, per_side=4)
+    epochs = np.r_[:60, 91:150]
+    warm = np.where(epochs < 75, 1 - np.exp(-epochs / 40), 5.52 * np.exp(-epochs / 40))
+    ratios = []
+    for seed in range(4):
+        rng, seen = np.random.default_rng(seed), []
+        moved = replace(field, points=field.points + rng.normal(0, 0.02, field.points.shape))
+        for k, u in zip(epochs, warm, strict=True):
+            interior = replace(scene.INTERIOR, x0=scene.INTERIOR.x0 - 0.010 * u)
+            pose = scene.EXTERIOR.as_array() + knock * (k > 90) * np.eye(6)[1]
+            seen.append(scene.observe(moved, rng, interior, ExteriorOrientation.from_array(pose)))
+        gaps = drift_gaps(10.0 * epochs)
+        r = scene.adjusted_series(field, seen, exterior="auto", gaps=gaps)
+        error = r.values[:, 1] - scene.INTERIOR.x0 + 0.010 * warm
+        ratios.append((error - error.mean()) / r.sd[:, 1])
+    assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.3
 
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])

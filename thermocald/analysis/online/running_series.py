@@ -36,7 +36,7 @@ from thermocald.photogrammetry.field.testfield import find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.field_motion import taken_off
 from thermocald.photogrammetry.series.long_series import KnownSeries
-from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period, image_px
+from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_gaps, drift_period, image_px
 from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS, slow_course
@@ -415,7 +415,10 @@ class RunningSeries:
         self._period = drift_period(time, np.array([k.temperature for k in kept]))
         self._shown = np.asarray(grid.observed.any(axis=0))
         self._offsets = self._asked.target_offsets and self._shown.sum() <= _MOST_TARGETS
-        s = replace(self._asked, drift_period=self._period, target_offsets=self._offsets)
+        s = replace(
+            self._asked, drift_period=self._period, gaps=drift_gaps(time),
+            target_offsets=self._offsets,
+        )  # fmt: skip
         alone, c_px = np.array([k.alone for k in kept]), start[0] / self._sensor.pixel_pitch
         self._wrong = misplaced_targets(self._sensor, self._field, grid, alone)
         while True:  # a single pass, unless misplaced targets biased the initial values

@@ -29,7 +29,7 @@ from thermocald.photogrammetry.series.field_motion import (
     wandering_targets,
 )
 from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
-from thermocald.photogrammetry.series.mount import drift_period
+from thermocald.photogrammetry.series.mount import drift_gaps, drift_period
 from thermocald.photogrammetry.series.normals import (
     WithoutTargets,
     gathered,
@@ -126,8 +126,12 @@ def table_of_series(
     if len(wrong):
         return left_out()
     apart = replace(apart, head=head)
-    settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
     in_blocks = len(source) > together_at_most(len(testfield))
+    settings = replace(
+        settings,
+        drift_period=drift_period(apart.frame_time, apart.temperature),
+        gaps=() if in_blocks else drift_gaps(apart.frame_time),
+    )
     if not in_blocks:
         source = grid = gathered(source, [slice(0, len(source))])
     found = _adjust(testfield, apart, start, source, settings, in_blocks, jobs, advance)

@@ -136,7 +136,7 @@ def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Move
         found.append(
             estimate_movement(
                 N[part] / variance, b[part] / variance, free, good[part],
-                series.s.drift_period, correlated,
+                series.s.drift_period, correlated, [k - part.start for k in series.s.gaps],
             )
         )  # fmt: skip
     return mean_movement(found, starts) if found else STILL

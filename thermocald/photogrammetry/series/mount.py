@@ -398,6 +398,12 @@ def drift_period(time_s: Array, temperature: Array) -> float:
     return max(FASTEST_DRIFT_S / interval, _FEWEST_A_PERIOD)
 
 
+def drift_gaps(time_s: Array) -> tuple[int, ...]:
+    """Return the first epoch after each gap in times (E,) s in which a camera may drift."""
+    steps = np.diff(time_s)
+    return tuple((np.flatnonzero(steps > 0.5 * FASTEST_DRIFT_S) + 1).tolist())
+
+
 def estimate_movement(
     N: Array,
     b: Array,
@@ -405,12 +411,15 @@ def estimate_movement(
     good: Mask,
     period: float = 24.0,
     correlated: Array | None = None,
+    gaps: Sequence[int] = (),
 ) -> Movement:
     """Estimate the variance components of the mount from the normal equations of a series.
 
     N (E, 16, 16), b (E, 16): of every epoch at one linearisation, in units of the noise; own (p,):
     the free interior parameters; good (E,): epochs to use; period: from `drift_period`; correlated
-    (6, 6): part of the pose's normal matrix from correlated errors, ΣAᵀPCPA.
+    (6, 6): part of the pose's normal matrix from correlated errors, ΣAᵀPCPA; gaps: from
+    `drift_gaps`. Across a gap in which the perspective shows that the camera drifted, nothing is
+    known of the mount.
     """
     rows = np.flatnonzero(good)
     if len(rows) < FEWEST_EPOCHS:
@@ -428,13 +437,21 @@ def estimate_movement(
     back = np.linalg.inv(root) @ np.linalg.inv(whiten)
     # the pose by the perspective alone, the interior orientation eliminated
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
-    jumped, stairs, of_jumps = find_jumps(trajectory, back.T @ M @ back, g @ back)
+    M, g = back.T @ M @ back, g @ back
+    jumped, stairs, of_jumps = find_jumps(trajectory, M, g)
     trajectory = trajectory - stairs
     # what c, x0 and y0 do not follow, as they are held, is the mount's, however slow
     held = not (own < PRINCIPAL.stop).any()
     period = 0.0 if held else min(period, len(trajectory) / _PERIODS)
+    cuts: list[int] = []
     if period:
-        smooth = _smooth(trajectory, int(_CUBIC * period))
+        missing = np.flatnonzero(np.diff(rows) > 0.5 * period) + 1
+        for row in sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()}):
+            long = min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS
+            if long and _is_of_camera(row, _step(trajectory, row)[0], M, g):
+                cuts.append(row)
+        parts = np.split(trajectory, cuts)
+        smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
     else:
         trajectory = trajectory - trajectory.mean(axis=0)
         smooth = np.zeros_like(trajectory)
@@ -442,7 +459,11 @@ def estimate_movement(
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
     rough = np.clip(rough, -limit, limit)
     directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
-    white, slow, memory = components((smooth + rough) @ directions, period, held)
+    parts = np.split((smooth + rough) @ directions, cuts)
+    found = [components(p, min(period, len(p) / _PERIODS), held) for p in parts]
+    size = [len(p) for p in parts]
+    white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
+    memory = max(f[2] for f in found)
     axes = back @ directions
     if jumped:
         memory = max(memory, len(trajectory) / 2.0)

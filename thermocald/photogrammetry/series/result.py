@@ -49,13 +49,14 @@ class SeriesSettings(AdjustmentSettings):
     field's sigmas as prior; target_noise: estimate the measuring noise, its correlations within a
     marker and the excess scatter of neighbouring epochs, if the series is long enough;
     drift_period: shortest period of the camera's drift in epochs (`mount.drift_period`), 0 if the
-    series is too short for a drift.
+    series is too short for a drift; gaps: the first epoch after each gap (`mount.drift_gaps`).
     """
 
     exterior: Exterior = "series"
     target_offsets: bool = True
     target_noise: bool = True
     drift_period: float = 24.0
+    gaps: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, settings: AdjustmentSettings, exterior: str) -> SeriesSettings:

@@ -7,7 +7,8 @@ import re
 import pytest
 
 from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
-from thermocald.store.recording.reader import read_recording, read_testfield
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.testfield_file import read_testfield
 
 
 def edit(path, old: str, new: str) -> None:

@@ -13,7 +13,7 @@ from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment
 from thermocald.store.logger.dialect import stated_unit
 from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
-from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.recording.reader import interpolate_readings
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
 JUNE = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()  # 12:00 in Berlin

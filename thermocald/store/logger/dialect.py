@@ -40,6 +40,8 @@ _STATED = re.compile(
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
+UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
+"""The unit behind a reading."""
 
 
 def stated_unit(text: str) -> str | None:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
+REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 _ROWS = 1 << 18
 _MOST_COLUMNS = 200
 # those of `RecordingWriter`; a number that such a form would change is written in full
@@ -154,14 +155,13 @@ class ColumnChunk(Chunk):
         return found
 
 
-def parse_once(table: Table, required: Sequence[str]) -> Table:
+def parse_once(table: Table) -> Table:
     """Return the binary copy of a text table from the user's cache; write it if there is none.
 
     Without pyarrow or space on the disk, or if pyarrow's parser refuses the text, the table itself
     is returned: reading it then reports what is wrong.
     """
     try:
-        _pyarrow()
         found = table.path.stat()
         key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
         folder = _cache()
@@ -181,7 +181,7 @@ def parse_once(table: Table, required: Sequence[str]) -> Table:
                 partial.replace(copy)
             finally:
                 partial.unlink(missing_ok=True)
-        return ParquetTable(copy, required, table)
+        return ParquetTable(copy, REQUIRED, table)
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
     except (OSError, ValueError, RecordingError) as cause:  # pyarrow raises the first two
@@ -207,23 +207,32 @@ def _cache() -> Path:
 
 def _parse(table: Table, target: Path) -> None:
     """Write a CSV table as Parquet with pyarrow's parser; its numbers are Python's to the bit."""
-    from pyarrow import csv, float64, int64, string
+    pyarrow = _pyarrow()
+    from pyarrow import csv
 
     if next(table.chunks(1), None) is None:
         raise ValueError("no rows")
     names = [name for name in table.columns if name]
-    numeric = dict.fromkeys(table.numeric(names), float64())
-    kinds = dict.fromkeys(names, string()) | numeric | {"epoch": int64(), "target": string()}
+    kinds = dict.fromkeys(names, pyarrow.string())
+    kinds |= dict.fromkeys(_number_columns(table), pyarrow.float64())
     reader = csv.open_csv(
         table.path,
-        csv.ReadOptions(block_size=_TEXT_BLOCK, column_names=table.columns, skip_rows=1),
-        csv.ParseOptions(newlines_in_values=False),
+        csv.ReadOptions(
+            block_size=_TEXT_BLOCK, column_names=table.columns, skip_rows=table._line(-1)
+        ),
+        csv.ParseOptions(newlines_in_values=True),
         csv.ConvertOptions(
             column_types=kinds, null_values=[""], include_columns=list(kinds), check_utf8=True
         ),
     )
     with reader:
-        _write(target, ({name: batch.column(name) for name in kinds} for batch in reader))
+        parts = ({name: batch.column(name) for name in kinds} for batch in reader)
+        _write(target, (part | {"epoch": part["epoch"].cast(pyarrow.int64())} for part in parts))
+
+
+def _number_columns(table: Table) -> list[str]:
+    further = [name for name in table.columns if name not in ("", *REQUIRED)]
+    return ["epoch", *REQUIRED[2:], *table.numeric(further)]
 
 
 def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
@@ -267,32 +276,30 @@ def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
 
     advance(n) is called after each n rows. Raises RecordingError; UsageError without pyarrow.
     """
-    pyarrow = _pyarrow()
-    table = Table(source, ("epoch", "target", "x", "y", "sx", "sy"))
-    numeric = table.numeric([name for name in table.columns if name not in ("", "target")])
+    table = Table(source, REQUIRED)
+    names = _number_columns(table)
 
-    def columns_of(chunk: Chunk) -> dict[str, Any]:
-        columns: dict[str, Any] = {}
-        for name in filter(None, table.columns):
-            if name == "epoch":
-                columns[name] = pyarrow.array(chunk.integers(name))
-            elif name in numeric:
-                values = chunk.numbers(name, empty_is_nan=True)
-                columns[name] = pyarrow.array(values, mask=np.isnan(values))
-            else:
-                columns[name] = pyarrow.array(chunk.text(name))
-        advance(len(chunk))
-        return columns
+    def check(read: Table) -> None:
+        for chunk in read.chunks():
+            chunk.integers("epoch")
+            for name in names:
+                chunk.numbers(name, empty_is_nan=name not in REQUIRED)
+            advance(len(chunk))
 
     with new_file(target) as partial:
-        _write(partial, map(columns_of, table.chunks(_ROWS)))
+        try:
+            _parse(table, partial)
+        except ValueError as cause:
+            check(table)  # names the line of what is wrong
+            raise RecordingError(f"{source}: cannot be converted: {cause}") from cause
+        check(ParquetTable(partial, REQUIRED, table))
 
 
 def parquet_to_csv(source: Path, target: Path, advance: Any) -> None:
     """Write observations.parquet as CSV, so that every number reads back the same."""
     import csv
 
-    table = ParquetTable(source, ("epoch", "target", "x", "y", "sx", "sy"))
+    table = ParquetTable(source, REQUIRED)
     with new_file(target) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table.columns)

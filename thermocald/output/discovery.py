@@ -123,7 +123,9 @@ def _next_steps(d: Discovery) -> tuple[str, ...]:
 
 
 def _not_covered(d: Discovery) -> tuple[str, ...]:
-    limits = [f"Temperatures other than{_temperatures(d)}, and changes faster than those measured."]
+    limits = [
+        f"Temperatures other than those{_temperatures(d)}, and changes faster than those measured."
+    ]
     if d.stages[0].verify is None:
         limits.append("Whether the constants hold on another day: no M2 was given.")
     limits.append("Effects that move the image by less than its noise: they are not detected.")

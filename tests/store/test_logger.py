@@ -228,6 +228,7 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         ((b"entity_id,state,last_changed\nsensor.humidity,45,2026-06-14T12:00:00Z\n"
          b"sensor.humidity,46,2026-06-14T12:01:00Z\n"), {}, "no sensor .* has temperatures"),
         (b"\x7fELF\0\0\0\0", {}, "is not text"),
+        (b"time,temp\n46187.5,20\n46187.50012,20\n", {}, "line 2.* spreadsheet's date"),
         (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
     ],
 )  # fmt: skip

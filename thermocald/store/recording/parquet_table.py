@@ -252,17 +252,15 @@ def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
             writer.write_table(batch)
 
 
-def write_parquet(
-    path: Path, parts: Iterable[Mapping[str, Any]], *, nan_is_null: bool = False
-) -> None:
+def write_parquet(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
     """Write columns {name: (n,)}, given in parts, to a Parquet file, as a whole or not at all.
 
-    Numbers are written bit for bit; nan_is_null: NaN becomes null. UsageError without pyarrow.
+    Numbers are written bit for bit, NaN as null. Raises UsageError without pyarrow.
     """
     pyarrow = _pyarrow()
     arrays = (
         {
-            name: pyarrow.array(values, from_pandas=nan_is_null and isinstance(values, np.ndarray))
+            name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
             for name, values in columns.items()
         }
         for columns in parts

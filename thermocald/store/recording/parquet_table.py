@@ -17,13 +17,15 @@ import shutil
 import tempfile
 import time
 from contextlib import ExitStack, suppress
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import RecordingError, UsageError
-from thermocald.files import new_file
+from thermocald.files import new_file, write_parts
+from thermocald.result import csv_text
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
@@ -33,14 +35,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+    from thermocald.result import Columns
 
 
 REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 _ROWS = 1 << 18
 _MOST_COLUMNS = 200
-# those of `RecordingWriter`; a number that such a form would change is written in full
-_FORMS = {"x": "%.5f", "y": "%.5f"}
-_USUAL_FORM = "%.6g"
 
 log = logging.getLogger(__name__)
 
@@ -295,28 +295,19 @@ def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
 
 def parquet_to_csv(source: Path, target: Path, advance: Any) -> None:
     """Write observations.parquet as CSV, so that every number reads back the same."""
-    import csv
-
     table = ParquetTable(source, REQUIRED)
-    with new_file(target) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table.columns)
-        for chunk in table.chunks():
-            writer.writerows(zip(*(_format_column(chunk, n) for n in table.columns), strict=True))
-            advance(len(chunk))
 
+    def columns_of(chunk: ColumnChunk) -> Columns:
+        advance(len(chunk))
+        return {
+            name: chunk.integers(name) if name == "epoch"
+            else chunk.numbers(name, empty_is_nan=True) if chunk.is_number(name)
+            else chunk.text(name)
+            for name in table.columns
+        }  # fmt: skip
 
-def _format_column(chunk: ColumnChunk, name: str) -> Sequence[str]:
-    if name == "epoch":
-        return [str(n) for n in chunk.integers(name).tolist()]
-    if not chunk.is_number(name):
-        return chunk.text(name)
-    form = _FORMS.get(name, _USUAL_FORM)
-    texts = []
-    for value in chunk.numbers(name, empty_is_nan=True).tolist():
-        text = "" if value != value else form % value
-        texts.append(text if not text or float(text) == value else repr(value))
-    return texts
+    head: Columns = dict.fromkeys(table.columns, ())  # of a file without rows, too
+    write_parts(target, csv_text(chain([head], map(columns_of, table.chunks()))))
 
 
 def _select_groups(metadata: Any, column: int, epochs: tuple[int, int]) -> tuple[range, int]:

@@ -13,6 +13,7 @@ import numpy as np
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
+from thermocald.result import csv_text
 from thermocald.store.recording.head import Head, head_document
 from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
@@ -96,7 +97,8 @@ class RecordingWriter:
     def keep_readings(self, readings: TemperatureLog) -> None:
         """Write every reading of a log, not only those of the epochs."""
         try:
-            _write_readings(self._partial / READINGS, readings)
+            with self._new(READINGS) as file:
+                file.writelines(csv_text([{"time": readings.times, **readings.channels}]))
         except OSError as cause:
             raise self._failed(cause) from cause
 
@@ -225,16 +227,6 @@ def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterab
     with RecordingWriter(path, head, testfield) as writer:
         for epoch in epochs:
             writer.append(epoch)
-
-
-def _write_readings(path: Path, readings: TemperatureLog) -> None:
-    """Write readings as `readings.csv`: time and one column per channel."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["time", *readings.channels])
-        columns = [c.tolist() for c in readings.channels.values()]
-        for time, *values in zip(readings.times.tolist(), *columns, strict=True):
-            rows.writerow([f"{time:.6f}", *("" if math.isnan(v) else f"{v:.10g}" for v in values)])
 
 
 def _number(value: float, form: str) -> str:

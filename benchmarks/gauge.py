@@ -39,8 +39,8 @@ from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.adjustment import adjust
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
-from thermocald.store.recording.head import Head
-from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.writer import write_recording
 
 GOAL = 1.2
 # Runs on two machines gave 1.14 to 1.21 for JPEGs; for grey values see above

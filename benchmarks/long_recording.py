@@ -17,7 +17,7 @@ from benchmarks.adjustment import corner_field as whole_field
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics.model import follow_angle
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import RecordingWriter
+from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable

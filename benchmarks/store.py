@@ -37,7 +37,8 @@ from thermocald.store.database.columns import (
 from thermocald.store.database.epochs import insert_epoch
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import RecordingWriter, open_recording
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.recording.writer import RecordingWriter
 from thermocald.store.series import EpochResult, StoredEpoch
 
 if TYPE_CHECKING:

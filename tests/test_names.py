@@ -29,7 +29,8 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, Senso
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
-from thermocald.store.recording.reader import read_recording, write_recording
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.writer import write_recording
 from thermocald.store.schema import COLUMN_NAMES
 
 LIKE_OURS = [

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    Columns = dict[str, NDArray[Any] | Sequence[str]]
+    Column = NDArray[Any] | Sequence[str]
+    Columns = dict[str, Column]
 
 
 class Result(ABC):
@@ -133,18 +134,14 @@ def with_sds(names: Iterable[str], values: Iterable[Any], sds: Iterable[Any]) ->
 
 
 def csv_text(
-    parts: Iterable[Mapping[str, NDArray[Any] | Sequence[str]]],
-    separator: str = ",",
-    decimal: str = ".",
+    parts: Iterable[Mapping[str, Column]], separator: str = ",", decimal: str = "."
 ) -> Iterator[str]:
     """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
     for number, columns in enumerate(parts):
         yield _csv_part(columns, not number, separator, decimal)
 
 
-def _csv_part(
-    columns: Mapping[str, NDArray[Any] | Sequence[str]], first: bool, separator: str, decimal: str
-) -> str:
+def _csv_part(columns: Mapping[str, Column], first: bool, separator: str, decimal: str) -> str:
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator, lineterminator="\n")
     if first:
@@ -154,7 +151,7 @@ def _csv_part(
     return text.getvalue()
 
 
-def _cells(name: str, values: NDArray[Any] | Sequence[str], decimal: str) -> Iterable[str]:
+def _cells(name: str, values: Column, decimal: str) -> Iterable[str]:
     import numpy as np  # the command line's list of commands does without
 
     if not isinstance(values, np.ndarray):

@@ -23,9 +23,9 @@ from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.database.store import Store
-from thermocald.store.recording.head import Head, read_head
-from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
+from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.testfield_file import write_testfield
+from thermocald.store.recording.writer import write_recording
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 

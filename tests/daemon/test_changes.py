@@ -15,7 +15,8 @@ from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
-from thermocald.store.recording.reader import read_recording, write_recording
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.writer import write_recording
 from thermocald.store.sources import StoredRecording
 
 EPOCHS, WHEN = 18, 13

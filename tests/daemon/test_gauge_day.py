@@ -18,8 +18,8 @@ from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import write_model
 from thermocald.physics.testfields import corner_field, demonstration_model
-from thermocald.store.recording.head import Head
-from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.writer import write_recording
 
 pytestmark = pytest.mark.slow
 

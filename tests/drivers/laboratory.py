@@ -33,7 +33,7 @@ from thermocald.hal import Clock, SystemClock, VirtualClock
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import RecordingWriter
+from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,7 +21,8 @@ from thermocald.photogrammetry.field.testfield import (
     observations_from_lists,
 )
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import RecordingWriter, read_recording
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.writer import RecordingWriter
 
 BEGIN = 1.6e9
 IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)

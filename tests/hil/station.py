@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from tests.hil.frames import heating, subject
-from thermocald.store.recording.reader import write_testfield
+from thermocald.store.recording.testfield_file import write_testfield
 
 if TYPE_CHECKING:
     from pathlib import Path

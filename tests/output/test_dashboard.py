@@ -384,6 +384,15 @@ def test_a_series_is_read_page_by_page(client_of, monkeypatch):
     assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]
 
 
+def test_the_table_of_a_series_without_epochs_has_its_header(tmp_path):
+    head = Head("rpi", "M1", 10.0, CameraSpec("rpi", Sensor(64, 48, 0.003)), {"t": Channel()})
+    with Store.open(tmp_path / "t.db", "append", durable=False) as store:
+        store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+    header, *rows = "".join(View(tmp_path / "t.db", tmp_path).csv("rpi", "M1")).splitlines()
+    assert header.startswith("epoch,frame_time,temperature_time,t,c,x0,")
+    assert rows == []
+
+
 def test_open_to_others_it_wants_a_token(tmp_path):
     with pytest.raises(ConfigurationError, match="token-file"):
         serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437)

@@ -143,6 +143,7 @@ def test_the_page_of_a_silent_daemon_says_so_and_its_times_are_utc(page_with, pa
     page = page_of(url, timezone_id="Asia/Tokyo")
     page.wait_for_function(_SETTLED, arg=_name(1))  # always the first camera
     assert page.text_content("#connection") == "live"
+    assert page.get_attribute("#overlay", "viewBox") == "0 0 640 480"  # of the first frame shown
     first = page.evaluate("document.querySelector('#course').data[0].x[0]")
     assert first == "2020-09-13T12:26:50.000"
     page.wait_for_function(

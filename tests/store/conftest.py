@@ -13,7 +13,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import write_recording
+from thermocald.store.recording.writer import write_recording
 from thermocald.store.series import EpochResult
 
 if TYPE_CHECKING:

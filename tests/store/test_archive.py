@@ -12,7 +12,8 @@ import thermocald as tc
 from thermocald.epoch import Epoch
 from thermocald.store.database.archive import archive_series, archive_store
 from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import read_recording, write_recording
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.writer import write_recording
 from thermocald.store.series import clock_corrections
 
 

@@ -7,7 +7,8 @@ import re
 import pytest
 
 from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
-from thermocald.store.recording.reader import read_recording, read_testfield
+from thermocald.store.recording.reader import read_recording
+from thermocald.store.recording.testfield_file import read_testfield
 
 
 def edit(path, old: str, new: str) -> None:
@@ -120,6 +121,7 @@ FILES = {
         "testfield.csv: is not text in UTF-8; save it as CSV in UTF-8"),
     "another case": (
         "testfield.csv", lambda path: edit(path, "X,Y,Z", "x,y,z"), "is 'x' meant"),
+    "a unit": ("observations.csv", lambda path: edit(path, ",x,", ",x [px],"), "Write x, without"),
     "half a last line": (
         "observations.csv", without_its_end,
         "line 61: has 5 fields instead of 6; is the file cut"),

@@ -13,7 +13,7 @@ import pytest
 from benchmarks import store as benchmark
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.store.recording.reader import RecordingWriter
+from thermocald.store.recording.writer import RecordingWriter
 
 DAY = 8640
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from thermocald.errors import ThermocaldError
 from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import open_recording, read_recording, read_testfield
+from thermocald.store.recording.reader import open_recording, read_recording
+from thermocald.store.recording.testfield_file import read_testfield
 
 FILES = ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
 QUICK = settings(

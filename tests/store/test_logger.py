@@ -13,7 +13,7 @@ from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment
 from thermocald.store.logger.dialect import stated_unit
 from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
-from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.recording.reader import interpolate_readings
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
 JUNE = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()  # 12:00 in Berlin
@@ -228,6 +228,7 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         ((b"entity_id,state,last_changed\nsensor.humidity,45,2026-06-14T12:00:00Z\n"
          b"sensor.humidity,46,2026-06-14T12:01:00Z\n"), {}, "no sensor .* has temperatures"),
         (b"\x7fELF\0\0\0\0", {}, "is not text"),
+        (b"time,temp\n46187.5,20\n46187.50012,20\n", {}, "line 2.* spreadsheet's date"),
         (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
     ],
 )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.commands import succeed
+from tests.commands import call, succeed
 from thermocald.errors import RecordingError
 from thermocald.store.recording.reader import open_recording, read_recording
 
@@ -28,16 +28,16 @@ def same(a, b):
             assert np.array_equal(x.quality[name], y.quality[name], equal_nan=True)
 
 
-def test_there_and_back_is_the_same_file(recording_path):
+def test_there_and_back_are_the_same_numbers(recording_path):
     csv = recording_path / "observations.csv"
-    before, text = read_recording(recording_path), csv.read_bytes()
+    before = read_recording(recording_path)
     convert(recording_path, "parquet")
     assert not csv.exists()
     same(before, read_recording(recording_path))
     streamed = list(open_recording(recording_path)._observation_file.stream())
     assert [len(s) for s in streamed] == [len(e.observations) for e in before.epochs]
     convert(recording_path, "csv")
-    assert csv.read_bytes() == text
+    same(before, read_recording(recording_path))
 
 
 def test_digits_beyond_ours_are_kept(recording_path):
@@ -55,6 +55,21 @@ def test_digits_beyond_ours_are_kept(recording_path):
     convert(recording_path, "csv")
     same(before, read_recording(recording_path))
     assert "word 3" in csv.read_text()
+
+
+def test_text_that_cannot_be_read_is_not_converted(recording_path):
+    csv = recording_path / "observations.csv"
+    head, first, *rest = csv.read_text().splitlines()
+    cells = first.split(",")
+    text = "\n".join([head, ",".join([*cells[:2], '"1,5"', *cells[3:]]), *rest])
+    csv.write_text(text)
+    done = call("convert", recording_path, "--to", "parquet")
+    assert "line 2, column x: '1,5' is not a number; write decimals with a point" in done.stderr
+    assert (done.returncode, csv.read_text()) == (1, text)
+    csv.write_text("\n".join(["", head, first, *rest]))
+    before = read_recording(recording_path)
+    convert(recording_path, "parquet")
+    same(before, read_recording(recording_path))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.recording.reader import interpolate_readings
 
 NONE = np.nan
 TENS = np.arange(0.0, 100.0, 10.0)

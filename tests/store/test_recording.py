@@ -16,14 +16,9 @@ from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.recording import observation_file, parquet_table
 from thermocald.store.recording import reader as module
-from thermocald.store.recording.reader import (
-    RecordingWriter,
-    open_recording,
-    read_recording,
-    read_testfield,
-    write_recording,
-    write_testfield,
-)
+from thermocald.store.recording.reader import open_recording, read_recording
+from thermocald.store.recording.testfield_file import read_testfield, write_testfield
+from thermocald.store.recording.writer import RecordingWriter, write_recording
 
 
 def same(a: Observations, b: Observations) -> bool:

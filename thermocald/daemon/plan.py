@@ -23,7 +23,8 @@ from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import open_recording, read_testfield
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.recording.testfield_file import read_testfield
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

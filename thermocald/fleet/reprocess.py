@@ -241,6 +241,6 @@ def calibrate_block(block: Block) -> Outcome:
         "status": [r.status for r in results],
         "reason": [r.reason for r in results],
     }
-    write_parquet(block.target, [columns], nan_is_null=True)
+    write_parquet(block.target, [columns])
     calibrated = sum(r.status == "ok" for r in results)
     return Outcome(block, block.stop - block.first, calibrated)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,8 +93,9 @@ def _answer(d: Discovery) -> Answer:
 
 
 def _statement(effect: EffectFound) -> str:
-    """Return an effect's statement without the full stop; an amplitude a_c is written as c."""
-    return re.sub(r"\ba_(?=[A-Zcxy])", "", effect.statement).rstrip(".")
+    """Return an effect's statement without the full stop; an amplitude a_x0 is written as x₀."""
+    text = re.sub(r"\ba_(\w+)", lambda m: parameter_label(m[1]), effect.statement)
+    return text.replace(" = -", " = −").rstrip(".")
 
 
 def _temperatures(d: Discovery) -> str:
@@ -121,7 +123,9 @@ def _next_steps(d: Discovery) -> tuple[str, ...]:
 
 
 def _not_covered(d: Discovery) -> tuple[str, ...]:
-    limits = [f"Temperatures other than{_temperatures(d)}, and changes faster than those measured."]
+    limits = [
+        f"Temperatures other than those{_temperatures(d)}, and changes faster than those measured."
+    ]
     if d.stages[0].verify is None:
         limits.append("Whether the constants hold on another day: no M2 was given.")
     limits.append("Effects that move the image by less than its noise: they are not detected.")
@@ -129,11 +133,13 @@ def _not_covered(d: Discovery) -> tuple[str, ...]:
 
 
 def _names(d: Discovery) -> list[str]:
-    """Return M1, M2, … with the recordings' names."""
-    return [
-        f"M{k}" if (e.source.series or f"M{k}") == f"M{k}" else f"M{k} ({e.source.series})"
-        for k, e in enumerate(d.examination.fitter.series, start=1)
-    ]
+    """Return M1, M2, … with the series' names, or the recordings' where these would mislead."""
+    sources = [e.source for e in d.examination.fitter.series]
+    roles, own = [f"M{k + 1}" for k in range(len(sources))], [s.series for s in sources]
+    if any(name in roles and roles.index(name) != k for k, name in enumerate(own)):
+        own = [Path(s.name).name for s in sources]
+    named = zip(roles, own, strict=True)
+    return [role if name in ("", role) else f"{role} ({name})" for role, name in named]
 
 
 def _origin(d: Discovery) -> list[str]:
@@ -284,7 +290,7 @@ def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) 
     """Draw bars (name, px, colour) in groups, each group with its noise, px."""
     bars = [bar for _, group in groups for bar in group]
     with drawing_style():
-        drawing = new_drawing(5.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups))
+        drawing = new_drawing(4.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups))
         axis = drawing.subplots()
         place = 0.0
         for k, (noise, group) in enumerate(groups):
@@ -420,7 +426,7 @@ def _noise_test(d: Discovery) -> Section:
     names = x.best.names[len(x.base.terms) :]
     tests = list(zip(names, x.surrogates, strict=False))
     with drawing_style():
-        drawing = new_drawing(5.0, 0.4 + 1.7 * len(tests))
+        drawing = new_drawing(4.0, 0.4 + 1.7 * len(tests))
         axes = np.atleast_1d(drawing.subplots(len(tests), 1))
         for axis, (name, test) in zip(axes, tests, strict=True):
             _draw_surrogates(axis, name, test)

@@ -25,7 +25,8 @@ from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, p
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.history import History
 from thermocald.physics.testfields import corner_view
-from thermocald.store.recording.reader import CameraSpec, Channel, Head, RecordingWriter
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

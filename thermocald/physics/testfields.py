@@ -25,7 +25,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.physics.model import ThermalModel
-from thermocald.store.recording.reader import read_testfield
+from thermocald.store.recording.testfield_file import read_testfield
 
 RPI_INTERIOR = InteriorOrientation(
     c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4

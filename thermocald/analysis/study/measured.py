@@ -21,7 +21,7 @@ from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.recording.reader import interpolate_readings
 from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
 

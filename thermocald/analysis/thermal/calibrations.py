@@ -28,7 +28,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.physics.model import BASES, RATED, ThermalModel, choose_basis, distortion_along
-from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.recording.reader import interpolate_readings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

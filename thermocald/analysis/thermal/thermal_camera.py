@@ -488,7 +488,7 @@ class ThermalCamera(Result):
 
 def _require_known(log: Array, readings: Array, times: Array) -> None:
     """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
-    from thermocald.store.recording.readings import TemperatureLog
+    from thermocald.store.recording.reader import TemperatureLog
 
     outside = ~TemperatureLog(log, {"": readings}).known_at(times)
     if outside.any():

@@ -16,6 +16,7 @@ import shutil
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -332,14 +333,14 @@ def _answer(read: Callable[[View, Request], Any], media_type: str, request: Requ
 
 
 def _csv(request: Request) -> Response:
-    view = _view(request)
     camera, series = _camera_and_series(request)
-    view.require(camera, series)
+    text = _view(request).csv(camera, series)
+    head = next(text)  # an error is answered before the table begins
     name = f"{camera}-{series}.csv"
     if not all(c.isalnum() or c in "._-" for c in name):
         name = "series.csv"
     return StreamingResponse(
-        view.csv(camera, series),
+        chain([head], text),
         media_type="text/csv",
         headers={"content-disposition": f'attachment; filename="{name}"'},
     )

@@ -213,11 +213,6 @@ class View:
                 for page in store.column_pages(found, names, _ROWS_AT_ONCE)
             )
 
-    def require(self, camera: str, series: str) -> None:
-        """Raise StoreError if there is no such series."""
-        with Store.open(self._store) as store:
-            store.find_series(camera, series)
-
     def _path(self, camera: str, suffix: str) -> Path:
         # a name from a request is checked before it becomes part of a path
         if camera not in self.status().get("cameras", {}):

@@ -135,14 +135,15 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
         return Section(title, tuple(text), (*shown, *more), rows, folded=folded)
 
     matrices = [name for name in drawn if name.startswith("correlation-")]
+    depends = tables.dependence_tables(camera)
     parts = [
         section(
             "How the camera changed", ("deviations", "principal-point", "movement"),
             [tables.deviation_table(camera)], _clips(camera),
         ),
         section(
-            "How it depends on the temperature", ("temperature-dependence", *matrices),
-            tables.dependence_tables(camera), text=detail_sentences(camera),
+            "How it depends on the temperature", ("temperature-dependence",),
+            depends[:1], text=detail_sentences(camera),
         ),
         section(
             "What it means in object space", ("object-space-errors", "errors-by-point"),
@@ -152,7 +153,10 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
             "Whether the changes are significant", ("significance",),
             [tables.significance_table(camera, settings)], folded=True,
         ),
-        section("Correlations of the parameters", ("iop-correlations",), [], folded=True),
+        section(
+            "Correlations, and other thermometers", (*matrices, "iop-correlations"),
+            depends[1:], folded=True,
+        ),
         section(
             "What was measured and assumed", (), [tables.overview_table(camera)],
             text=_assumed(camera, settings), folded=True,

@@ -22,6 +22,8 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.report import Table
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from thermocald.analysis.study.series_study import (
         ChannelStudy,
         Deviation,
@@ -161,40 +163,50 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
 
 
 def dependence_tables(camera: CameraStudy) -> list[Table]:
-    """Return the tables of correlation and slope on each thermometer (reference, section 4.3)."""
+    """Return the table of correlation and slope on each thermometer (reference, section 4.3)."""
+    found = [(s, c) for s in camera.series for c in s.channels if c.dependences]
+    names = dict.fromkeys(channel.thermometer.name for _, channel in found)
     return [
-        _dependence_table(study, channel)
-        for study in camera.series
-        for channel in study.channels
-        if channel.dependences
+        _dependence_table(name, [(s, c) for s, c in found if c.thermometer.name == name])
+        for name in names
     ]
 
 
-def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
+def _dependence_table(
+    thermometer: str, channels: Sequence[tuple[SeriesStudy, ChannelStudy]]
+) -> Table:
     def slope(name: str, value: float, sd: float) -> str:
         factor, unit = _small_unit(UNITS[name])
         return with_sd(factor * value, factor * sd, f"{unit or 1}/K")
 
-    t = channel.thermometer
+    names = dict.fromkeys(name for _, channel in channels for name in channel.dependences)
+    rows = [
+        (study, name, channel.dependences[name])
+        for name in names
+        for study, channel in channels
+        if name in channel.dependences
+    ]
+    noise = ", ".join(f"{plain(c.thermometer.sd, 'K', 2)} in {s.series.name}" for s, c in channels)
     return Table.of(
-        f"Dependence on {parameter_label(t.name)}, {study.series.name}",
-        channel.dependences.items(),
+        f"Dependence on {parameter_label(thermometer)}",
+        rows,
         {
-            "parameter": lambda r: parameter_label(r[0]),
-            "r": lambda r: coefficient(r[1].r),
-            "n": lambda r: f"{r[1].n}",
-            "n effective": lambda r: f"{r[1].n_effective:.0f}",
-            "p naive": lambda r: p_text(r[1].p_naive_holm),
-            "p": lambda r: p_text(r[1].p_holm),
-            "slope ± sd": lambda r: slope(r[0], r[1].slope, r[1].sd_slope),
-            "px/K": lambda r: _in_pixels(study, r[0], r[1].slope, r[1].sd_slope),
-            "scatter / noise": lambda r: f"{r[1].misfit:.1f}",
+            "parameter": lambda r: parameter_label(r[1]),
+            "series": lambda r: r[0].series.name,
+            "r": lambda r: coefficient(r[2].r),
+            "n": lambda r: f"{r[2].n}",
+            "n effective": lambda r: f"{r[2].n_effective:.0f}",
+            "p naive": lambda r: p_text(r[2].p_naive_holm),
+            "p": lambda r: p_text(r[2].p_holm),
+            "slope ± sd": lambda r: slope(r[1], r[2].slope, r[2].sd_slope),
+            "px/K": lambda r: _in_pixels(r[0], r[1], r[2].slope, r[2].sd_slope),
+            "scatter / noise": lambda r: f"{r[2].misfit:.1f}",
         },
         "r: Pearson's correlation. p naive treats every epoch as independent; p is valid for noise "
         "correlated in time; both are corrected for the number of parameters (Holm). n effective: "
         "number of independent epochs with the same information. The slope takes the thermometer's "
-        f"noise of {plain(t.sd, 'K', 2)} into account, its sd the correlation of the noise. "
-        "Scatter / noise above 1: the straight line does not explain all changes.",
+        f"noise ({noise}) into account, its sd the correlation of the noise. Scatter / noise above "
+        "1: the straight line does not explain all changes.",
     )
 
 

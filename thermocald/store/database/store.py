@@ -189,18 +189,17 @@ class Store(SeriesReader):
         """Yield the columns of `stamped_columns`, `rows` epochs at a time, in constant memory.
 
         Each page is a query of its own: a slow reader blocks no writer, and epochs stored meanwhile
-        are included.
+        are included. The last page has fewer rows, of a series without epochs none.
         """
         source = {name: _chunk_name(name, series) for name in names}
         wanted = list(dict.fromkeys(["number", *source.values()]))
-        after = -1
-        while True:
+        after, size = -1, rows
+        while size == rows:
             with self._reads("columns") as connection:
                 found = columns.read_page(connection, series.id, wanted, after, rows)
-            if not len(found["number"]):
-                return
-            after = int(found["number"][-1])
             yield {name: found[source[name]] for name in names}
+            size = len(found["number"])
+            after = int(found["number"][-1]) if size else after
 
     def readings(self, thermometer: str | None = None) -> Iterator[LoggedReading]:
         """Yield the readings that belong to no epoch, in the order in which they were stored."""

@@ -40,6 +40,8 @@ _STATED = re.compile(
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
+UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
+"""The unit behind a reading."""
 
 
 def stated_unit(text: str) -> str | None:
@@ -227,7 +229,7 @@ def _detect_encoding(path: Path) -> str:
             if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
                 return "utf-16"
             if b"\0" in head:
-                raise DataError(f"{path}: is not text")
+                raise DataError(f"{path}: is not text; save it as CSV in UTF-8")
             for name in ("utf-8", "gb18030", "cp1252"):
                 file.seek(0)
                 if _is_text(iter(lambda: file.read(_CHUNK), b""), name):

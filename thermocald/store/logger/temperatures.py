@@ -1,8 +1,7 @@
 """Read temperatures from the file of a logger, for every command that reads a log.
 
-Columns are taken by name, or guessed and reported. Units, the order of day and month, and the time
-zone are taken from the file or follow from the times of the photographs. Otherwise the file is
-refused, and the message names the option that gives them.
+Units and the time zone are taken from the file. Otherwise the file is refused, and the message
+names the option that gives them.
 """
 
 from __future__ import annotations
@@ -10,63 +9,44 @@ from __future__ import annotations
 import re
 from array import array
 from collections import Counter
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, time
+from dataclasses import replace
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError, UsageError
+from thermocald.errors import DataError
 from thermocald.names import channel_fault
 from thermocald.numbers import column_label, counted
-from thermocald.store.logger.clock import (
-    DeviceClock,
-    day_and_month,
-    device_clock,
-    is_date_like,
-    parse_moment,
-    time_zone,
-    whole_seconds,
+from thermocald.store.logger.clock import DeviceClock, parse_moment, time_zone, whole_seconds
+from thermocald.store.logger.columns import (
+    OTHER_NAME,
+    find_date_order,
+    find_temperature_columns,
+    find_time_columns,
+    quoted,
+    require_columns,
 )
+from thermocald.store.logger.columns import LogOptions as LogOptions
+from thermocald.store.logger.columns import log_options as log_options
 from thermocald.store.logger.dialect import (
     OUR_TIMES,
-    TIME_NAME,
-    UNITS,
+    UNIT_BEHIND,
     LoggerFile,
     open_log,
     stated_unit,
     to_celsius,
     without_unit,
 )
-from thermocald.store.recording.readings import TemperatureLog as TemperatureLog
+from thermocald.store.recording.reader import TemperatureLog as TemperatureLog
 from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts, time_fault
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
 
-_TEMPERATURE_NAME = re.compile(
-    r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
-    r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|[℃℉]",
-    re.IGNORECASE,
-)
-_OTHER_NAME = re.compile(
-    r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
-    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt"
-    r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
-    # setpoints and statistics, not readings
-    r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
-    r"|temp\w*[ _]?set|soll|consigne|desired|target|wanted|nominal|reference value|forecast"
-    r"|prognose|heat.?index|wind.?chill|feels|设定|目标"
-    r"|^epoch$|pixel|^(?:c|x0|y0|sigma0)$|^sd_|^#$|^no\.?$",
-    re.IGNORECASE,
-)
-_MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _HEADER_ZONE = re.compile(r"(?:GMT|UTC)\s*[+-]\s*\d{1,2}(?::?\d{2})?", re.IGNORECASE)
-_NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
-_UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
 """Lines above a table that state °F."""
@@ -78,70 +58,8 @@ _PAUSE, _LONGEST_PAUSE_S = 5.0, 86400.0  # of the usual interval: a longer one i
 _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
-_GOOD_SHARE = 0.8
 _FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
-_WORDS = {"dmy": "day/month", "mdy": "month/day"}
-_LONGER = 10.0  # ratio of spans: with day and month exchanged, a log spans months
-
-
-@dataclass(frozen=True, slots=True)
-class LogOptions:
-    """What the user has given about a log.
-
-    times, temperatures: names of columns, empty to guess; separator, decimal, date_order, unit:
-    None to detect; clock: the logger's; wanted: names of temperature columns to use if they occur,
-    such as a model's thermometers; names: new names of columns by those in the file.
-    """
-
-    times: tuple[str, ...] = ()
-    temperatures: tuple[str, ...] = ()
-    separator: str | None = None
-    decimal: str | None = None
-    date_order: str | None = None
-    unit: str | None = None
-    clock: DeviceClock = field(default_factory=DeviceClock)
-    wanted: tuple[str, ...] = ()
-    names: Mapping[str, str] = field(default_factory=dict)
-
-
-def log_options(
-    *,
-    timezone: str | None = None,
-    log_timezone: str | None = None,
-    log_clock: str = "0",
-    ambiguous: str = "order",
-    time_column: Sequence[str] | None = None,
-    temperature_column: Sequence[str] | None = None,
-    separator: str | None = None,
-    decimal: str | None = None,
-    date_order: str | None = None,
-    unit: str | None = None,
-    name: Sequence[str] | None = None,
-) -> LogOptions:
-    """Return the options of a log from the text of a command. Raises UsageError."""
-    for option, value, allowed in (
-        ("--unit", unit, UNITS),
-        ("--date-order", date_order, ("dmy", "mdy")),
-        ("--decimal", decimal, (",", ".")),
-    ):
-        if value is not None and value not in allowed:
-            raise UsageError(f"{option} {value}: must be one of {', '.join(allowed)}")
-    names = {}
-    for text in name or ():
-        column, _, label = text.rpartition("=")
-        fault = channel_fault(label) if column and label else "must be COLUMN=LABEL"
-        if fault:
-            raise UsageError(f"--name {text}: {fault}")
-        names[column] = label
-    mark = {"tab": "\t", "\\t": "\t"}.get(separator or "", separator)
-    if mark is not None and (len(mark) != 1 or mark.isalnum()):
-        raise UsageError(f"--separator {separator}: must be one character, or the word tab")
-    clock = device_clock(timezone, log_timezone, log_clock, ambiguous, "--log-timezone")
-    return LogOptions(
-        tuple(time_column or ()), tuple(temperature_column or ()), mark, decimal, date_order, unit,
-        clock, names=names,
-    )  # fmt: skip
 
 
 def read_log(
@@ -153,10 +71,10 @@ def read_log(
     """
     options = options or LogOptions()
     file = open_log(path, options.separator, options.decimal)
-    time_names = _find_time_columns(file, options)
+    time_names = find_time_columns(file, options)
     clock, notes = _apply_header_zone(options.clock, " ".join(time_names))
-    names = _find_temperature_columns(file, time_names, options)
-    order, order_notes = _find_date_order(file, time_names, options, clock, near)
+    names = find_temperature_columns(file, time_names, options)
+    order, order_notes = find_date_order(file, time_names, options, clock, near)
     table = _Table(file, time_names, names, order)
     table.read()
     times = table.times(clock)
@@ -172,7 +90,7 @@ def read_log(
             f"{-steps[row - 1]:.0f} s ({table.where(row)}): was the clock set, or are hours of a "
             "12-hour clock without AM and PM? The rows are put in the order of their times"
         )
-    _require_columns(table.file, tuple(options.names), "--name")
+    require_columns(table.file, tuple(options.names), "--name")
     channels = {}
     for name in names:
         values, unit_note = _to_celsius_column(table, name, options)
@@ -190,7 +108,7 @@ def read_log(
         notes += held
     notes = [
         f"log: {len(times)} rows, {file.description}",
-        f"log: time from {_quoted(time_names)}; temperatures from {_quoted(channels)}"
+        f"log: time from {quoted(time_names)}; temperatures from {quoted(channels)}"
         + ("" if options.temperatures else " (guessed; set --temperature-column to change)"),
         *order_notes, *notes, *table.left_out(),
     ]  # fmt: skip
@@ -333,7 +251,7 @@ class _Table:
         if not text:
             return np.nan
         plain = text.replace(",", ".") if self.file.decimal == "," else text
-        if unit := _UNIT_BEHIND.search(plain):
+        if unit := UNIT_BEHIND.search(plain):
             plain = plain[: unit.start()]
             self.units[name][stated_unit(f"({unit[0].strip()[-1:]})") or ""] += 1
         try:
@@ -377,18 +295,14 @@ def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[s
     labels = np.array(table.labels)
     every = list(dict.fromkeys(table.labels))
     names = [n for n in every if n in options.wanted] or [
-        n for n in every if not _OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
+        n for n in every if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
     ]
     if not names:
         raise DataError(
             f"{table.file.path}: no sensor in column {_LABEL!r} has temperatures: "
-            f"{_quoted(every[:6])}; export one that has"
+            f"{quoted(every[:6])}; export one that has"
         )
     return {_channel_name(name): np.where(labels == name, values, np.nan) for name in names}
-
-
-def _quoted(names: Sequence[str] | dict[str, Array]) -> str:
-    return ", ".join(repr(n) for n in names)
 
 
 def _channel_name(name: str) -> str:
@@ -397,150 +311,6 @@ def _channel_name(name: str) -> str:
     plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
     plain = plain[:48]
     return f"{plain} of the log" if channel_fault(plain) else plain
-
-
-def _require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
-    for name in names:
-        if name not in file.names:
-            raise DataError(
-                f"{file.path}: there is no column {name!r} ({option}); the columns are "
-                f"{_quoted(file.names)}"
-            )
-    return names
-
-
-def _kind(values: list[str]) -> str:
-    """Return the kind of most of a column's values: moment, seconds, date, time, number, text."""
-    kinds: Counter[str] = Counter(_kind_of(value) for value in values if re.search(r"\d", value))
-    if not kinds:
-        return "empty"
-    kind, count = kinds.most_common(1)[0]
-    return kind if count >= _GOOD_SHARE * kinds.total() else "text"
-
-
-def _kind_of(value: str) -> str:
-    number = _NUMBER.fullmatch(_UNIT_BEHIND.sub("", value))
-    try:
-        found = parse_moment(value)
-    except ValueError:
-        if is_date_like(value):
-            return "moment" if ":" in value else "date"
-        return "number" if number else "text"
-    if number:
-        return "seconds" if isinstance(found, datetime) else "number"
-    if isinstance(found, datetime):
-        return "moment"
-    return "time" if isinstance(found, time) else "date"
-
-
-def _find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
-    if options.times:
-        return _require_columns(file, options.times, "--time-column")
-    kinds = {name: _kind(file.column(name)) for name in file.names}
-    ours = [n for n in OUR_TIMES if kinds.get(n) in ("number", "seconds")]
-    moments = [n for n, kind in kinds.items() if kind == "moment"]
-    moments += [n for n, kind in kinds.items() if kind == "seconds" and TIME_NAME.search(n)]
-    if ours or moments:
-        return ((ours or moments)[0],)
-    dates = [n for n, kind in kinds.items() if kind == "date"]
-    clocks = [n for n, kind in kinds.items() if kind == "time"]
-    if dates and clocks:
-        return (dates[0], clocks[0])
-    seconds = [n for n, kind in kinds.items() if kind == "seconds"]
-    if len(seconds) == 1:
-        return (seconds[0],)
-    shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in file.names)
-    raise DataError(
-        f"{file.path}: no column holds dates with times, as in 2026-06-14 12:00:00; change their "
-        f"form, or give --time-column NAME (twice for a date and a time). First row: {shown}"
-    )
-
-
-def _find_date_order(
-    file: LoggerFile,
-    names: tuple[str, ...],
-    options: LogOptions,
-    clock: DeviceClock,
-    near: tuple[float, float] | None,
-) -> tuple[str | None, list[str]]:
-    """Return the order of day and month, None if dates need none, and notes.
-
-    It follows from a number above 12; else from the photographs, if only one order puts the log
-    near them; else from the rows, as a log of some days would span months in the other order.
-    """
-    if options.date_order is not None:
-        return options.date_order, []
-    if not any(day_and_month(text) for text in file.column(names[0])):
-        return None, []
-    places = [file.names.index(name) for name in names]
-    first = last = ""
-    orders: set[str] = set()
-    same = True
-    for _, row in file.rows():
-        found = day_and_month(row[places[0]])
-        if found is None:
-            continue
-        last = " ".join(row[place] for place in places)
-        first = first or last
-        same &= found[0] == found[1]
-        if max(found) > 12:
-            orders.add("dmy" if found[0] > 12 else "mdy")
-    if len(orders) == 1:
-        return orders.pop(), []
-    if same:
-        return "dmy", []
-    if not orders:
-        spans: dict[str, list[datetime]] = {}
-        for order in ("dmy", "mdy"):
-            ends = [parse_moment(text, order) for text in (first, last)]
-            spans[order] = [e if isinstance(e, datetime) else datetime.now(UTC) for e in ends]
-        if near is not None:
-            far = {}
-            for order, span in spans.items():
-                utc = clock.utc(span, lambda _: f"{file.path}")
-                far[order] = float(max(utc.min() - near[1], near[0] - utc.max(), 0.0))
-            if abs(far["dmy"] - far["mdy"]) > 86400.0:
-                order = min(far, key=lambda o: far[o])
-                return order, [
-                    f"log: {first!r} is {_WORDS[order]}: this puts the log near the photographs"
-                ]
-        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in spans.items()}
-        order = min(lengths, key=lambda o: lengths[o])
-        if max(lengths.values()) > _LONGER * lengths[order]:
-            return order, [f"log: {first!r} is {_WORDS[order]}: this makes the rows consecutive"]
-    raise DataError(
-        f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: give "
-        "--date-order dmy or mdy"
-    )
-
-
-def _find_temperature_columns(
-    file: LoggerFile, times: tuple[str, ...], options: LogOptions
-) -> tuple[str, ...]:
-    if options.temperatures:
-        return _require_columns(file, options.temperatures, "--temperature-column")
-    wanted = tuple(name for name in options.wanted if name in file.names)
-    numeric = [
-        name
-        for name in file.names
-        if name not in times and _kind(file.column(name)) in ("number", "seconds")
-    ]
-    named = [
-        n for n in numeric
-        if _TEMPERATURE_NAME.search(n) and not _OTHER_NAME.search(n) and n not in wanted
-    ]  # fmt: skip
-    if wanted or named:
-        return (*wanted, *named)
-    others = [n for n in numeric if not _OTHER_NAME.search(n) and n not in OUR_TIMES]
-    if len(others) == 1:
-        return (others[0],)
-    means = [n for n in numeric if _TEMPERATURE_NAME.search(n) and _MEAN.search(n)]
-    if len(means := [n for n in means if not _OTHER_NAME.search(_MEAN.sub("", n))]) == 1:
-        return (means[0],)
-    shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
-    raise DataError(
-        f"{file.path}: which column is the temperature? Give --temperature-column NAME. {shown}"
-    )
 
 
 def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid, runs
-from thermocald.store.recording.parquet_table import ParquetTable, parse_once
+from thermocald.store.recording.parquet_table import REQUIRED, ParquetTable, parse_once
 from thermocald.store.recording.sense import frame_fault, point_fault
 from thermocald.store.recording.table import Table
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 # A file of text or Parquet of this size (a day of 150 targets every 10 s) is read in parts.
 LONG_FROM_BYTES = 100_000_000
-_REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,14 +105,14 @@ class ObservationFile:
         self, path: Path, field: TestField, numbers: NDArray[np.int64], sensor: Sensor
     ) -> None:
         if path.suffix == ".parquet":
-            self._table: Table = ParquetTable(path, _REQUIRED)
+            self._table: Table = ParquetTable(path, REQUIRED)
         else:
-            self._table = Table(path, _REQUIRED)
+            self._table = Table(path, REQUIRED)
             if path.stat().st_size >= LONG_FROM_BYTES:
-                self._table = parse_once(self._table, _REQUIRED)
+                self._table = parse_once(self._table)
         self._field, self._numbers, self._sensor = field, numbers, sensor
         self._has_covariances = "sxy" in self._table.columns
-        extras = [n for n in self._table.columns if n not in {*_REQUIRED, "sxy", ""}]
+        extras = [n for n in self._table.columns if n not in {*REQUIRED, "sxy", ""}]
         self._quality = self._table.numeric(extras)
 
     def load(self) -> ObservationRows:
@@ -156,7 +155,7 @@ class ObservationFile:
         self, windows: Sequence[slice] | None, quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
         """Yield rows of whole epochs, in order, with the first wanted one and the end."""
-        columns = [*_REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
+        columns = [*REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
         every = [slice(0, len(self._numbers))]
         # text is read once for all windows
         parts = [[w] for w in windows or every] if self._table.seeks else [list(windows or every)]

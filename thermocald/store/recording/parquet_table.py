@@ -17,13 +17,15 @@ import shutil
 import tempfile
 import time
 from contextlib import ExitStack, suppress
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import RecordingError, UsageError
-from thermocald.files import new_file
+from thermocald.files import new_file, write_parts
+from thermocald.result import csv_text
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
@@ -33,13 +35,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+    from thermocald.result import Columns
 
 
+REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 _ROWS = 1 << 18
 _MOST_COLUMNS = 200
-# those of `RecordingWriter`; a number that such a form would change is written in full
-_FORMS = {"x": "%.5f", "y": "%.5f"}
-_USUAL_FORM = "%.6g"
 
 log = logging.getLogger(__name__)
 
@@ -154,14 +155,13 @@ class ColumnChunk(Chunk):
         return found
 
 
-def parse_once(table: Table, required: Sequence[str]) -> Table:
+def parse_once(table: Table) -> Table:
     """Return the binary copy of a text table from the user's cache; write it if there is none.
 
     Without pyarrow or space on the disk, or if pyarrow's parser refuses the text, the table itself
     is returned: reading it then reports what is wrong.
     """
     try:
-        _pyarrow()
         found = table.path.stat()
         key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
         folder = _cache()
@@ -181,7 +181,7 @@ def parse_once(table: Table, required: Sequence[str]) -> Table:
                 partial.replace(copy)
             finally:
                 partial.unlink(missing_ok=True)
-        return ParquetTable(copy, required, table)
+        return ParquetTable(copy, REQUIRED, table)
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
     except (OSError, ValueError, RecordingError) as cause:  # pyarrow raises the first two
@@ -207,23 +207,32 @@ def _cache() -> Path:
 
 def _parse(table: Table, target: Path) -> None:
     """Write a CSV table as Parquet with pyarrow's parser; its numbers are Python's to the bit."""
-    from pyarrow import csv, float64, int64, string
+    pyarrow = _pyarrow()
+    from pyarrow import csv
 
     if next(table.chunks(1), None) is None:
         raise ValueError("no rows")
     names = [name for name in table.columns if name]
-    numeric = dict.fromkeys(table.numeric(names), float64())
-    kinds = dict.fromkeys(names, string()) | numeric | {"epoch": int64(), "target": string()}
+    kinds = dict.fromkeys(names, pyarrow.string())
+    kinds |= dict.fromkeys(_number_columns(table), pyarrow.float64())
     reader = csv.open_csv(
         table.path,
-        csv.ReadOptions(block_size=_TEXT_BLOCK, column_names=table.columns, skip_rows=1),
-        csv.ParseOptions(newlines_in_values=False),
+        csv.ReadOptions(
+            block_size=_TEXT_BLOCK, column_names=table.columns, skip_rows=table._line(-1)
+        ),
+        csv.ParseOptions(newlines_in_values=True),
         csv.ConvertOptions(
             column_types=kinds, null_values=[""], include_columns=list(kinds), check_utf8=True
         ),
     )
     with reader:
-        _write(target, ({name: batch.column(name) for name in kinds} for batch in reader))
+        parts = ({name: batch.column(name) for name in kinds} for batch in reader)
+        _write(target, (part | {"epoch": part["epoch"].cast(pyarrow.int64())} for part in parts))
+
+
+def _number_columns(table: Table) -> list[str]:
+    further = [name for name in table.columns if name not in ("", *REQUIRED)]
+    return ["epoch", *REQUIRED[2:], *table.numeric(further)]
 
 
 def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
@@ -243,17 +252,15 @@ def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
             writer.write_table(batch)
 
 
-def write_parquet(
-    path: Path, parts: Iterable[Mapping[str, Any]], *, nan_is_null: bool = False
-) -> None:
+def write_parquet(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
     """Write columns {name: (n,)}, given in parts, to a Parquet file, as a whole or not at all.
 
-    Numbers are written bit for bit; nan_is_null: NaN becomes null. UsageError without pyarrow.
+    Numbers are written bit for bit, NaN as null. Raises UsageError without pyarrow.
     """
     pyarrow = _pyarrow()
     arrays = (
         {
-            name: pyarrow.array(values, from_pandas=nan_is_null and isinstance(values, np.ndarray))
+            name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
             for name, values in columns.items()
         }
         for columns in parts
@@ -267,51 +274,40 @@ def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
 
     advance(n) is called after each n rows. Raises RecordingError; UsageError without pyarrow.
     """
-    pyarrow = _pyarrow()
-    table = Table(source, ("epoch", "target", "x", "y", "sx", "sy"))
-    numeric = table.numeric([name for name in table.columns if name not in ("", "target")])
+    table = Table(source, REQUIRED)
+    names = _number_columns(table)
 
-    def columns_of(chunk: Chunk) -> dict[str, Any]:
-        columns: dict[str, Any] = {}
-        for name in filter(None, table.columns):
-            if name == "epoch":
-                columns[name] = pyarrow.array(chunk.integers(name))
-            elif name in numeric:
-                values = chunk.numbers(name, empty_is_nan=True)
-                columns[name] = pyarrow.array(values, mask=np.isnan(values))
-            else:
-                columns[name] = pyarrow.array(chunk.text(name))
-        advance(len(chunk))
-        return columns
+    def check(read: Table) -> None:
+        for chunk in read.chunks():
+            chunk.integers("epoch")
+            for name in names:
+                chunk.numbers(name, empty_is_nan=name not in REQUIRED)
+            advance(len(chunk))
 
     with new_file(target) as partial:
-        _write(partial, map(columns_of, table.chunks(_ROWS)))
+        try:
+            _parse(table, partial)
+        except ValueError as cause:
+            check(table)  # names the line of what is wrong
+            raise RecordingError(f"{source}: cannot be converted: {cause}") from cause
+        check(ParquetTable(partial, REQUIRED, table))
 
 
 def parquet_to_csv(source: Path, target: Path, advance: Any) -> None:
     """Write observations.parquet as CSV, so that every number reads back the same."""
-    import csv
+    table = ParquetTable(source, REQUIRED)
 
-    table = ParquetTable(source, ("epoch", "target", "x", "y", "sx", "sy"))
-    with new_file(target) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table.columns)
-        for chunk in table.chunks():
-            writer.writerows(zip(*(_format_column(chunk, n) for n in table.columns), strict=True))
-            advance(len(chunk))
+    def columns_of(chunk: ColumnChunk) -> Columns:
+        advance(len(chunk))
+        return {
+            name: chunk.integers(name) if name == "epoch"
+            else chunk.numbers(name, empty_is_nan=True) if chunk.is_number(name)
+            else chunk.text(name)
+            for name in table.columns
+        }  # fmt: skip
 
-
-def _format_column(chunk: ColumnChunk, name: str) -> Sequence[str]:
-    if name == "epoch":
-        return [str(n) for n in chunk.integers(name).tolist()]
-    if not chunk.is_number(name):
-        return chunk.text(name)
-    form = _FORMS.get(name, _USUAL_FORM)
-    texts = []
-    for value in chunk.numbers(name, empty_is_nan=True).tolist():
-        text = "" if value != value else form % value
-        texts.append(text if not text or float(text) == value else repr(value))
-    return texts
+    head: Columns = dict.fromkeys(table.columns, ())  # of a file without rows, too
+    write_parts(target, csv_text(chain([head], map(columns_of, table.chunks()))))
 
 
 def _select_groups(metadata: Any, column: int, epochs: tuple[int, int]) -> tuple[range, int]:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 _LATEST_S = 7.26e9  # the year 2200
 _LONGEST_PAUSE_S = 3.2e8  # ten years
+_SERIAL_DAY, _SERIAL_DAYS = 5.5e4, 2.5e4  # of a spreadsheet, since 1899: 1982 to 2119
+_SHORTEST_STEP_S = 0.05  # median, of times in s; of days it is more than an hour
 _UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}  # of times, by their number per second
 _NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0, 150.0, -0.0625)
 """°C that thermometers give without measuring: at power-on, unplugged, all zeros or ones."""
@@ -51,6 +53,13 @@ def time_fault(times: Array) -> tuple[int, str] | None:
 
     The row after a jump of years is found as well: a clock that was not set shows 1970.
     """
+    known = times[np.isfinite(times)]
+    step = np.median(np.abs(np.diff(known))) if len(known) > 1 else math.inf
+    if 0 < step < _SHORTEST_STEP_S and (np.abs(known - _SERIAL_DAY) < _SERIAL_DAYS).all():
+        return 0, (
+            f"{known[0]:.8g} looks like a spreadsheet's date (days since 1900): write it as "
+            "2026-06-14 12:00:00 in a log, as seconds since 1970 in a recording"
+        )
     late = times > _LATEST_S
     if late.any():
         row = int(np.argmax(late))

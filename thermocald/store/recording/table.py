@@ -175,8 +175,8 @@ class Table:
         hint = ""
         if len(self.columns) == 1 and name in self.columns[0]:
             hint = "; separate the columns with commas and write decimals with a point"
-        elif near := [c for c in self.columns if c.lower() == name.lower()]:
-            hint = f"; is {near[0]!r} meant? Names are case-sensitive"
+        elif near := [c for c in self.columns if re.split(r"\W", c.lower())[0] == name.lower()]:
+            hint = f"; is {near[0]!r} meant? Write {name}, without a unit, in these letters"
         return f"{self.path}, line 1: column {name} is missing; found: {found[:200]}{hint}"
 
     def _line(self, row: int) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +9,13 @@ import numpy as np
 from thermocald.errors import TestFieldError
 from thermocald.files import write_text
 from thermocald.photogrammetry.field.testfield import KINDS, TestField
+from thermocald.result import csv_text
 from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from thermocald.result import Columns
 
 
 _MOST_TARGETS = 4000
@@ -118,19 +119,13 @@ def require_millimetres(
 
 def testfield_csv(field: TestField) -> str:
     """Return a test field as the text of `testfield.csv`, with all digits of its numbers."""
-    with_codes = any(field.codes)
-    with_kinds = with_codes or any(kind != KINDS[0] for kind in field.kinds)
-    header = [*_REQUIRED, *(["kind"] if with_kinds else []), *(["code"] if with_codes else [])]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for i, name in enumerate(field.names):
-        diameter = field.diameters[i]
-        row: list[object] = [name, *field.points[i].tolist()]
-        row += ["" if np.isnan(diameter) else float(diameter), *field.sigmas[i].tolist()]
-        row += [field.kinds[i]] * with_kinds + [field.codes[i]] * with_codes
-        writer.writerow(row)
-    return text.getvalue()
+    numbers = (*field.points.T, np.array(field.diameters, dtype=float), *field.sigmas.T)
+    columns: Columns = {"target": field.names, **dict(zip(_NUMBERS, numbers, strict=True))}
+    if any(field.codes) or any(kind != KINDS[0] for kind in field.kinds):
+        columns["kind"] = field.kinds
+    if any(field.codes):
+        columns["code"] = field.codes
+    return "".join(csv_text([columns]))
 
 
 def write_testfield(path: Path, field: TestField) -> None:

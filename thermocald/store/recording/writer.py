@@ -13,8 +13,9 @@ import numpy as np
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
+from thermocald.result import csv_text
 from thermocald.store.recording.head import Head, head_document
-from thermocald.store.recording.readings import READINGS, TemperatureLog, write_readings
+from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ class RecordingWriter:
     def keep_readings(self, readings: TemperatureLog) -> None:
         """Write every reading of a log, not only those of the epochs."""
         try:
-            write_readings(self._partial / READINGS, readings)
+            with self._new(READINGS) as file:
+                file.writelines(csv_text([{"time": readings.times, **readings.channels}]))
         except OSError as cause:
             raise self._failed(cause) from cause
 

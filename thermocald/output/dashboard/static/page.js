@@ -101,8 +101,8 @@ function showCamera(camera) {
   for (const [name, label] of [["c", "c"], ["x0", "x₀"], ["y0", "y₀"]]) {
     const sd = online["sd_" + name] ?? last["sd_" + name];
     figures.push([label, measured(online[name] ?? last[name], 5, "mm"),
-      (sd ? `± ${fixed(sd, 5)}` : "") + (sd && last["sd_" + name] ?
-        `; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : "")]);
+      (sd ? `±\u00a0${fixed(sd, 5)}` : "") + (sd && last["sd_" + name] ?
+        `; this epoch alone ${fixed(last[name], 5)} ±\u00a0${fixed(last["sd_" + name], 5)}` : "")]);
   }
   figures.push(["σ₀", fixed(last.sigma0, 3), `${counted(last.n_observations, "target")}, ${last.n_rejected} rejected`]);
   if (online.orientation) figures.push(["Camera", online.orientation, ""]);
@@ -119,7 +119,11 @@ function showCamera(camera) {
 
 async function showFrame(name) {
   let epoch;
-  try { epoch = await get(`api/cameras/${encodeURIComponent(name)}/epoch`); } catch { return; }
+  try {
+    epoch = await get(`api/cameras/${encodeURIComponent(name)}/epoch`);
+    // the size of its image, without which the targets would be drawn elsewhere
+    if (!series.some((s) => s.camera === name)) series = await get("api/series");
+  } catch { if (!epoch) return; }
   if (name !== chosen()) return;
   const targets = epoch.targets || {}, found = series.findLast((s) => s.camera === name);
   const overlay = $("overlay");

@@ -100,3 +100,40 @@ def test_a_bug_in_a_driver_is_a_fault_not_the_end(clock, link_of):
     assert link.state == "out"
     clock.advance(10.0)
     assert link.do(device.read)
+
+
+def test_whatever_a_driver_raises_it_is_retried_and_logged_once(clock, link_of, caplog):
+    """A `close` that failed, or a driver's sys.exit(), ended the device's thread for good."""
+    device, link, events = link_of()
+
+    def fail(*_):
+        raise failures[0]
+
+    failures = [SystemExit(3), KeyError("x")]
+
+    device.close = device.warnings = device.identity = fail
+    while failures:
+        for _ in range(5):
+            assert not link.do(fail)
+            assert link.identity() == {}
+            assert link.status(0.0, 60.0)["warnings"] == []
+            clock.advance(60.0)
+        failures.pop(0)
+    failures.append(OSError("x"))
+    assert link.do(device.read)
+    link.close()
+    assert events == ["device_out", "device_back"]
+    assert caplog.text.count("Traceback") == 4  # one of each method, and one of the action
+
+
+def test_a_device_that_comes_and_goes_all_day_is_not_reported_each_time(clock, link_of, caplog):
+    device, link, events = link_of({"kind": "unplugged", "at_s": 50_000.0, "for_s": 5_000.0})
+    caplog.set_level("INFO")
+    for k in range(4000):
+        link.do(device.read if k % 2 else _gone)
+        clock.advance(10.0)
+    assert link.faults == 2000
+    assert len(events) == 19
+    assert "10 times within an hour" in caplog.text
+    poll(clock, link, device, 3000, 10.0)  # calm, then out for good
+    assert events[19:] == ["device_out", "device_back"]

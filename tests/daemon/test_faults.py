@@ -82,7 +82,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     daemon.run(**devices())
     daemon.more(4)
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
+    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (16384, before[1]))
     daemon.until(lambda: "results wait in memory" in daemon.log())
     daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)

@@ -245,7 +245,7 @@ class Device:
     def close(self) -> None:
         """Release the device."""
         handle, self.handle = self.handle, None
-        if handle is not None:
+        if hasattr(handle, "close"):
             handle.close()
 
     def opened(self) -> Any:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     OnEvent = Callable[[float, str, str], None]
 
-_QUEUE = 200  # results that may wait for an output
+_QUEUE = 400  # results that may wait for an output: an hour at one every 10 s
 _LATEST_START = 0.1  # of a period; a tick that would begin later is skipped
 _REMEMBERED = 1000
 

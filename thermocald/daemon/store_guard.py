@@ -218,7 +218,6 @@ _RESERVE_BYTES = 16_000_000
 _ENOUGH_BYTES = 20_000_000
 _MOST_WITH_OBSERVATIONS = 100
 _MOST_WAITING = 20_000
-_RETRY_S = 1.0  # between two attempts while the store is away: epochs may come faster
 _FLUSH_S = 5.0  # of writing what waited, then others get their turn: the watchdog does not wait
 _TELL_EVERY_S = 60.0  # losses are reported this often
 
@@ -258,7 +257,7 @@ class StoreGuard:
         self._waiting: deque[Row] = deque()
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
-        self._tried_at = -math.inf
+        self._retry_at = -math.inf
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
         self._series_store: Store | None = None  # the store of `_series`
@@ -328,7 +327,7 @@ class StoreGuard:
         """Store an epoch now or when the store can be written; return whether it is stored."""
         with self._lock:
             self._waiting.append(row)
-            if self.away and time.monotonic() - self._tried_at < _RETRY_S:
+            if self.away and time.monotonic() < self._retry_at:
                 self._limit_waiting()
             else:
                 self.flush()
@@ -376,7 +375,7 @@ class StoreGuard:
     def flush(self, within_s: float = _FLUSH_S) -> None:
         """Write what waits, oldest first, until a write fails or the time is over."""
         with self._lock:
-            self._tried_at = begin = time.monotonic()
+            begin = time.monotonic()
             self._watch()
             while self._waiting and time.monotonic() - begin < within_s:
                 row = self._waiting[0]
@@ -394,6 +393,8 @@ class StoreGuard:
                     self.lose(f"epoch {row.epoch.number} of {row.series.camera}: {error}")
                 else:
                     self._hold_back(error)
+                    # an attempt at a locked store takes long, and epochs may come faster
+                    self._retry_at = 2 * time.monotonic() - begin
                     return
             self._flush_events()
             self._flush_readings()

@@ -10,8 +10,9 @@ Nothing is inferred from a driver's name or attributes: all that the program nee
 driver is a member of the classes here, with a default.
 
 Errors are those of `thermocald.errors`: after a `TransientDeviceError` the caller closes and opens
-the device again, with back-off; a `PermanentDeviceError` is reported and not retried; after a
-`DeviceFinished`, which is no fault, the device is not used any more.
+the device again, with back-off; a `PermanentDeviceError` is reported and not retried, except that a
+device that is not found or denied is looked for; after a `DeviceFinished`, which is no fault, the
+device is not used any more.
 """
 
 from __future__ import annotations
@@ -245,8 +246,9 @@ class Device:
     def close(self) -> None:
         """Release the device."""
         handle, self.handle = self.handle, None
-        if hasattr(handle, "close"):
-            handle.close()
+        close = getattr(handle, "close", None)  # a path or a flag needs none
+        if close is not None:
+            close()
 
     def opened(self) -> Any:
         """Return the handle; raises DeviceGone while the device is closed."""

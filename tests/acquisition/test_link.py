@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from thermocald.acquisition.device_loop import Link
-from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound
+from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound, WrongDevice
 from thermocald.hal import VirtualClock, open_device
 
 
@@ -68,16 +68,30 @@ def _gone():
 def test_what_no_retry_mends_is_given_up_and_told(clock, link_of):
     device, link, events = link_of()
 
-    def denied():
-        raise DeviceDenied("group video")
+    def another():
+        raise WrongDevice("another camera")
 
-    assert not link.do(denied)
+    assert not link.do(another)
     assert link.ended
     assert events == ["device_failed"]
     assert not link.do(device.read)
 
 
-def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
+def test_an_output_that_is_denied_is_not_tried_again(clock):
+    """A broker or a mail server may lock out who repeats a wrong password."""
+    link = Link("output", "home", open_device("output", "mock", {}, clock), clock)
+    link.device.open = lambda: _raise(DeviceDenied("wrong password"))
+    assert not link.do(lambda: None)
+    assert link.ended
+
+
+def _raise(error):
+    raise error
+
+
+@pytest.mark.parametrize("error", [DeviceNotFound, DeviceDenied])
+def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of, error):
+    """Regression: one that udev had not handled yet, or a phone to be unlocked, was given up."""
     device, link, events = link_of()
     there = device.open
     missing = [True] * 3
@@ -85,7 +99,7 @@ def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
     def open_late():
         if missing:
             missing.pop()
-            raise DeviceNotFound("no such device")
+            raise error("no such device")
         there()
 
     device.open = open_late

@@ -6,8 +6,11 @@ missed ticks are counted and not made up for.
 
 The link opens the device when it is needed, and again after faults, with growing pauses. It reports
 once that a device goes away, and once that it is back. A permanent fault ends the link until the
-configuration is read again; only a device that was not found is looked for again, since it may be
-plugged in later. A device that comes and goes all the time is reported once, then only counted.
+configuration is read again. A device that was not found is looked for again, since it may be
+plugged in later; so is a camera or thermometer that is denied: at boot its node belongs to root
+until udev has handled it, another program probes it, and a person may yet unlock a phone. An output
+is not, since a server may lock out who repeats a wrong password. A device that comes and goes all
+the time is reported once, then only counted.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import (
+    DeviceDenied,
     DeviceFinished,
     DeviceNotFound,
     PermanentDeviceError,
@@ -125,6 +129,7 @@ class Link:
         self._clock = clock
         self._period_s = period_s
         self._on_event = on_event
+        self._searched = DeviceNotFound if kind == "output" else (DeviceNotFound, DeviceDenied)
         self._pause_s = 0.0
         self._retry_at = 0.0
         self._outages: deque[float] = deque(maxlen=_OFTEN)
@@ -146,7 +151,7 @@ class Link:
             action()
         except TransientDeviceError as error:
             self._out(str(error), max(self._period_s, _LONGEST_PAUSE_S))
-        except DeviceNotFound as error:
+        except self._searched as error:
             self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
         except PermanentDeviceError as error:
             self._close()

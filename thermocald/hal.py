@@ -98,7 +98,8 @@ class Frame:
         if self.image is None and self.encoded is None and self.observations is None:
             raise ValueError("a frame needs an image, encoded bytes, or observations")
         _require_numbers(monotonic=self.monotonic, utc=self.utc, exposure=self.exposure or 0.0)
-        for name, value in self.settings.items():
+        given: Mapping[str, Any] = self.settings  # what a driver gives may be anything
+        for name, value in given.items():
             if not isinstance(value, Real):
                 raise BadReading(f"its driver gives {value!r:.60} as {name}")
         if not isinstance(self.encoded, bytes | None):
@@ -124,14 +125,16 @@ class Reading:
     missing: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        values, missing = {}, dict(self.missing)
-        for name, value in self.values.items():
+        given: Mapping[str, Any] = self.values  # what a driver gives may be anything
+        values: dict[str, float] = {}
+        missing = dict(self.missing)
+        for name, value in given.items():
             if fault := channel_fault(name):
                 raise WrongDevice(
                     f"a temperature channel cannot be called {name!r}: it {fault}; give it another "
                     "name in the configuration"
                 )
-            if isinstance(value, Real) and _POSSIBLE_C[0] <= value <= _POSSIBLE_C[1]:
+            if isinstance(value, Real) and _POSSIBLE_C[0] <= float(value) <= _POSSIBLE_C[1]:
                 values[name] = float(value)
             else:
                 missing[name] = f"{name}: {value!r:.60} is not a temperature"

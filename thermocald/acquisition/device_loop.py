@@ -233,12 +233,14 @@ class Link:
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
-        warnings = self._ask("warnings", lambda: list(map(str, self.device.warnings())), [])
+        warnings: list[str] = []
         return {
             "device": "hung" if busy_s > hang_after_s else self.state,
             "why": self.why,
             "since": self.since,
-            "warnings": warnings,
+            "warnings": self._ask(
+                "warnings", lambda: [str(text) for text in self.device.warnings()], warnings
+            ),
             "faults": self.faults,
         }
 

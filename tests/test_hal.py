@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from thermocald import errors, hal
-from thermocald.errors import ConfigurationError, DriverMissing, ThermocaldError
-from thermocald.hal import Frame, SystemClock, VirtualClock, load_driver
+from thermocald.errors import BadReading, ConfigurationError, DriverMissing, ThermocaldError
+from thermocald.hal import Frame, Reading, SystemClock, VirtualClock, load_driver
 
 
 def test_a_frame_cannot_be_changed_and_holds_something():
@@ -27,6 +27,32 @@ def test_a_frame_cannot_be_changed_and_holds_something():
         Frame(None, 1.0, 2.0)
     assert Frame(None, 1.0, 2.0, encoded=b"\xff\xd8").image is None
     assert Frame(None, 1.0, 2.0, observations={}).image is None
+
+
+@pytest.mark.parametrize("value", ["21.5", None, np.nan, np.inf, 1e300, -400.0, [21.0], np.ones(2)])
+def test_what_is_no_temperature_is_no_reading(value):
+    """A text as a temperature ended the daemon with a traceback."""
+    with pytest.raises(BadReading, match="is not a temperature"):
+        Reading({"temperature": value}, 1.0, 2.0)
+    reading = Reading({"lens": np.float32(21.5), "air": value}, 1.0, 2.0)
+    assert reading.values == {"lens": 21.5}
+    assert "is not a temperature" in reading.missing["air"]
+
+
+@pytest.mark.parametrize("wrong", ["12", None, np.nan, np.inf])
+def test_times_and_settings_of_a_driver_are_numbers(wrong):
+    image = np.zeros((4, 5), dtype=np.uint8)
+    for make in (
+        lambda: Reading({"temperature": 20.0}, wrong, 2.0),
+        lambda: Reading({"temperature": 20.0}, 1.0, wrong),
+        lambda: Reading({}, 1.0, 2.0),
+        lambda: Frame(image, wrong, 2.0),
+        lambda: Frame(image, 1.0, wrong),
+        lambda: Frame(None, 1.0, 2.0, encoded="text"),
+        lambda: Frame(image, 1.0, 2.0, settings={"focus": "near"}),
+    ):
+        with pytest.raises(BadReading, match="its driver gives"):
+            make()
 
 
 def test_virtual_clock_jumps_and_never_goes_back():

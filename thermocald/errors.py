@@ -9,6 +9,7 @@
      │    ├── TestFieldError                  a test field is broken
      │    ├── ImageError                      an image cannot be read or used
      │    ├── StoreError                      a store is broken, foreign, or cannot be written
+     │    │    ├── StoreBusyError             another program keeps it locked
      │    │    ├── StoreFullError             the disk has no room for it
      │    │    ├── StoreVersionError          a store of a newer program
      │    │    └── ServerError                a server refused a request: a person must act
@@ -76,6 +77,10 @@ class ImageError(DataError):
 
 class StoreError(DataError):
     """A store is broken, foreign, or cannot be written."""
+
+
+class StoreBusyError(StoreError):
+    """Another program keeps the store locked; this may pass."""
 
 
 class StoreFullError(StoreError):

@@ -10,17 +10,20 @@ Nothing is inferred from a driver's name or attributes: all that the program nee
 driver is a member of the classes here, with a default.
 
 Errors are those of `thermocald.errors`: after a `TransientDeviceError` the caller closes and opens
-the device again, with back-off; a `PermanentDeviceError` is reported and not retried; after a
-`DeviceFinished`, which is no fault, the device is not used any more.
+the device again, with back-off; a `PermanentDeviceError` is reported and not retried, except that a
+device that is not found or denied is looked for; after a `DeviceFinished`, which is no fault, the
+device is not used any more.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
+from numbers import Real
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -37,7 +40,13 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from thermocald.addresses import hide_secrets
 from thermocald.config import Section, in_words, keys
-from thermocald.errors import ConfigurationError, DeviceGone, DriverMissing, WrongDevice
+from thermocald.errors import (
+    BadReading,
+    ConfigurationError,
+    DeviceGone,
+    DriverMissing,
+    WrongDevice,
+)
 from thermocald.names import channel_fault as channel_fault
 from thermocald.names import require_channels
 
@@ -50,6 +59,14 @@ if TYPE_CHECKING:
 Kind = Literal["camera", "thermometer", "output"]
 _ATTEMPTS = 10  # at most, until the clocks were read within _CLOSE_S
 _CLOSE_S = 1e-4
+_POSSIBLE_C = (-273.15, 3000.0)
+
+
+def _require_numbers(**given: Any) -> None:
+    """Raise BadReading if what a driver gave as a number is none, or is infinite."""
+    for name, value in given.items():
+        if not isinstance(value, Real) or not math.isfinite(value):
+            raise BadReading(f"its driver gives {value!r:.60} as {name}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +84,8 @@ class Frame:
     focus, exposure, gain, white balance in the device's own units; 1.0 and 0.0 for automatic modes
     on and off. They are stored with the epoch in the columns `camera_<name>`.
     fingerprint: a number that differs between any two images by their noise; None without one.
+
+    Raises BadReading if a time or a setting is no number, or if `encoded` holds no bytes.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -82,6 +101,13 @@ class Frame:
     def __post_init__(self) -> None:
         if self.image is None and self.encoded is None and self.observations is None:
             raise ValueError("a frame needs an image, encoded bytes, or observations")
+        _require_numbers(monotonic=self.monotonic, utc=self.utc, exposure=self.exposure or 0.0)
+        given: Mapping[str, Any] = self.settings  # what a driver gives may be anything
+        for name, value in given.items():
+            if not isinstance(value, Real):
+                raise BadReading(f"its driver gives {value!r:.60} as {name}")
+        if not isinstance(self.encoded, bytes | None):
+            raise BadReading(f"its driver gives {type(self.encoded).__name__} as encoded bytes")
         data: bytes | memoryview | None = self.encoded
         if self.image is not None:
             self.image.setflags(write=False)
@@ -95,8 +121,9 @@ class Reading:
     """The values of a thermometer's channels at one time.
 
     values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in,
-    and is in `missing` with the reason. Raises WrongDevice if a channel has the name of one of the
-    program's columns or holds a character that separates columns (`names`).
+    and is in `missing` with the reason; so is a value that is not a possible temperature. Raises
+    WrongDevice if a channel has the name of one of the program's columns or holds a character that
+    separates columns (`names`), BadReading without any value or with times that are no numbers.
     monotonic, utc: time of the conversion, s, as exactly as the device reports it.
     """
 
@@ -106,12 +133,24 @@ class Reading:
     missing: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in self.values:
+        given: Mapping[str, Any] = self.values  # what a driver gives may be anything
+        values: dict[str, float] = {}
+        missing = dict(self.missing)
+        for name, value in given.items():
             if fault := channel_fault(name):
                 raise WrongDevice(
                     f"a temperature channel cannot be called {name!r}: it {fault}; give it another "
                     "name in the configuration"
                 )
+            if isinstance(value, Real) and _POSSIBLE_C[0] <= float(value) <= _POSSIBLE_C[1]:
+                values[name] = float(value)
+            else:
+                missing[name] = f"{name}: {value!r:.60} is not a temperature"
+        _require_numbers(monotonic=self.monotonic, utc=self.utc)
+        if not values:
+            raise BadReading("; ".join(missing.values()) or "its driver gives no channel")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "missing", missing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +257,9 @@ class Device:
     def close(self) -> None:
         """Release the device."""
         handle, self.handle = self.handle, None
-        if handle is not None:
-            handle.close()
+        close = getattr(handle, "close", None)  # a path or a flag needs none
+        if close is not None:
+            close()
 
     def opened(self) -> Any:
         """Return the handle; raises DeviceGone while the device is closed."""

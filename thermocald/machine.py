@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 NOT_BEFORE = 1_700_000_000.0  # s UTC; this program did not exist before
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
-_STA_UNSYNC = 0x40
+_TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 
 State = Literal["ok", "missing", "warning", "not needed"]
 _Result = tuple[State, str, str]  # state, text and remedy of a finding
@@ -285,29 +285,14 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
     return lines
 
 
-class _Timex(ctypes.Structure):
-    """The struct timex of adjtimex(2), of which only `status` is read."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("rest", ctypes.c_char * 256),
-    )
-
-
 def machine_clock_trusted() -> bool:
     """Return whether the clock is synchronised, as reported by systemd-timesyncd or the kernel."""
     if time.time() < NOT_BEFORE:
         return False
     if _SYNCHRONISED.exists():
         return True
-    timex = _Timex()
+    timex = ctypes.create_string_buffer(512)  # more than a struct timex, and only read
     try:
-        answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
+        return bool(0 <= ctypes.CDLL(None).adjtimex(timex) < _TIME_ERROR)
     except (OSError, AttributeError):
         return False
-    return answer >= 0 and not timex.status & _STA_UNSYNC

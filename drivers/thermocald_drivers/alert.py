@@ -261,9 +261,6 @@ class AlertOutput(Output):
         self._last: dict[str, tuple[Any, Any]] = {}  # {device: (series, epoch)}
         self._lost = self._unstored = 0
 
-    def close(self) -> None:
-        self.handle = None
-
     def emit(self, result: Mapping[str, Any]) -> None:
         self.opened()
         for alert in self.changes(result, str(result.get("device", self.options.device))):

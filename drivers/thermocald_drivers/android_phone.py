@@ -52,7 +52,7 @@ from thermocald.errors import (
     DeviceTimeout,
     WrongDevice,
 )
-from thermocald.hal import Device, DriverOptions, Found, Thermometer
+from thermocald.hal import Device, DriverOptions, Found
 from thermocald_drivers import chips, kernel, support
 
 if TYPE_CHECKING:
@@ -166,10 +166,6 @@ class AdbPhone(Device):
         if state != "device":
             raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
         self.handle, self.seen = client.device(serial=o.serial), True
-
-    def close(self) -> None:
-        """Close the phone; the server keeps running."""
-        self.handle = None
 
     def shell(self, command: str) -> str:
         """Return the command's output (both streams); its exit status is ignored."""
@@ -295,7 +291,7 @@ class ThermometerOptions(PhoneOptions):
     timeout_s: support.Seconds = 5.0
 
 
-class AndroidThermometer(AdbPhone, Thermometer):
+class AndroidThermometer(AdbPhone, support.CheckedThermometer):
     """A phone's battery, thermal service and thermal zones, read in one shell call each."""
 
     Options = ThermometerOptions
@@ -315,7 +311,7 @@ class AndroidThermometer(AdbPhone, Thermometer):
                     f"units.{channel}: sensors has no battery or zone of that name"
                 )
         self._watch = kernel.UnitWatch(self.clock)
-        self._believed = support.Channels(self.clock, *PHONE_RANGE_C)
+        self.checked = support.Channels(self.clock, *PHONE_RANGE_C)
         self._scales = self._stated()
 
     @classmethod
@@ -325,7 +321,6 @@ class AndroidThermometer(AdbPhone, Thermometer):
 
     def close(self) -> None:
         super().close()
-        self._believed.clear()
         self._scales = self._stated()
 
     def named_channels(self) -> list[str]:
@@ -344,7 +339,7 @@ class AndroidThermometer(AdbPhone, Thermometer):
             channel: (source, partial(self._judge, channel, source, found.get(source)))
             for channel, source in self.sensors.items()
         }
-        return self._believed.reading(measures, start)
+        return self.checked.reading(measures, start)
 
     def _judge(self, channel: str, source: str, value: float | str | None) -> float:
         where = f"{self.where}: {source}"
@@ -354,7 +349,7 @@ class AndroidThermometer(AdbPhone, Thermometer):
             state = STATE_UNIT.format(channel=channel)
             raise BadReading(f"{where}: {value.format(state=state)}")
         idle = "what an absent sensor reports" if chips.is_idle("", value) else ""
-        return self._believed.judge(source, value, where, idle)
+        return self.checked.judge(source, value, where, idle)
 
     def _stated(self) -> dict[str, float]:
         """Return {source: factor to °C} for the units in the stanza."""

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceTimeout, WrongDevice
-from thermocald.hal import DriverOptions, Found, Thermometer
+from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class I2cOptions(DriverOptions):
     channel: support.Text = "temperature"
 
 
-class I2cThermometer(Thermometer):
+class I2cThermometer(support.CheckedThermometer):
     """A thermometer at one address of a bus; a chip's class implements `_identify`, `_measure`."""
 
     device_classes = ("char-i2c",)
@@ -72,7 +72,7 @@ class I2cThermometer(Thermometer):
                 f"address: 0x{chosen:02x} is not an address of a {self.chip} ({known})"
             )
         self.where = f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.options.bus}"
-        self._channels = support.Channels(self.clock, *self.range_c)
+        self.checked = support.Channels(self.clock, *self.range_c)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
@@ -107,11 +107,11 @@ class I2cThermometer(Thermometer):
 
     def read(self) -> Reading:
         self.opened()
-        return self._channels.reading({self.options.channel: (self.where, self._checked)})
+        return self.checked.reading({self.options.channel: (self.where, self._checked)})
 
     def _checked(self) -> float:
         value, idle = self._measure()
-        return self._channels.judge("", value, self.where, idle)
+        return self.checked.judge("", value, self.where, idle)
 
     def _identify(self) -> None:
         """Check the chip's identity and make it convert; WrongDevice if it is another chip."""

@@ -42,7 +42,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
-from thermocald.hal import DriverOptions, Found, Thermometer, channel_fault
+from thermocald.hal import DriverOptions, Found, channel_fault
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class ZoneOptions(KernelOptions):
     unit: Literal["degC", "tenths", "thousandths"] | None = None
 
 
-class _KernelThermometer(Thermometer):
+class _KernelThermometer(support.CheckedThermometer):
     """A device folder of a sysfs class, found by its name."""
 
     Options: ClassVar[type[DriverOptions]] = ChipOptions
@@ -111,7 +111,7 @@ class _KernelThermometer(Thermometer):
             )
         self.chip = self.where = getattr(o, self.key)
         self.sysfs = Path(o.sysfs)
-        self._believed = support.Channels(self.clock, o.minimum_c, o.maximum_c)
+        self.checked = support.Channels(self.clock, o.minimum_c, o.maximum_c)
         self._channels: dict[str, str] = {}
         self._name = ""
 
@@ -155,10 +155,6 @@ class _KernelThermometer(Thermometer):
         self.handle, self.seen = matches[0], True
         self._name = support.read_line(matches[0] / self.name_file)
 
-    def close(self) -> None:
-        self.handle = None
-        self._believed.clear()
-
     def named_channels(self) -> list[str]:
         return list(self.options.channels)
 
@@ -191,7 +187,7 @@ class _KernelThermometer(Thermometer):
         for channel, key in self._channels.items():
             where = f"{folder.name} ({self.chip}) {key}"
             measures[channel] = where, partial(self._measure, folder, key, where)
-        reading = self._believed.reading(measures)
+        reading = self.checked.reading(measures)
         try:
             name = support.read_line(folder / self.name_file)
         except OSError as error:
@@ -202,7 +198,7 @@ class _KernelThermometer(Thermometer):
 
     def _measure(self, folder: Path, key: str, where: str) -> float:
         value, idle = self._convert(folder, key)
-        return self._believed.judge(key, value, where, idle)
+        return self.checked.judge(key, value, where, idle)
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:
@@ -353,7 +349,7 @@ class ThermalZoneThermometer(_KernelThermometer):
                 f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and agrees with the "
                 "last reading only in another unit; the kernel has switched the unit"
             )
-        if not stated and not larger and not self._believed.support(key, value):
+        if not stated and not larger and not self.checked.support(key, value):
             return value, f"{number:g} in a unit that is not certain (set unit: {self.unit})"
         if self.unit == "thousandths" and 0 < abs(number) <= LARGEST_OF_DEGREES:
             return value, f"{number:g} in thousandths, or in degrees"

@@ -175,9 +175,6 @@ class MockDevice(Device):
             raise DeviceGone(f"{self.where}: unplugged")
         self.handle = True
 
-    def close(self) -> None:
-        self.handle = None
-
     def identity(self) -> Mapping[str, str]:
         seed = getattr(self.options, "seed", 0)
         return {"name": self.where, "serial": f"mock-{seed}"}

@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from thermocald.errors import BadReading, DeviceError, DeviceGone, DeviceTimeout
-from thermocald.hal import DriverOptions, Found, Thermometer
+from thermocald.errors import BadReading, DeviceError, DeviceGone
+from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class OneWireOptions(DriverOptions):
     sysfs: support.Text = "/sys"
 
 
-class Ds18b20Thermometer(Thermometer):
+class Ds18b20Thermometer(support.CheckedThermometer):
     """One or several 1-wire thermometers, read at the same time."""
 
     Options = OneWireOptions
@@ -124,7 +124,7 @@ class Ds18b20Thermometer(Thermometer):
         self.sensors: dict[str, str] = self.options.sensors
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._pending: dict[str, Future[float]] = {}
-        self._believed = support.Channels(self.clock, -55.0, 125.0)
+        self.checked = support.Channels(self.clock, -55.0, 125.0)
 
     def named_channels(self) -> list[str]:
         return list(self.sensors)
@@ -154,10 +154,6 @@ class Ds18b20Thermometer(Thermometer):
             )
         self.handle = self.seen = True
 
-    def close(self) -> None:
-        self.handle = None
-        self._believed.clear()
-
     def identity(self) -> Mapping[str, str]:
         return {"sensors": ", ".join(self.sensors.values())}
 
@@ -171,7 +167,7 @@ class Ds18b20Thermometer(Thermometer):
                 self._pending[channel] = support.in_thread(
                     partial(self._read_one, channel), f"w1-{channel}"
                 )
-        return self._believed.reading(
+        return self.checked.reading(
             {
                 channel: (f"1-wire {rom}", partial(self._await, channel, deadline))
                 for channel, rom in self.sensors.items()
@@ -180,16 +176,10 @@ class Ds18b20Thermometer(Thermometer):
 
     def _await(self, channel: str, deadline: float) -> float:
         """Wait for a sensor's thread and return its result."""
-        task = self._pending[channel]
-        try:
-            return task.result(max(0.0, deadline - self.clock.monotonic()))
-        except TimeoutError:
-            if task.done():
-                raise
-            patience_s = self.options.timeout_s * len(self.sensors)
-            raise DeviceTimeout(
-                f"1-wire {self.sensors[channel]}: no answer in {patience_s:g} s"
-            ) from None
+        patience_s = self.options.timeout_s * len(self.sensors)
+        late = f"1-wire {self.sensors[channel]}: no answer in {patience_s:g} s"
+        left_s = deadline - self.clock.monotonic()
+        return float(support.result_in_time(self._pending[channel], left_s, late))
 
     def _read_one(self, channel: str) -> float:
         rom = self.sensors[channel]
@@ -201,7 +191,7 @@ class Ds18b20Thermometer(Thermometer):
                 )
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
                 idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
-                return self._believed.judge(channel, value, f"1-wire {rom}", idle)
+                return self.checked.judge(channel, value, f"1-wire {rom}", idle)
             except BadReading as error:
                 problem = error
             except OSError as error:

@@ -288,15 +288,8 @@ class Picamera2Camera(Camera):
     def _in_time(self, work: Any, what: str, timeout_s: float | None = None) -> Any:
         """Run work in a new thread, which is abandoned if it hangs; raises DeviceTimeout."""
         limit = self.options.timeout_s if timeout_s is None else timeout_s
-        task = support.in_thread(work, f"picamera2-{what}")
-        try:
-            return task.result(limit)
-        except TimeoutError as error:
-            if task.done():
-                raise
-            raise DeviceTimeout(
-                f"{self.where}: {what} hangs, given up after {limit:g} s"
-            ) from error
+        late = f"{self.where}: {what} hangs, given up after {limit:g} s"
+        return support.result_in_time(support.in_thread(work, f"picamera2-{what}"), limit, late)
 
 
 def agrees(asked: Any, got: Any, tolerance: float) -> bool:

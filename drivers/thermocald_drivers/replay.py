@@ -80,9 +80,6 @@ class _Replay(Device):
             self._epochs = every if after is None else (e for e in every if e.frame_time > after)
         self.handle = self._recording
 
-    def close(self) -> None:
-        self.handle = None
-
     def identity(self) -> Mapping[str, str]:
         if self._recording is None:
             return {"name": "replay"}

@@ -55,7 +55,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
-from thermocald.hal import DriverOptions, Found, Reading, Thermometer
+from thermocald.hal import DriverOptions, Found, Reading
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class SerialOptions(DriverOptions):
         return {**own, **{key: value for key, value in data.items() if value is not None}}
 
 
-class SerialThermometer(Thermometer):
+class SerialThermometer(support.CheckedThermometer):
     """A thermometer with a line protocol, given by a pattern or an instrument's name."""
 
     device_classes = ("char-ttyUSB", "char-ttyACM", "char-ttyAMA", "char-ttyS")
@@ -176,7 +176,7 @@ class SerialThermometer(Thermometer):
             raise ConfigurationError("pattern: name the value, such as (?P<temperature>[-+0-9.]+)")
         if o.checksum != "none" and "checksum" not in self.pattern.groupindex:
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
-        self._believed = support.Channels(self.clock, o.minimum_c, o.maximum_c)
+        self.checked = support.Channels(self.clock, o.minimum_c, o.maximum_c)
         self._decimals: dict[str, tuple[int, bool, int]] = {}
         self._line = b""
         self._synchronous = False
@@ -221,7 +221,6 @@ class SerialThermometer(Thermometer):
         self._decimals.clear()
         if not self.command:
             self._line, self._synchronous = b"", False
-        self._believed.clear()
 
     def identity(self) -> Mapping[str, str]:
         return {"instrument": self.options.instrument or "serial line", "port": self.options.port}
@@ -344,7 +343,7 @@ class SerialThermometer(Thermometer):
             channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match[channel]))
             for channel in there
         }
-        return self._believed.reading(measures, start)
+        return self.checked.reading(measures, start)
 
     def _celsius(self, channel: str, text: str) -> float:
         """Convert a printed number to °C; BadReading if it means that nothing was measured."""
@@ -357,7 +356,7 @@ class SerialThermometer(Thermometer):
         celsius = factor * (number * self.options.scale + self.options.offset - zero)
         if self.options.unit == "mA" and not LOOP_MA[0] <= number <= LOOP_MA[1]:
             raise BadReading(f"{where} mA is a broken loop, not within 3.6 … 21 mA (NAMUR NE 43)")
-        self._believed.require_range(celsius, where)
+        self.checked.require_range(celsius, where)
         if any(
             self._printed(number, decimals, refused) or abs(celsius - refused) < NO_SENSOR_STEP_K
             for refused in self.options.refuse_c
@@ -367,7 +366,7 @@ class SerialThermometer(Thermometer):
                 "refuse_c: []"
             )
         idle = self._idle(number, decimals) if self.options.refuse_c else ""
-        return self._believed.judge(channel, celsius, where, idle)
+        return self.checked.judge(channel, celsius, where, idle)
 
     def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
         """Raise BadReading for a number that lost digits, since firmware always prints as many.

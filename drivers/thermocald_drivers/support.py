@@ -32,7 +32,7 @@ from thermocald.errors import (
     DriverMissing,
     TransientDeviceError,
 )
-from thermocald.hal import Reading, read_together
+from thermocald.hal import Reading, Thermometer, read_together
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -193,6 +193,16 @@ def parse_number(text: str, *, comma: bool = False) -> float:
     return float(plain.replace(",", "."))
 
 
+def result_in_time(task: Future[Any], seconds: float, late: str) -> Any:
+    """Return a task's result, or raise its error; DeviceTimeout with the message `late`."""
+    try:
+        return task.result(max(0.0, seconds))
+    except TimeoutError as error:
+        if task.done():
+            raise
+        raise DeviceTimeout(late) from error
+
+
 class Channels:
     """The channels of one thermometer: checks their temperatures and makes its readings.
 
@@ -264,6 +274,16 @@ class Channels:
             first = next(iter(missing.values()))
             raise type(first)("; ".join(map(str, missing.values()))) from first
         return middle_reading(self._clock, values, start, {k: str(e) for k, e in missing.items()})
+
+
+class CheckedThermometer(Thermometer):
+    """A thermometer whose readings pass the checks of `Channels`, which are anew after a close."""
+
+    checked: Channels
+
+    def close(self) -> None:
+        super().close()
+        self.checked.clear()
 
 
 BAYER_ORDERS = {

@@ -218,12 +218,8 @@ class OpenCvStream:
     def grab(self, deadline: float, accept: Accept) -> Grab | None:
         if self._pending is None or self._pending.done():
             self._pending = support.in_thread(self._read, "opencv-grab")
-        try:
-            grab = self._pending.result(max(0.0, deadline - time.monotonic()))
-        except OSError as error:
-            if isinstance(error, TimeoutError) and not isinstance(error, DeviceTimeout):
-                raise DeviceTimeout(f"{self._path}: no frame came") from None
-            raise
+        late = f"{self._path}: no frame came"
+        grab = support.result_in_time(self._pending, deadline - time.monotonic(), late)
         return grab if accept(grab.stamp, False) else None
 
     def _read(self) -> Grab:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from thermocald.acquisition.device_loop import Link
-from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound
+from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound, WrongDevice
 from thermocald.hal import VirtualClock, open_device
 
 
@@ -68,16 +68,30 @@ def _gone():
 def test_what_no_retry_mends_is_given_up_and_told(clock, link_of):
     device, link, events = link_of()
 
-    def denied():
-        raise DeviceDenied("group video")
+    def another():
+        raise WrongDevice("another camera")
 
-    assert not link.do(denied)
+    assert not link.do(another)
     assert link.ended
     assert events == ["device_failed"]
     assert not link.do(device.read)
 
 
-def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
+def test_an_output_that_is_denied_is_not_tried_again(clock):
+    """A broker or a mail server may lock out who repeats a wrong password."""
+    link = Link("output", "home", open_device("output", "mock", {}, clock), clock)
+    link.device.open = lambda: _raise(DeviceDenied("wrong password"))
+    assert not link.do(lambda: None)
+    assert link.ended
+
+
+def _raise(error):
+    raise error
+
+
+@pytest.mark.parametrize("error", [DeviceNotFound, DeviceDenied])
+def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of, error):
+    """Regression: one that udev had not handled yet, or a phone to be unlocked, was given up."""
     device, link, events = link_of()
     there = device.open
     missing = [True] * 3
@@ -85,7 +99,7 @@ def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
     def open_late():
         if missing:
             missing.pop()
-            raise DeviceNotFound("no such device")
+            raise error("no such device")
         there()
 
     device.open = open_late
@@ -100,3 +114,40 @@ def test_a_bug_in_a_driver_is_a_fault_not_the_end(clock, link_of):
     assert link.state == "out"
     clock.advance(10.0)
     assert link.do(device.read)
+
+
+def test_whatever_a_driver_raises_it_is_retried_and_logged_once(clock, link_of, caplog):
+    """A `close` that failed, or a driver's sys.exit(), ended the device's thread for good."""
+    device, link, events = link_of()
+
+    def fail(*_):
+        raise failures[0]
+
+    failures = [SystemExit(3), KeyError("x")]
+
+    device.close = device.warnings = device.identity = fail
+    while failures:
+        for _ in range(5):
+            assert not link.do(fail)
+            assert link.identity() == {}
+            assert link.status(0.0, 60.0)["warnings"] == []
+            clock.advance(60.0)
+        failures.pop(0)
+    failures.append(OSError("x"))
+    assert link.do(device.read)
+    link.close()
+    assert events == ["device_out", "device_back"]
+    assert caplog.text.count("Traceback") == 4  # one of each method, and one of the action
+
+
+def test_a_device_that_comes_and_goes_all_day_is_not_reported_each_time(clock, link_of, caplog):
+    device, link, events = link_of({"kind": "unplugged", "at_s": 50_000.0, "for_s": 5_000.0})
+    caplog.set_level("INFO")
+    for k in range(4000):
+        link.do(device.read if k % 2 else _gone)
+        clock.advance(10.0)
+    assert link.faults == 2000
+    assert len(events) == 19
+    assert "10 times within an hour" in caplog.text
+    poll(clock, link, device, 3000, 10.0)  # calm, then out for good
+    assert events[19:] == ["device_out", "device_back"]

@@ -48,7 +48,6 @@ int adjtimex(struct timex *state) {
   if (!real) real = (int (*)(struct timex *))dlsym(RTLD_NEXT, "adjtimex");
   int done = real(state);
   if (getenv("CLOCK_SYNCHRONISED")) {
-    state->status &= ~STA_UNSYNC;
     return TIME_OK;
   }
   return done;

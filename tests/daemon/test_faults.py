@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import signal
@@ -13,6 +14,9 @@ import pytest
 
 from tests.daemon.conftest import make_photographs
 from tests.marks import mostly_slow
+from thermocald.daemon.plan import recording_config
+from thermocald.daemon.service import Service
+from thermocald.daemon.store_guard import StoreGuard
 from thermocald.store.database.store import Store
 
 
@@ -82,7 +86,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     daemon.run(**devices())
     daemon.more(4)
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
+    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (16384, before[1]))
     daemon.until(lambda: "results wait in memory" in daemon.log())
     daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
@@ -97,6 +101,24 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     assert numbers == [r["epoch"] for r in results] == list(range(1, len(numbers) + 1))
     assert daemon.log().count("results wait in memory") == 1
     assert daemon.log().count("can be written again") == 1
+
+
+def test_a_hang_up_while_it_starts_does_not_end_it(recording, tmp_path, monkeypatch):
+    """systemd does not restart a service that a SIGHUP ended."""
+    unheard = []
+    before = signal.signal(signal.SIGHUP, lambda *_: unheard.append(True))
+
+    def open_store(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGHUP)
+        return StoreGuard(*arguments, **options)
+
+    monkeypatch.setattr("thermocald.daemon.service.StoreGuard", open_store)
+    config = recording_config(recording, tmp_path / "t.db")
+    try:
+        assert Service(config, fast=True, epochs=3, until_finished=True).run()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert not unheard
 
 
 @pytest.mark.parametrize("failing", mostly_slow(["write", "sync"], "write"))

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import sqlite3
+import time
+from dataclasses import replace
+
+import pytest
+
 from thermocald.daemon.store_guard import Row, StoreGuard
+from thermocald.errors import StoreBusyError
 
 
 def test_a_row_that_found_no_room_waits(tmp_path, head, field, make_epoch, make_result):
@@ -30,3 +37,78 @@ def test_a_row_that_found_no_room_waits(tmp_path, head, field, make_epoch, make_
     stored = [epoch.epoch.number for epoch in guard.store.epochs(series)]
     assert stored == list(range(1, number + 2))
     guard.close()
+
+
+@pytest.fixture
+def guard(tmp_path, head, field):
+    guard = StoreGuard(tmp_path / "t.db", durable=False)
+    guard.store.create_series(head, field)
+    yield guard
+    guard.close()
+
+
+@pytest.fixture
+def keep(guard, make_epoch, make_result):
+    (series,) = guard.store.all_series()
+    return lambda n, **more: guard.append(
+        Row(series, replace(make_epoch(n), **more), make_result(n), {}, True)
+    )
+
+
+def numbers(guard):
+    (series,) = guard.store.all_series()
+    return [stored.epoch.number for stored in guard.store.epochs(series)]
+
+
+def test_a_lock_of_another_program_is_waited_for_and_loses_nothing(guard, keep, monkeypatch):
+    """A row was lost if the lock ended at the wrong time, and the watchdog starved for a minute."""
+    other = sqlite3.connect(guard.path, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    write_event = guard.store.add_event
+
+    def end_lock(event):
+        other.close()
+        write_event(event)
+
+    monkeypatch.setattr(guard.store, "add_event", end_lock)
+    begin = time.monotonic()
+    for number in range(1, 11):  # epochs come faster than attempts may be made
+        keep(number)
+    assert time.monotonic() - begin < 5.0
+    assert "another program keeps it locked" in guard.away
+    assert (guard.waiting, guard.lost) == (10, 0)
+    other.close()
+    guard.flush()
+    assert (guard.away, guard.lost, guard.waiting) == ("", 0, 0)
+    assert numbers(guard) == [*range(1, 11)]
+
+
+def test_a_row_that_cannot_be_written_at_all_is_lost_and_stops_nothing(guard, keep):
+    keep(1)
+    keep(2, temperatures={"t": object()})
+    keep(3)
+    assert (guard.lost, guard.waiting, numbers(guard)) == (1, 0, [1, 3])
+
+
+def test_a_long_backlog_is_written_in_parts_so_that_the_watchdog_is_fed(guard, keep, monkeypatch):
+    append = guard.store.append
+    monkeypatch.setattr(guard.store, "append", lambda *_, **__: refuse())
+    for number in range(1, 11):
+        keep(number)
+    monkeypatch.setattr(guard.store, "append", lambda *a, **k: (time.sleep(0.05), append(*a, **k)))
+    guard.flush(0.12)
+    assert 5 <= guard.waiting <= 9
+    guard.flush()
+    assert numbers(guard) == [*range(1, 11)]
+
+
+def refuse():
+    raise StoreBusyError("locked")
+
+
+def test_losses_are_counted_each_and_reported_once_a_minute(guard, caplog):
+    for number in range(1000):
+        guard.lose(f"epoch {number}: too slow")
+    assert guard.lost == 1000
+    assert caplog.text.count("lost: epoch") == 1
+    assert len([e for e in guard.stored_events() if e.kind == "epoch_lost"]) <= 1

@@ -6,8 +6,11 @@ missed ticks are counted and not made up for.
 
 The link opens the device when it is needed, and again after faults, with growing pauses. It reports
 once that a device goes away, and once that it is back. A permanent fault ends the link until the
-configuration is read again; only a device that was not found is looked for again, since it may be
-plugged in later.
+configuration is read again. A device that was not found is looked for again, since it may be
+plugged in later; so is a camera or thermometer that is denied: at boot its node belongs to root
+until udev has handled it, another program probes it, and a person may yet unlock a phone. An output
+is not, since a server may lock out who repeats a wrong password. A device that comes and goes all
+the time is reported once, then only counted.
 """
 
 from __future__ import annotations
@@ -17,10 +20,11 @@ import math
 import threading
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import (
+    DeviceDenied,
     DeviceFinished,
     DeviceNotFound,
     PermanentDeviceError,
@@ -34,7 +38,7 @@ if TYPE_CHECKING:
 
     OnEvent = Callable[[float, str, str], None]
 
-_QUEUE = 200  # results that may wait for an output
+_QUEUE = 400  # results that may wait for an output: an hour at one every 10 s
 _LATEST_START = 0.1  # of a period; a tick that would begin later is skipped
 _REMEMBERED = 1000
 
@@ -84,12 +88,14 @@ class Schedule:
 
 
 log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 LinkState = Literal["closed", "open", "out", "failed", "finished"]
 
 _FIRST_PAUSE_S = 0.25
 _LONGEST_PAUSE_S = 2.0  # or the device's period if that is longer
 _SEARCH_PAUSE_S = 10.0
+_OFTEN, _OFTEN_S = 10, 3600.0  # outages within a time, from which they are not reported one by one
 
 
 class Link:
@@ -123,8 +129,12 @@ class Link:
         self._clock = clock
         self._period_s = period_s
         self._on_event = on_event
+        self._searched = DeviceNotFound if kind == "output" else (DeviceNotFound, DeviceDenied)
         self._pause_s = 0.0
         self._retry_at = 0.0
+        self._outages: deque[float] = deque(maxlen=_OFTEN)
+        self._restless = False
+        self._broken: set[str] = set()  # methods of the driver that failed
 
     @property
     def ended(self) -> bool:
@@ -141,10 +151,10 @@ class Link:
             action()
         except TransientDeviceError as error:
             self._out(str(error), max(self._period_s, _LONGEST_PAUSE_S))
-        except DeviceNotFound as error:
+        except self._searched as error:
             self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
         except PermanentDeviceError as error:
-            self.device.close()
+            self._close()
             self.since = self._clock.utc()
             self.why = without_secrets(str(error))
             # the end of a recording is not a failure
@@ -152,9 +162,9 @@ class Link:
             self.state = "finished" if finished else "failed"
             level = logging.INFO if finished else logging.ERROR
             self._report(level, f"device_{self.state}", f"{self.called}: {self.why}")
-        except Exception as error:
-            # an error in a driver must not stop the daemon
-            if self.state != "out":
+        except BaseException as error:
+            # an error in a driver, even its sys.exit(), must not stop the daemon
+            if self.state != "out" and not self._restless:
                 log.exception("%s: its driver failed", self.called)
             self._out(f"{type(error).__name__}: {error}", max(self._period_s, _LONGEST_PAUSE_S))
         else:
@@ -164,21 +174,32 @@ class Link:
 
     def close(self) -> None:
         """Release the device."""
-        self.device.close()
+        self._close()
         if not self.ended:
             self.state = "closed"
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, str]:
         """Return the device's identity; empty if it cannot be read."""
+        return self._ask(
+            "identity", lambda: {str(k): str(v) for k, v in self.device.identity().items()}, {}
+        )
+
+    def _close(self) -> None:
+        self._ask("close", self.device.close, None)
+
+    def _ask(self, method: str, call: Callable[[], _T], default: _T) -> _T:
+        """Call a method of the driver that should not fail; log once that it did."""
         try:
-            return dict(self.device.identity())
-        except Exception:
-            log.exception("%s: its identity cannot be read", self.called)
-            return {}
+            return call()
+        except BaseException:
+            if method not in self._broken:
+                log.exception("%s: its driver failed in `%s`", self.called, method)
+            self._broken.add(method)
+            return default
 
     def _back(self) -> None:
-        if self.state == "out":
-            away_s = self._clock.monotonic() - self.out_since
+        away_s = self._clock.monotonic() - self.out_since
+        if self.state == "out" and (not self._restless or away_s > _OFTEN_S):
             self._report(logging.INFO, "device_back", f"{self.called} is back after {away_s:.0f} s")
         self.state = "open"
         self.since = math.nan
@@ -186,7 +207,7 @@ class Link:
         self._pause_s = 0.0
 
     def _out(self, why: str, longest_s: float) -> None:
-        self.device.close()
+        self._close()
         why = without_secrets(why)  # a library may quote an address
         self.faults += 1
         self.why = why
@@ -194,7 +215,13 @@ class Link:
             self.state = "out"
             self.out_since = self._clock.monotonic()
             self.since = self._clock.utc()
-            self._report(logging.WARNING, "device_out", f"{self.called} is out: {why}")
+            self._outages.append(self.out_since)
+            was_restless, count = self._restless, len(self._outages)
+            self._restless = count == _OFTEN and self.out_since - self._outages[0] < _OFTEN_S
+            if not was_restless or not self._restless:
+                often = f", {count} times within an hour; from now on only the status shows it"
+                text = f"{self.called} is out: {why}{often if self._restless else ''}"
+                self._report(logging.WARNING, "device_out", text)
         # the first retry is at the next tick, since most faults concern a single frame
         now = self._clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
@@ -206,16 +233,14 @@ class Link:
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
-        try:
-            warnings = list(self.device.warnings())
-        except Exception:
-            log.exception("%s: its warnings cannot be read", self.called)
-            warnings = []
+        warnings: list[str] = []
         return {
             "device": "hung" if busy_s > hang_after_s else self.state,
             "why": self.why,
             "since": self.since,
-            "warnings": warnings,
+            "warnings": self._ask(
+                "warnings", lambda: [str(text) for text in self.device.warnings()], warnings
+            ),
             "faults": self.faults,
         }
 

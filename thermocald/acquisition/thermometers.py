@@ -6,6 +6,7 @@ at a frame's time, interpolate between the readings of neighbouring epochs.
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections import deque
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from thermocald.config import Config
     from thermocald.hal import Clock, Reading, Thermometer
 
+
+log = logging.getLogger(__name__)
 
 _REMEMBERED = 16
 _FARTHEST_IN_PERIODS = 1.5
@@ -92,6 +95,7 @@ class Thermometers:
         self._channels: dict[str, tuple[str, ...]] = {}  # as declared, then as read
         self._periods_s = {one.name: one.period_s for one in config.thermometers}
         self._kept: dict[str, deque[Reading]] = {}
+        self._missed: set[tuple[str, str]] = set()  # channels that were reported as missing
         self._changed = threading.Condition()
         for one in config.thermometers:
             device = open_device("thermometer", one.driver, one.options, clock)
@@ -132,6 +136,10 @@ class Thermometers:
             channels = {**self._channels, name: (*self._channels[name], *new)}
             self._require(channels, WrongDevice)
             self._channels = channels
+        for channel, why in reading.missing.items():
+            if (name, channel) not in self._missed:
+                log.warning("thermometer %s lacks %s: %s", name, channel, why)
+                self._missed.add((name, channel))
         with self._changed:
             self._kept[name].append(reading)
             self._changed.notify_all()
@@ -140,6 +148,11 @@ class Thermometers:
         """Return a thermometer's last values, {channel: °C}."""
         kept = self._kept[name]
         return kept[-1].values if kept else {}
+
+    def missing(self, name: str) -> list[str]:
+        """Return why channels are missing in a thermometer's last reading."""
+        kept = self._kept[name]
+        return list(kept[-1].missing.values()) if kept else []
 
     def nearest(self, name: str, monotonic: float) -> Reading | None:
         """Return a thermometer's reading nearest to a time; None if it is over 1.5 periods away."""

@@ -44,7 +44,7 @@ class LiveState:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._failed = False
+        self._failed: set[str] = set()
 
     @classmethod
     def beside(cls, store: Path) -> LiveState:
@@ -90,15 +90,15 @@ class LiveState:
             self.folder.mkdir(parents=True, exist_ok=True)
             partial.write_bytes(data)
             os.replace(partial, self.folder / name)
-            self._failed = False
+            self._failed.discard(name)
         except OSError as error:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
             if name.endswith(".json") and overwrite_json(self.folder / name, data):
                 return  # an old status from before the disk was full would look healthy
-            if not self._failed:
-                log.warning("%s: the status cannot be written: %s", self.folder, error)
-            self._failed = True
+            if name not in self._failed:
+                log.warning("%s: cannot be written: %s", self.folder / name, error)
+            self._failed.add(name)
 
 
 def _beside(store: Path) -> Path:

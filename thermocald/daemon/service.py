@@ -10,6 +10,7 @@ could take the memory that the daemon needs.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import queue
@@ -172,6 +173,12 @@ class Service:
 
         Raises ThermocaldError if the daemon cannot start.
         """
+        # already while the store is opened: a SIGHUP would end the process, and systemd takes that
+        # for an exit without a fault
+        with self._signals():
+            return self._run()
+
+    def _run(self) -> bool:
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
         self._runtime = Runtime(self._guard, self.clock, self.live, **self._options)
@@ -182,23 +189,22 @@ class Service:
             self._sessions = Sessions(self._guard, self.clock, self._station)
             if not self._until_finished:
                 self._sessions.resume(self._station)
-            with self._signals():
-                self._station.start()
-                if not self._until_finished:
-                    control.open()
-                log.info("thermocald %s runs", __version__, extra={"event": "started"})
-                self._record("started", f"thermocald {__version__} started")
-                notify(f"READY=1\nSTATUS={self._line()}")
-                try:
-                    self._loop()
-                finally:
-                    notify("STOPPING=1")
-                    control.close()
-                    done = self._station.stop(_GRACE_S)
-                    self._record("stopped", "thermocald stopped")
-                    self._guard.flush()
-                    self.live.remove()  # while the page still runs and can report it
-                    self._dashboard.stop()
+            self._station.start()
+            if not self._until_finished:
+                control.open()
+            log.info("thermocald %s runs", __version__, extra={"event": "started"})
+            self._record("started", f"thermocald {__version__} started")
+            notify(f"READY=1\nSTATUS={self._line()}")
+            try:
+                self._loop()
+            finally:
+                notify("STOPPING=1")
+                control.close()
+                done = self._station.stop(_GRACE_S)
+                self._record("stopped", "thermocald stopped")
+                self._guard.flush()
+                self.live.remove()  # while the page still runs and can report it
+                self._dashboard.stop()
         finally:
             self._guard.close()
             self.live.remove()
@@ -358,6 +364,7 @@ class Service:
         self._sessions.resume(new)
         logging.getLogger().setLevel(config.logging.level.upper())
         self.config, self._station = config, new
+        gc.collect()  # the old station refers to itself: 50 MB would stay for a while
         new.start()
         text = "the configuration was read again"
         self._record("reloaded", text)

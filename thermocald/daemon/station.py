@@ -161,13 +161,7 @@ class Station:
         return {
             "cameras": {camera.plan.name: camera.status() for camera in self.cameras},
             "thermometers": {
-                name: {
-                    **link.status(
-                        self._readers[name].busy_s() if name in self._readers else 0.0, hang_after_s
-                    ),
-                    "last": dict(self.thermometers.last(name)),
-                }
-                for name, link in self.thermometers.links.items()
+                name: self._thermometer_status(name) for name in self.thermometers.links
             },
             "outputs": {
                 output.link.name: {
@@ -183,6 +177,15 @@ class Station:
                 "paused": self.frames.paused,
                 "ages_known": self.runtime.clock.settled(),
             },
+        }
+
+    def _thermometer_status(self, name: str) -> dict[str, Any]:
+        busy_s = self._readers[name].busy_s() if name in self._readers else 0.0
+        link = self.thermometers.links[name].status(busy_s, self.runtime.hang_after_s)
+        return {
+            **link,
+            "warnings": link["warnings"] + self.thermometers.missing(name),
+            "last": dict(self.thermometers.last(name)),
         }
 
     def _read(self, name: str) -> None:

@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.addresses import without_secrets
-from thermocald.errors import OutputError, StoreError, StoreFullError
+from thermocald.errors import OutputError, StoreBusyError, StoreError, StoreFullError
 from thermocald.files import cannot_write, is_unmounted, make_folder, mount_point, utc_stamp
+from thermocald.numbers import counted
 from thermocald.store.database.file import HELPERS, StoreFile, helper, read_wal_tail
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
@@ -217,6 +218,8 @@ _RESERVE_BYTES = 16_000_000
 _ENOUGH_BYTES = 20_000_000
 _MOST_WITH_OBSERVATIONS = 100
 _MOST_WAITING = 20_000
+_FLUSH_S = 5.0  # of writing what waited, then others get their turn: the watchdog does not wait
+_TELL_EVERY_S = 60.0  # losses are reported this often
 
 
 @dataclass(eq=False)
@@ -247,13 +250,14 @@ class StoreGuard:
     def __init__(self, path: Path, *, durable: bool = True) -> None:
         self.path = path
         self.lost = 0  # epochs that were taken but not stored, for any reason
-        self._lost_at = -math.inf
+        self._lost_at = self._lost_told_at = -math.inf
         self._lost_why = ""
         self.away = ""  # why the store cannot be written, else empty
         self.thin = False
         self._waiting: deque[Row] = deque()
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
+        self._retry_at = -math.inf
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
         self._series_store: Store | None = None  # the store of `_series`
@@ -272,9 +276,11 @@ class StoreGuard:
     def close(self) -> None:
         """Try once more to store what waits, then close."""
         with self._lock:
-            self.flush()
-            while self._waiting:
-                self.lose(f"epoch {self._waiting.popleft().epoch.number}: {self.away}")
+            self.flush(math.inf)
+            if self._waiting:
+                first, count = self._waiting[0].epoch.number, len(self._waiting)
+                self.lose(f"epoch {first}{' and later' if count > 1 else ''}: {self.away}", count)
+                self._waiting.clear()
             self._file.close()
 
     def series(self, wanted: StoredSeries) -> StoredSeries:
@@ -321,7 +327,10 @@ class StoreGuard:
         """Store an epoch now or when the store can be written; return whether it is stored."""
         with self._lock:
             self._waiting.append(row)
-            self.flush()
+            if self.away and time.monotonic() < self._retry_at:
+                self._limit_waiting()
+            else:
+                self.flush()
             return row.stored
 
     def amend(
@@ -349,22 +358,26 @@ class StoreGuard:
             self._events.append(event)
             self._flush_events()
 
-    def lose(self, why: str) -> None:
-        """Count an epoch that was taken but will not be stored, and report it."""
-        self.lost += 1
+    def lose(self, why: str, count: int = 1) -> None:
+        """Count epochs that were taken but will not be stored; report this once a minute."""
+        self.lost += count
         self._lost_at, self._lost_why = time.monotonic(), why
-        log.error("an epoch is lost: %s", why, extra={"event": "epoch_lost"})
+        if count == 1 and self._lost_at - self._lost_told_at < _TELL_EVERY_S:
+            return
+        self._lost_told_at = self._lost_at
+        log.error("%s lost: %s", counted(self.lost, "epoch"), why, extra={"event": "epoch_lost"})
         self._events.append(Event(time.time(), "epoch_lost", why))
 
     def reading(self, reading: LoggedReading) -> None:
         """Queue a reading that belongs to no epoch, for the next `flush`."""
         self._readings.append(reading)
 
-    def flush(self) -> None:
-        """Write what waits, oldest first, until a write fails."""
+    def flush(self, within_s: float = _FLUSH_S) -> None:
+        """Write what waits, oldest first, until a write fails or the time is over."""
         with self._lock:
+            begin = time.monotonic()
             self._watch()
-            while self._waiting:
+            while self._waiting and time.monotonic() - begin < within_s:
                 row = self._waiting[0]
                 error = self._write(row)
                 if error is None or self._is_committed(row):
@@ -380,6 +393,8 @@ class StoreGuard:
                     self.lose(f"epoch {row.epoch.number} of {row.series.camera}: {error}")
                 else:
                     self._hold_back(error)
+                    # an attempt at a locked store takes long, and epochs may come faster
+                    self._retry_at = 2 * time.monotonic() - begin
                     return
             self._flush_events()
             self._flush_readings()
@@ -407,8 +422,14 @@ class StoreGuard:
                 )
             except StoreError as refusal:
                 error = error or refusal
+            except Exception as cause:
+                # no row, whatever a driver put into it, may stop the daemon
+                log.exception("epoch %d of %s", row.epoch.number, row.series.camera)
+                error = error or StoreError(f"{type(cause).__name__}: {cause}")
             else:
                 return None
+            if isinstance(error, StoreBusyError):
+                break
         return error
 
     def _check_free_space(self, row: Row) -> None:
@@ -439,9 +460,12 @@ class StoreGuard:
     def _refuses_only_this(self, error: StoreError) -> bool:
         """Return whether the store can be written, but not with the row of this error.
 
-        On a full disk there may be room for an event but not for a row: then the row waits.
+        On a full disk there may be room for an event but not for a row, and a lock may end while
+        the event waits for it: then the row waits.
         """
-        if self.away or isinstance(error, StoreFullError) or not self._flush_events():
+        if self.away or isinstance(error, StoreFullError | StoreBusyError):
+            return False
+        if not self._flush_events():
             return False
         try:
             self.store.add_event(Event(time.time(), "row_refused", "probe"))
@@ -456,13 +480,16 @@ class StoreGuard:
         self.away = str(error)
 
     def _hold_back(self, error: StoreError) -> None:
-        """Let the rows wait; thin those beyond the latest 100, and lose the oldest of too many."""
         self._mark_out(error, self._waiting[0].epoch.frame_time)
+        self._limit_waiting()
+
+    def _limit_waiting(self) -> None:
+        """Thin the rows beyond the latest 100, and lose the oldest of too many."""
         last = -1 - _MOST_WITH_OBSERVATIONS
         if len(self._waiting) >= -last:
             self._waiting[last] = self._waiting[last].thin()
         if len(self._waiting) > _MOST_WAITING:
-            self.lose(f"epoch {self._waiting.popleft().epoch.number}: too many wait: {error}")
+            self.lose(f"epoch {self._waiting.popleft().epoch.number}: too many wait: {self.away}")
 
     def _mark_back(self) -> None:
         if self.away:

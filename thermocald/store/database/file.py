@@ -30,7 +30,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from thermocald.errors import StoreError, StoreFullError, StoreVersionError, ThermocaldError
+from thermocald.errors import (
+    StoreBusyError,
+    StoreError,
+    StoreFullError,
+    StoreVersionError,
+    ThermocaldError,
+)
 from thermocald.files import cannot_write, is_ordinary, output_place
 from thermocald.store import schema
 from thermocald.store.database.columns import DamageError
@@ -59,7 +65,7 @@ _ADVICE = {
     "SQLITE_READONLY": _READ_ONLY,
     "SQLITE_PERM": _READ_ONLY,
     "SQLITE_CANTOPEN": "it cannot be opened; check that its folder exists and may be written",
-    "SQLITE_BUSY": f"another process kept it locked for more than {_BUSY_S:g} s",
+    "SQLITE_BUSY": "another program keeps it locked",
     "SQLITE_NOTADB": _NO_STORE,
     "SQLITE_CORRUPT": _NO_STORE,
 }
@@ -204,6 +210,7 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
     except sqlite3.Error as cause:
         name = _name(cause)
         kind = StoreFullError if name.startswith(_NO_ROOM) else StoreError
+        kind = StoreBusyError if name.startswith("SQLITE_BUSY") else kind
         advice = next((text for start, text in _ADVICE.items() if name.startswith(start)), "{}")
         raise kind(f"{path}: {doing}: {advice.format(cause)}") from cause
     except (

@@ -59,6 +59,7 @@ log = logging.getLogger(__name__)
 
 _EPOCHS_AT_ONCE = 100
 _READINGS_AT_ONCE = 1000
+_CLAIMED_BUSY_MS = 500
 _DERIVED = ("epoch", "status")
 
 
@@ -86,7 +87,10 @@ class Store(SeriesReader):
         StoreVersionError.
         """
         if mode == "read" or claimed:
-            return cls(path, connect(path, mode, durable=durable), None)
+            connection = connect(path, mode, durable=durable)
+            if claimed:  # its rows can wait in memory, and its watchdog cannot
+                connection.execute(f"PRAGMA busy_timeout = {_CLAIMED_BUSY_MS}")
+            return cls(path, connection, None)
         file = StoreFile(path)
         try:
             if file.names > 1:

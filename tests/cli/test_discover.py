@@ -58,11 +58,17 @@ def test_everything_is_written(recordings, found):
     assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
     page = report.read_text().replace("\u00a0", " ")
     assert page.count("<figure") == 6
+    assert "Could noise do this?" in page
+    assert "≤ 1/120" in page
+    assert "UTC, 60 epochs." in page
+    assert "&lt;" not in page  # no object's repr in place of its text
     assert "http://" not in page.replace("http://www.w3.org", "").replace(
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
     assert document["effects"][0]["statement"][1:] in page
-    assert "reading" in found.stderr
+    stages = ("reading", "targets that moved", "measuring noise", "base model", "effect 1")
+    assert [found.stderr.count(stage) for stage in stages[1:3]] == [1, 1]
+    assert [*stages] == sorted(stages, key=found.stderr.index)
 
 
 def test_with_the_model_found_nothing_is_missing(recordings, found):

@@ -1,4 +1,4 @@
-"""Reduction of a series: offsets, gross errors, weak input, copies; corners of real cameras."""
+"""Reduction of a series: offsets, gross errors, weak input; corners of real cameras."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import thermocald as tc
 from tests.blind import bridge
 from tests.blind.case import Case
 from tests.blind.generator import generate
 from thermocald.discovery.result import discover_series
-from thermocald.errors import DataError, UsageError
+from thermocald.errors import DataError
 from thermocald.store.recording.reader import read_recording
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
@@ -163,24 +162,3 @@ def test_a_hidden_board_does_not_pull_at_the_cameras(shared):
     mean = np.nanmean(e.residuals[:, often], axis=0)
 
     assert np.max(np.abs(mean)) < 1e-3
-
-
-@pytest.fixture
-def series(tmp_path):
-    return [
-        tc.simulate("nexus5-cold", seed=seed, series=name, out=tmp_path / name)
-        for name, seed in (("M1", 1), ("M2", 1), ("M3", 2))
-    ]
-
-
-def test_a_recording_counts_once(series):
-    m1, m2, m3 = series
-    for others in ([m2, m1], [m2, m3, tc.open(m2.source)]):
-        with pytest.raises(UsageError, match="is the same series as"):
-            tc.discover(m1, verify=others)
-
-
-def test_a_copy_under_another_name_proves_nothing(series):
-    m1, m2, m3 = series
-    with pytest.raises(DataError, match=r"M2 holds the same observations as .*M1"):
-        tc.discover(m1, verify=[m3, m2])

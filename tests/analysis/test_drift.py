@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import signal
 
 import thermocald as tc
 from thermocald.analysis.series.adjusted import table_of_series
@@ -143,10 +142,12 @@ def test_many_epochs_are_averaged():
 )
 def test_replay_reports_no_drift_in_noise_with_a_memory(coloured, phi, epochs):
     """At the level of 1 %; a test with its own line once reported drift in 7 to 17 %."""
+    from scipy.signal import lfilter  # half a second, of one worker
+
     rng, claims = np.random.default_rng(16), []
     for _ in range(120):
         values = np.zeros((epochs, 16))
-        slow = signal.lfilter([1], [1, -phi], rng.standard_normal((600 + epochs, 3)), axis=0)[600:]
+        slow = lfilter([1], [1, -phi], rng.standard_normal((600 + epochs, 3)), axis=0)[600:]
         values[:, :3] = np.sqrt(coloured * (1 - phi**2)) * slow
         values[:, :3] += np.sqrt(1 - coloured) * rng.standard_normal((epochs, 3))
         table = table_of(values, np.ones((epochs, 16)), "series")

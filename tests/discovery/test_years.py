@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from year_of_means import DAY, year
 
 import thermocald as tc
@@ -38,6 +37,8 @@ def outdoors(t):
 
 def behind(at, _):
     """The cellar's temperature with a lag, in steps of 10 s about the afternoon."""
+    from scipy.signal import lfilter  # half a second, of one worker
+
     fine = np.arange(199.0 * DAY, 203.0 * DAY, 10.0)
     a = np.exp(-10.0 / LAG_S)
     warm = cellar(fine)

@@ -12,7 +12,7 @@ import yaml
 import thermocald as tc
 from tests.blind.case import Case
 from tests.blind.generator import generate, write
-from tests.commands import answer, succeed
+from tests.commands import succeed
 from thermocald.errors import DataError, UsageError
 
 PROGRAMME = """
@@ -93,14 +93,6 @@ def test_another_camera_is_refused(recordings, tmp_path):
         discover()
     with pytest.raises(DataError, match="another camera"):
         discover(recordings / "M1", "--verify", tmp_path / "M2")
-
-
-def test_a_real_recording_without_temperature(shared):
-    result = answer("discover", shared / "data" / "aviary-cam1", "--json", "-")
-    assert isinstance(result.exception, DataError)
-    assert result.exception.exit_status == 1
-    assert "temperature" in str(result.exception)
-    assert result.stdout == ""
 
 
 @pytest.mark.slow

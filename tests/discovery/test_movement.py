@@ -11,6 +11,7 @@ from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
 from tests.discovery.test_likelihood import of_images, products
+from tests.marks import mostly_slow
 from thermocald.discovery.result import discover_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.fit import HypothesisFitter
@@ -130,17 +131,14 @@ def test_a_tremble_is_no_drift(effects, px, expected):
     assert [detect_tremble(e) for e in trembling(effects, px, 3)] == [expected] * 2
 
 
-@pytest.mark.parametrize(
-    ("effects", "px", "seed", "epochs"),
-    [
-        ((), 0.05, 2, 90),
-        pytest.param(("softening",), 0.02, 3, 180, marks=pytest.mark.slow),
-        pytest.param(("softening",), 0.05, 2, 180, marks=pytest.mark.slow),
-        pytest.param(("thermal_lag",), 0.02, 3, 180, marks=pytest.mark.slow),
-        pytest.param(("thermal_lag",), 0.05, 2, 180, marks=pytest.mark.slow),
-        pytest.param(("cyclic_interference",), 0.02, 3, 180, marks=pytest.mark.slow),
-    ],
-)
+TREMBLING = (
+    ((), 0.05, 2, 60), (("softening",), 0.02, 3, 180), (("softening",), 0.05, 2, 180),
+    (("thermal_lag",), 0.02, 3, 180), (("thermal_lag",), 0.05, 2, 180),
+    (("cyclic_interference",), 0.02, 3, 180),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("effects", "px", "seed", "epochs"), mostly_slow(TREMBLING, TREMBLING[0]))
 def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed, epochs):
     found = discover_series(trembling(effects, px, seed, epochs))
 

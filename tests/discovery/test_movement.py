@@ -132,7 +132,7 @@ def test_a_tremble_is_no_drift(effects, px, expected):
 
 
 TREMBLING = (
-    ((), 0.05, 2, 60), (("softening",), 0.02, 3, 180), (("softening",), 0.05, 2, 180),
+    ((), 0.05, 2, 90), (("softening",), 0.02, 3, 180), (("softening",), 0.05, 2, 180),
     (("thermal_lag",), 0.02, 3, 180), (("thermal_lag",), 0.05, 2, 180),
     (("cyclic_interference",), 0.02, 3, 180),
 )  # fmt: skip

@@ -74,7 +74,7 @@ def test_a_recording_without_thermal_effects(shared, tmp_path, camera):
     """No drift, no rate and no effect are found."""
     m1 = with_temperature(shared / "data" / camera, tmp_path / "M1", 0, 50)
     m2 = with_temperature(shared / "data" / camera, tmp_path / "M2", 50, 101)
-    study = json.loads(run("study", m1, m2, "--json", "-").stdout)
+    study = json.loads(run("study", m1, m2, "--sets", 2000, "--json", "-").stdout)
     assert [len(camera["series"]) for camera in study["cameras"]] == [2]
     found = json.loads(run("discover", m1, "--verify", m2, "--json", "-").stdout)
     names = {e["effect"] for e in found["effects"]}

@@ -20,8 +20,8 @@ from PIL import Image
 import thermocald as tc
 from tests.commands import call
 from tests.main_paths import crooked
-from tests.main_paths.tables import read_rows, write_rows
 from tests.marks import mostly_slow
+from tests.recordings import read_rows, write_rows
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
 SOME = mostly_slow(REAL, "aviary-cam2")

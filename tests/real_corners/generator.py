@@ -9,7 +9,6 @@ and effects are from `tests.blind`, which shares no code with the program.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,7 +19,7 @@ import yaml
 from tests.blind.case import PROGRAMMES
 from tests.blind.hidden import Camera, bisected, fresh, hide, left_over, true_parameters
 from tests.blind.world import climate, image, smooth_unknown
-from tests.recordings import write_recording
+from tests.recordings import read_rows, write_recording
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 NINE = (
@@ -79,12 +78,10 @@ class RealSeries:
 @cache
 def corners(camera: str) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the targets' names and points (T, 3) mm, and image points (E, T, 2) px or NaN."""
-    with (SHARED / camera / "testfield.csv").open() as f:
-        field = list(csv.DictReader(f))
+    field = read_rows(SHARED / camera / "testfield.csv")
     names = tuple(row["target"] for row in field)
     place = np.array([[float(row[k]) for k in "XYZ"] for row in field])
-    with (SHARED / camera / "observations.csv").open() as f:
-        rows = list(csv.DictReader(f))
+    rows = read_rows(SHARED / camera / "observations.csv")
     numbers = sorted({int(row["epoch"]) for row in rows})
     points = np.full((len(numbers), len(names), 2), np.nan)
     for row in rows:

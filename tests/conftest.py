@@ -42,7 +42,7 @@ LONGEST = (
     "cli/test_outputs", "store/test_damage", "photogrammetry/test_markers", "fleet/test_trouble",
     "daemon/test_gauge", "output/test_pyorc", "fleet/test_forward", "analysis/test_distortion",
     "store/test_times", "photogrammetry/test_image_file", "daemon/test_virtual_clock",
-    "test_parallel", "photogrammetry/test_survey", "cli/test_measure",
+    "test_helpers", "photogrammetry/test_survey", "cli/test_measure",
     "photogrammetry/test_measuring",
 )  # fmt: skip
 """Files that take longest, in that order: so that no process is left alone with one at the end."""

@@ -31,9 +31,10 @@ NOISE_PX = 0.04
 
 def _coloured(phi: float, part: float = 1.0) -> Noise:
     """Return noise that is autoregressive (first order) in a part of its variance, else white."""
-    from scipy.signal import lfilter
 
     def draw(rng: np.random.Generator, n: int, columns: int) -> Array:
+        from scipy.signal import lfilter  # half a second, of one worker of the tests
+
         slow = lfilter([1], [1, -phi], rng.standard_normal((n + 2000, columns)), axis=0)[2000:]
         white = rng.standard_normal((n, columns))
         return np.sqrt(part * (1 - phi**2)) * np.asarray(slow) + np.sqrt(1 - part) * white

@@ -9,8 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import parquet
 
 from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR, SIGMA_PX
 from benchmarks.adjustment import corner_field as whole_field
@@ -60,6 +58,9 @@ def write_long_recording(
     seed: int = 1,
 ) -> None:
     """Write a recording."""
+    import pyarrow as pa  # tests import this module
+    from pyarrow import parquet
+
     rng = np.random.default_rng(seed)
     field = field_of(targets)
     camera = CameraSpec("rpi", SENSOR, INTERIOR.c)

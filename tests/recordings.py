@@ -35,3 +35,14 @@ def write_table(path: Path, columns: Sequence[str], rows: Rows) -> None:
         table = csv.writer(out, lineterminator="\n")
         table.writerow(columns)
         table.writerows(rows)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Read a CSV file."""
+    with path.open() as table:
+        return list(csv.DictReader(table))
+
+
+def write_rows(path: Path, rows: Sequence[dict[str, str]]) -> None:
+    """Write rows of a CSV file that was read."""
+    write_table(path, list(rows[0]), [list(row.values()) for row in rows])

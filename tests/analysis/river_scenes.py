@@ -16,7 +16,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
 from tests.analysis.test_gauge import NAMES, POSE, RATES, SD, SD_RATE, START, thermal_camera
-from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project, rotation
+from tests.blind.world import turn as rotation
+from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.correction import RowBlock
 from thermocald.analysis.thermal.gauge import GaugeCalibrator

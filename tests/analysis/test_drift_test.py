@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import signal
 from scipy.fft import dct
 
 from tests.marks import mostly_slow
@@ -25,7 +24,9 @@ def noise(rng, coloured, phi, n=N):
     white = rng.standard_normal(n)
     if not coloured:
         return white
-    slow = signal.lfilter([1], [1, -phi], rng.standard_normal(n + 600))[600:]
+    from scipy.signal import lfilter  # half a second, of one worker
+
+    slow = lfilter([1], [1, -phi], rng.standard_normal(n + 600))[600:]
     slow = np.asarray(slow) * np.sqrt(1 - phi**2)
     return np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * white
 

@@ -6,6 +6,7 @@ import doctest
 import importlib
 import json
 import pickle
+import re
 import runpy
 import shutil
 import subprocess
@@ -389,12 +390,18 @@ def test_one_image_point_is_an_array_of_one(camera):
         np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
 
 
-def test_a_copy_is_no_second_measurement(M1, inside, tmp_path):
-    """Neither a copied folder nor the store of the same recording, in a fit and in a study."""
+def test_a_copy_is_no_second_measurement(M1, M2, inside, tmp_path):
+    """Neither a copied folder nor the store of the same recording, nor one under another name."""
     shutil.copytree("M1", tmp_path / "again")
+    renamed = tc.simulate("rpi-v2.1-heating", seed=1, series="M3", out=tmp_path / "M3")
     for copy in (tc.open(tmp_path / "again"), tc.open("thermocald.db")):
         with pytest.raises(DataError, match="holds the same observations as"):
             tc.fit(M1, copy)
+    with pytest.raises(DataError, match=r"M3 holds the same observations as .*M1"):
+        tc.discover(M1, verify=[M2, renamed])
+    for others in ([M2, M1], [M2, renamed, tc.open(M2.source)]):
+        with pytest.raises(UsageError, match="is the same series as"):
+            tc.discover(M1, verify=others)
     with pytest.raises(DataError, match="has the same epochs as"):
         tc.study(M1, tc.open("thermocald.db"))
 
@@ -439,3 +446,15 @@ def test_a_script_of_a_user_runs(inside, tmp_path, monkeypatch):
     assert set(files) == {"ros-10.yaml", "ros-40.yaml"}
     assert all("distortion_model: plumb_bob" in text for text in files.values())
     assert files["ros-10.yaml"] != files["ros-40.yaml"]
+
+
+def test_what_a_page_shows_of_python_runs(inside, tmp_path, monkeypatch, recwarn):
+    """A quick page; all are run by tests/docs/test_commands.py."""
+    page = Path(__file__).resolve().parents[2] / "docs/how-to/thermal-model.md"
+    shutil.copy(inside / "camera.yaml", tmp_path / "camera.thermal.yaml")
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+
+    assert blocks
+    for block in blocks:
+        exec(compile(block, str(page), "exec"), {"__name__": "page"})

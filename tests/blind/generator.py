@@ -1,16 +1,11 @@
 """A generator of recordings with a hidden effect, which shares no code with thermocald.
 
 Projection, heat and noise are its own, on a time axis of one second, from CONVENTIONS and EFFECTS
-alone. Series are scored in memory, or written as recordings (CONVENTIONS §3), with the truth in a
-separate file.
-
-    python -m tests.blind.generator --effect thermal_lag --px 0.1 --seed 3 --out DIR --truth FILE
+alone. Series are scored in memory, or written as recordings (CONVENTIONS §3).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -274,23 +269,3 @@ def write(series: Series, folder: Path) -> None:
         for j, place in enumerate(series.field_nominal, 1)
     ]
     write_recording(folder, head, epochs, observations, field)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--effect", action="append", default=[])
-    parser.add_argument("--px", type=float, default=0.3)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--hard", action="store_true")
-    parser.add_argument("--epochs", type=int, default=180)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--truth", type=Path, required=True)
-    a = parser.parse_args()
-    series, truth = generate(Case(tuple(a.effect), a.px, a.seed, a.hard, epochs=a.epochs))
-    for s in series:
-        write(s, a.out / s.name)
-    a.truth.write_text(json.dumps(truth, indent=1, default=str))
-
-
-if __name__ == "__main__":
-    main()

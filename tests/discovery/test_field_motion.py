@@ -50,12 +50,6 @@ def test_a_target_that_wanders_is_reported_and_no_displacement(evidence_of, effe
     assert (moved["kind"], moved["targets"]) == ("wander", [str(TARGET + 1)])
 
 
-def test_a_field_that_stands_is_not_reported(evidence_of):
-    evidence, _ = evidence_of(px=0.1, seed=2)
-
-    assert "field" not in discover_series(evidence).as_dict()
-
-
 TAGS = (0, 4, 9, 13, 18, 22)
 """Of the nine on each sheet, in order: two on each."""
 WANDERING = ((1, 9, 11), (3, 12, 16))

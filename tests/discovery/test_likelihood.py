@@ -1,4 +1,4 @@
-"""The likelihood with the thermometer's error integrated out, against the dense covariance."""
+"""The likelihood against the dense covariance, and of blocks that are left out."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from thermocald.discovery.validation import cross_validation, is_confirmed, measure_block_gains
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.series import COLUMNS
@@ -98,3 +99,56 @@ def test_effect_free_recordings_are_at_the_floor(evidence_of):
     assert fit.chi2 / free == pytest.approx(1.0, abs=0.05)
     fitter.thermometer_factor = 1e-3
     assert fitter.fit(()).chi2 / free > 2.0
+
+
+def test_the_cause_predicts_every_block(evidence_of):
+    lab = HypothesisFitter(evidence_of("nonlinear_expansion", px=0.2, seed=91, epochs=90)[0])
+    fit = lab.refine(lab.fit([Term("nonlinear_expansion")]))
+
+    (gain,) = measure_block_gains(lab, fit)
+
+    assert is_confirmed(gain)
+    outside, inside = cross_validation(lab, fit)
+    assert 0.95 * inside < outside < 1.1 * inside
+
+
+@pytest.mark.parametrize(
+    ("gain", "expected"),
+    [
+        ([30.0, 5.0, -3.0, 0.0, 20.0, 1.0], True),
+        ([30.0, 5.0, -30.0, 0.0, 20.0, 1.0], False),  # one block contradicts it
+        ([-1.0, -2.0, 1.0, 0.0, 0.0, 0.0], False),  # nothing is predicted
+        ([1e5, 2e4, -300.0, 10.0, 20.0, 1.0], True),  # small relative to what it explains
+    ],
+)
+def test_what_confirms(gain, expected):
+    assert is_confirmed(np.array(gain)) == expected
+
+
+def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
+    """A cycle is fitted to a recording without effects, at the best period."""
+    lab = HypothesisFitter(evidence_of(px=0.2, seed=92, epochs=90, with_m2=False)[0])
+    trials = [
+        lab.fit([Term("cyclic_interference", nonlinear=(("P", p),))])
+        for p in np.geomspace(40, 400, 60)
+    ]
+
+    (gain,) = measure_block_gains(lab, min(trials, key=lambda f: f.objective))
+
+    assert gain.sum() < 12  # of six coefficients
+
+
+def test_a_step_within_the_block_left_out_is_no_fault(evidence_of):
+    """Without the block that holds an early slip in M2, its size is undetermined."""
+    evidence, truth = evidence_of("slip", px=0.2, seed=91, epochs=90)
+    lab = HypothesisFitter(evidence)
+    times = [s["time"] for (s,) in truth["effects"] if s["happens"]]
+    own = [
+        (("time", float(e.times[np.searchsorted(e.times, t)])),)
+        for e, t in zip(lab.series, times, strict=False)
+    ]
+    fresh = tuple(own) + (None,) * (len(lab.series) - len(own))
+
+    (gain,) = measure_block_gains(lab, lab.refine(lab.fit([Term("slip", fresh=fresh)])))
+
+    assert is_confirmed(gain)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.discovery.test_tremble import trembling
+from tests.discovery.test_movement import trembling
 from thermocald.discovery.entries import find_tied_constants, find_trade_off
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Node, say_together

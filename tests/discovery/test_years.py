@@ -1,14 +1,24 @@
-"""Discovery in a year's series: an effect within one afternoon, and one that takes a year."""
+"""Long series: condensed to means, an afternoon in a year, effects that take a year."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from year_of_means import DAY, year
 
+import thermocald as tc
+from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR
+from benchmarks.long_recording import INTERVAL_S, RATES, field_of, write_long_recording
+from tests.blocks import InBlocks
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.discovery.result import discover_series
-from thermocald.thermal.series import in_blocks
+from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.physics.model import follow_angle
+from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.series import SeriesInput, in_blocks
+from thermocald.thermal.source import condensed
 
 LAG_S = 1200.0
 
@@ -27,6 +37,8 @@ def outdoors(t):
 
 def behind(at, _):
     """The cellar's temperature with a lag, in steps of 10 s about the afternoon."""
+    from scipy.signal import lfilter  # half a second, of one worker
+
     fine = np.arange(199.0 * DAY, 203.0 * DAY, 10.0)
     a = np.exp(-10.0 / LAG_S)
     warm = cellar(fine)
@@ -74,3 +86,122 @@ def test_what_takes_a_year_or_comes_on_one_day_is_named(effect, drives, number, 
 def test_nothing_is_found_in_a_year_without_an_effect():
     found = discover_series(year(outdoors, lambda _, T: T, 3))
     assert found.verdict == "adequate"
+
+
+E, T = 7200, 9
+SIGMA = 0.05
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """A sine of 80 s for one of 30 hours; one point in epoch 4001 has a gross error."""
+    rng = np.random.default_rng(1)
+    places = rng.uniform(200, 2800, (T, 2))
+    t = 15.0 * np.arange(E)
+    fast = np.where((t > 20 * 3600) & (t < 21 * 3600), 0.5 * np.sin(2 * np.pi * t / 600), 0.0)
+    points = places + fast[:, None, None] + rng.normal(0, SIGMA, (E, T, 2))
+    points[4001, 3] += 30.0
+    weights = np.zeros((E, T, 3))
+    weights[..., :2] = 1 / SIGMA**2
+    weights[100:150, 2] = 0.0
+    points[100:150, 2] = np.nan
+    T_read = 20 + 5 * np.sin(t / 40_000) + rng.normal(0, 0.03, E)
+    names = [str(i) for i in range(T)]
+    field = TestField.build(names, rng.uniform(0, 500, (T, 3)))
+    empty = np.empty((0, T, 3))
+    whole = SeriesInput(
+        "long", "camera", Sensor(3280, 2464, 0.00112), field, 3.0, t, t, {"temperature": T_read},
+        {"temperature": None}, ObservationGrid(empty[..., :2], empty), np.arange(E) + 1,
+    )  # fmt: skip
+    return whole, ObservationGrid(points, weights)
+
+
+def test_rows_are_weighted_means(recorded):
+    whole, grid = recorded
+    out = condensed(whole, InBlocks(grid, 911), most=500)
+    assert out.counts.sum() == E
+    assert len(out.counts) <= 550
+    first = out.numbers - 1
+    row = int(np.searchsorted(first, 100, side="right")) - 1
+    part = slice(int(first[row]), int(first[row] + out.counts[row]))
+    w = grid.weights[part, :, 0]
+    mean = np.nansum(w[..., None] * grid.points[part], axis=0) / w.sum(axis=0)[:, None]
+    np.testing.assert_allclose(out.grid.points[row], mean, atol=1e-9)
+    np.testing.assert_allclose(out.grid.weights[row, :, 0], w.sum(axis=0), rtol=1e-12)
+    assert out.frame_times[row] == pytest.approx(whole.frame_times[part].mean())
+    noise = out.noises["temperature"] * np.sqrt(out.counts)
+    np.testing.assert_allclose(noise, 0.03, rtol=0.1)
+
+
+def test_the_blocks_that_are_read_do_not_matter(recorded):
+    whole, grid = recorded
+    one, other = (condensed(whole, InBlocks(grid, size), most=500) for size in (E, 480))
+    # except for points at the limit of gross errors
+    assert np.mean(np.abs(one.grid.points - other.grid.points) > 1e-9) < 0.002
+    np.testing.assert_array_equal(one.counts, other.counts)
+
+
+def test_a_gross_error_is_left_out(recorded):
+    whole, grid = recorded
+    out = condensed(whole, InBlocks(grid, 911), most=300)
+    row = int(np.searchsorted(out.numbers, 4002, side="right")) - 1
+    fine = np.nanmedian(grid.points[4001 - 100 : 4001 + 100, 3], axis=0)
+    np.testing.assert_allclose(out.grid.points[row, 3], fine, atol=0.1)
+
+
+def test_what_is_fast_keeps_short_rows(recorded):
+    whole, grid = recorded
+    out = condensed(whole, InBlocks(grid, 911), most=500)
+    fast = (out.frame_times > 20 * 3600) & (out.frame_times < 21 * 3600)
+    assert np.mean(out.counts[fast]) * 2 < np.median(out.counts[~fast])
+
+
+NAMES = ("c", "x0", "y0")
+
+
+def series_of(epochs):
+    """A year of image points without noise: 36 K, more on one side of the mean."""
+    field = field_of(21)
+    u = np.linspace(0, 1, epochs)
+    T = 16 + 12 * np.sin(2 * np.pi * u) + 6 * np.sin(4 * np.pi * u + 1)
+    values = np.tile(INTERIOR.as_array(), (epochs, 1))
+    for column, rate in RATES.items():
+        values[:, column] += rate * (T - 15.0)
+    values = follow_angle(values, INTERIOR.c)
+    points = project(SENSOR, values, np.tile(EXTERIOR.as_array(), (epochs, 1)), field.points)
+    weights = np.zeros((*points.shape[:2], 3))
+    weights[..., :2] = 1e4
+    times = INTERVAL_S * np.arange(epochs)
+    return SeriesInput(
+        name="far", series="far", camera="rpi", sensor=SENSOR, field=field,
+        grid=ObservationGrid(points, weights), numbers=np.arange(epochs), frame_times=times,
+        reading_times=times, readings={"temperature": T}, resolutions={"temperature": None},
+        principal_distance=INTERIOR.c,
+    )  # fmt: skip
+
+
+def test_the_rates_of_a_large_range():
+    reduced = reduce_series(series_of(300), strict=False)
+    fitted = fit_thermal_model([reduced], [])
+    for column, name in enumerate(NAMES):
+        assert fitted.model.rates[name] == pytest.approx(RATES[column], rel=3e-6)
+
+
+@pytest.mark.slow
+def test_the_scatter_of_long_series(tmp_path):
+    """Errors of the rates over their standard deviations, from ten series of 30,000 epochs."""
+    pytest.importorskip("pyarrow")
+    ratios, noise = [], []
+    for seed in range(10):
+        path = tmp_path / f"{seed}"
+        write_long_recording(path, 30_000, 21, seed=seed)
+        series = tc.open(path).observed()
+        assert series.counts is not None  # of means
+        fitted = fit_thermal_model([reduce_series(series, strict=False)], [])
+        sds = fitted.model.sds
+        ratios.append([(fitted.model.rates[n] - RATES[k]) / sds[f"rates.{n}"]
+                       for k, n in enumerate(NAMES)])  # fmt: skip
+        noise.append(fitted.fitted["series"][0].thermometer_sd)
+    # thirty values estimate a standard deviation to 13 %
+    assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.25
+    assert np.median(noise) == pytest.approx(0.02, rel=0.15)

@@ -124,3 +124,21 @@ def test_csv_is_rectangular(block):
     text = block.text.split("\n", 1)[1] if block.text.startswith("#") else block.text
     rows = list(csv.reader(StringIO(text)))
     assert len({len(row) for row in rows}) == 1
+
+
+def test_nothing_deeper_than_the_public_interface_is_imported():
+    pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md"), ROOT / "README.md"]
+    texts = {name(p): p.read_text() for p in (*pages, *(ROOT / "examples").rglob("*.py"))}
+    for notebook in NOTEBOOKS:
+        cells = json.loads(notebook.read_text())["cells"]
+        texts[name(notebook)] = "\n".join("".join(cell["source"]) for cell in cells)
+    for of_developers in ("docs/reference/drivers.md", "docs/reference/effects.md"):
+        del texts[of_developers]
+
+    deeper = re.compile(r"thermocald\.[a-z_]+\.[a-z]")
+    assert {page: found for page, text in texts.items() if (found := deeper.findall(text))} == {}
+
+
+def test_a_drift_is_drawn_in_ten_lines():
+    first = next(b for b in blocks(ROOT / "docs/how-to/notebook.md") if b.language == "python")
+    assert len([line for line in first.text.splitlines() if line.strip()]) <= 10

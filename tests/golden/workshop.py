@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import json
 import os
@@ -17,6 +16,7 @@ from tests.commands import call
 from tests.golden.cases import CASES, Case
 from tests.golden.compare import differences, parsed, shortened
 from tests.pictures import FOCAL, TAKEN, save_photograph
+from tests.recordings import read_rows
 
 EXPECTED = Path(__file__).parent / "expected"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -160,8 +160,7 @@ def real(folder: Path, camera: str, effect: str, seed: int) -> None:
 def walls(folder: Path) -> None:
     """Write the field of tags on the walls of a hall; corner 0 is bottom right."""
     corner = ("viewer_bottom_right", "viewer_bottom_left", "viewer_top_left", "viewer_top_right")
-    with (DATA / "frc" / "targets.csv").open() as source:
-        rows = list(csv.DictReader(source))
+    rows = read_rows(DATA / "frc" / "targets.csv")
     lines = ["target,X,Y,Z,diameter,sX,sY,sZ,kind,code"]
     for row in rows:
         k, tag = corner.index(row["corner"]), row["tag_id"]

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.physics.history import History
+from thermocald.physics.model import ThermalModel
 from thermocald.physics.scene import Scene
 from thermocald.physics.testfields import demonstration_field, demonstration_model
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.model import ThermalModel
-
-__all__ = ["heating", "subject"]
 
 
 def subject(width: int, height: int) -> tuple[TestField, ThermalModel]:

@@ -8,14 +8,9 @@ import shutil
 import socket
 import subprocess
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from tests.hil import thermal_zone
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-__all__ = ["Machine"]
 
 BOOT_S = 240.0
 # The least that NumPy and OpenCV need (x86-64-v2). With "max", which also has AVX, Python and NumPy

@@ -12,14 +12,9 @@ import socket
 import struct
 import threading
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from thermocald_drivers.onewire import crc8
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-__all__ = ["POWER_ON", "Adapter", "Probe"]
 
 # USB redirection: packet types, capabilities
 HELLO, CONNECT, INTERFACES, ENDPOINTS = 0, 1, 4, 5

@@ -7,18 +7,12 @@ import shutil
 import signal
 import subprocess
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from tests.hil.bars import stamp
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
-__all__ = ["ADB_PORT", "PHONE_PORT", "Phone"]
 
 # not 5555 to 5585, which the adb server uses for emulators
 PHONE_PORT = 5600

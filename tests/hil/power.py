@@ -9,13 +9,8 @@ from __future__ import annotations
 
 import struct
 import time
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-__all__ = ["entries", "replay", "wait_for_mark"]
+from collections.abc import Iterator
+from pathlib import Path
 
 MAGIC = 0x6A736677736872
 SUPER, ENTRY = struct.Struct("<QQQI"), struct.Struct("<QQQQ")

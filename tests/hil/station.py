@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from tests.hil.frames import heating, subject
 from thermocald.store.recording.testfield_file import write_testfield
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-__all__ = ["CAMERA", "PERIOD_S", "SIZE", "STORE", "VIVID", "configuration", "prepare"]
 
 SIZE = (640, 480)
 PERIOD_S = 2.0

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import struct
 
-__all__ = ["CELSIUS", "table"]
-
 CELSIUS = 37.0  # the kernel's value: 310.2 K − 273.2 K
 NOW, CRITICAL = 3102, 3782
 

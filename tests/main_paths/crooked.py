@@ -1,7 +1,7 @@
 """Recordings of fields unlike the simulation's: crooked, badly surveyed, moving.
 
-The image points share no code with the program: the projection is an own implementation of
-CONVENTIONS §2, with errors as in real set-ups. Frames are rendered by the simulation, with a bent
+The image points share no code with the program: the projection is that of the blind recordings,
+with errors as in real set-ups. Frames are rendered by the simulation, with a bent
 field. The truth of each epoch is returned.
 """
 
@@ -13,8 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.blind.world import image
 from tests.recordings import write_recording
-from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics.scene import Scene
 from thermocald.physics.testfields import corner_field, corner_view
 from thermocald.store.recording.testfield_file import write_testfield
@@ -27,27 +28,11 @@ CAMERA = {
 NOISE_PX = 0.05
 
 
-def rotation(omega: float, phi: float, kappa: float) -> np.ndarray:
-    """Return R_x(omega) R_y(phi) R_z(kappa), camera to object."""
-    (so, co), (sp, cp), (sk, ck) = ((np.sin(a), np.cos(a)) for a in (omega, phi, kappa))
-    x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
-    y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
-    return x @ y @ z
-
-
 def project(points: np.ndarray, pose: np.ndarray, c: float, x0: float, y0: float) -> np.ndarray:
     """Project object points (n, 3) mm, px (n, 2); pose: three angles and a centre."""
-    inside = (points - pose[3:]) @ rotation(*pose[:3])
-    x, y = -c * inside[:, 0] / inside[:, 2], -c * inside[:, 1] / inside[:, 2]
-    r2 = x**2 + y**2
-    radial = CAMERA["A1"] * r2 + CAMERA["A2"] * r2**2
-    b1, b2 = CAMERA["B1"], CAMERA["B2"]
-    dx = x * radial + b1 * (r2 + 2 * x**2) + 2 * b2 * x * y
-    dy = y * radial + b2 * (r2 + 2 * y**2) + 2 * b1 * x * y
-    u = (SIZE[0] - 1) / 2 + (x0 + x + dx) / PITCH
-    v = (SIZE[1] - 1) / 2 - (y0 + y + dy) / PITCH
-    return np.column_stack([u, v])
+    one = {**CAMERA, "c": c, "x0": x0, "y0": y0}
+    interior = [one.get(name, 0.0) for name in IOP_NAMES]
+    return image(points[None], np.array([[*interior, *pose]]), (*SIZE, PITCH))[0]
 
 
 def corner(rows: int, rng: np.random.Generator, crooked_mm: float) -> np.ndarray:

@@ -17,8 +17,8 @@ import pytest
 from tests.commands import call
 from tests.daemon.forking import Forker
 from tests.main_paths import crooked
-from tests.main_paths.tables import read_rows as rows
-from tests.main_paths.tables import write_rows
+from tests.recordings import read_rows as rows
+from tests.recordings import write_rows
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
 MAIN = ("c", "x0", "y0")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from thermocald.figures import Curve, Panel, draw_panel
 
@@ -12,6 +11,8 @@ from thermocald.figures import Curve, Panel, draw_panel
 @pytest.mark.parametrize("lowest", [-1234.0, -0.0123, -9.9e-5, 3.0405])
 def test_the_y_label_is_inside_the_drawing_and_clear_of_the_numbers(lowest):
     """Half of `Δx₀ in µm` was cut off if ticks had more digits than expected."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     x = np.linspace(0, 25, 150)
     curves = tuple(Curve(f"M{i}", x, lowest * np.sin(x / (7 + i))) for i in (1, 2))
     name = "Fühler 12 an der Brücke (Nordseite)"

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project, rotation
+from tests.blind.world import turn as rotation
+from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,

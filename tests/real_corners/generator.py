@@ -5,16 +5,10 @@ and is knocked, boards that people hide. Each corner is moved by the difference 
 with the camera at a temperature and at rest. The first half of the epochs is M1, the second M2;
 they are 30 s apart and have an invented temperature. The noise is real, the truth known. Climate
 and effects are from `tests.blind`, which shares no code with the program.
-
-    python -m tests.real_corners.generator --camera aviary-cam1 --effect thermal_lag --seed 3 \
-        --out DIR --truth FILE
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -25,7 +19,7 @@ import yaml
 from tests.blind.case import PROGRAMMES
 from tests.blind.hidden import Camera, bisected, fresh, hide, left_over, true_parameters
 from tests.blind.world import climate, image, smooth_unknown
-from tests.recordings import write_recording
+from tests.recordings import read_rows, write_recording
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 NINE = (
@@ -84,12 +78,10 @@ class RealSeries:
 @cache
 def corners(camera: str) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the targets' names and points (T, 3) mm, and image points (E, T, 2) px or NaN."""
-    with (SHARED / camera / "testfield.csv").open() as f:
-        field = list(csv.DictReader(f))
+    field = read_rows(SHARED / camera / "testfield.csv")
     names = tuple(row["target"] for row in field)
     place = np.array([[float(row[k]) for k in "XYZ"] for row in field])
-    with (SHARED / camera / "observations.csv").open() as f:
-        rows = list(csv.DictReader(f))
+    rows = read_rows(SHARED / camera / "observations.csv")
     numbers = sorted({int(row["epoch"]) for row in rows})
     points = np.full((len(numbers), len(names), 2), np.nan)
     for row in rows:
@@ -200,22 +192,3 @@ def write(series: RealSeries, source: str, folder: Path) -> None:
     ]
     write_recording(folder, head, epochs, observations)
     (folder / "testfield.csv").write_text((SHARED / source / "testfield.csv").read_text())
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--camera", choices=CAMERAS, required=True)
-    parser.add_argument("--effect", action="append", default=[])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--px", type=float)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--truth", type=Path, required=True)
-    a = parser.parse_args()
-    series, truth = generate(RealCase(a.camera, tuple(a.effect), a.seed, a.px))
-    for s in series:
-        write(s, a.camera, a.out / s.name)
-    a.truth.write_text(json.dumps(truth, indent=1))
-
-
-if __name__ == "__main__":
-    main()

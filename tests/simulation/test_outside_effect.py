@@ -56,7 +56,7 @@ from tests.analysis.test_thermal_model import reduced
 hidden = ModelEffect("saturation", {"T_s": 38.0, "c": 1e-3, "x0": 2e-3, "y0": -1e-3})
 s = preset_simulation("rpi-v2.1-heating", seed=3)
 lamp = Course.steps([0, 80.0, 700.0, 1e5], [0.0, 9.0, 0.0])
-programme = replace(s.programme, epochs=120, sources={"housing": lamp})
+programme = replace(s.programme, epochs=60, interval=20.0, sources={"housing": lamp})
 s = replace(s, model=replace(s.model, effects=(hidden,)), programme=programme)
 found = fit_thermal_model([reduced(s)], [parse_effect("saturation")]).model.effects[0]
 assert abs(found.values["T_s"] - 38.0) < 4 * found.sds["T_s"], found

@@ -1,4 +1,4 @@
-"""Rendered frames: positions of the targets, and equal frames on every machine."""
+"""Rendered frames, equal on every machine, and the mock camera that renders them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import hashlib
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.special import ndtr
 
+from thermocald.hal import VirtualClock, load_driver
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -18,6 +19,8 @@ from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics import shapes as portable
+from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import write_model
 from thermocald.physics.scene import Look, Scene
 from thermocald.physics.shapes import surface_normals
 from thermocald.physics.testfields import (
@@ -120,7 +123,7 @@ def test_blur_noise_vignetting():
     row = plain[round(cy), :].astype(float)
     x = np.arange(641)
     radius = 30.0 * 8 / 1000 / 0.005
-    profile = norm.cdf((radius - np.abs(x - cx)) / np.hypot(1.2, 12**-0.5))
+    profile = ndtr((radius - np.abs(x - cx)) / np.hypot(1.2, 12**-0.5))
     assert np.abs((200 - row) / 170 - profile).max() < 0.02
 
 
@@ -170,3 +173,49 @@ def test_portable_arithmetic_is_right():
     eop = corner_view(field, 1200.0).with_values(kappa=0.4).as_array()
     image = portable.project(SENSOR, iop, eop, field.points)
     np.testing.assert_allclose(image, project(SENSOR, iop, eop, field.points), rtol=0, atol=1e-9)
+
+
+MockCamera = load_driver("camera", "mock")
+
+
+@pytest.fixture
+def camera():
+    device = MockCamera(clock=VirtualClock())
+    device.open()
+    yield device
+    device.close()
+
+
+def test_frame_shows_the_known_drift(camera):
+    first = camera.capture()
+    camera.clock.advance(650.0)
+    hot = camera.capture()
+    assert hot.image.shape == (2464, 3280)
+    assert hot.utc - first.utc == pytest.approx(hot.monotonic - first.monotonic)
+    a, b = camera.truth(first.monotonic), camera.truth(hot.monotonic)
+    moved = (b.iop[0] - a.iop[0]) / camera.model.sensor.pixel_pitch
+    assert -12.0 < moved[1] < -9.0
+    seen = measure_corners(hot.image, locate_markers(hot.image, camera.field))
+    assert len(seen) >= 100
+    expected = project(camera.model.sensor, b.iop[0], b.eop[0], camera.field.points)
+    assert np.sqrt(np.mean((seen.points - expected[seen.targets]) ** 2)) < 0.04
+
+
+def test_equal_instants_give_equal_frames():
+    frames = []
+    for _ in range(2):
+        clock = VirtualClock()
+        with MockCamera(clock=clock, testfield="circles", seed=4) as device:
+            clock.advance(33.0)
+            frames.append(device.capture().image)
+    assert np.array_equal(frames[0], frames[1])
+
+
+def test_own_model_and_field(tmp_path, camera):
+    model = camera.model.with_effect(ModelEffect("slip", {"time": 100.0, "x0": 0.00112}))
+    write_model(tmp_path / "m.yaml", model)
+    clock = VirtualClock()
+    with MockCamera(clock=clock, model=str(tmp_path / "m.yaml"),
+                    programme=[[0, 25.0]], testfield="plain") as device:  # fmt: skip
+        before, after = device.truth(clock.monotonic() + 99), device.truth(clock.monotonic() + 101)
+    assert after.iop[0, 1] - before.iop[0, 1] == pytest.approx(0.00112)

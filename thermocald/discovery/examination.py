@@ -20,7 +20,7 @@ from thermocald.discovery.mounted import (
     search_beside_mount,
     split_knocks,
 )
-from thermocald.discovery.search import Search, Solution
+from thermocald.discovery.search import Search, Solution, by_score
 from thermocald.discovery.validation import (
     SurrogateTest,
     compare_with_surrogates,
@@ -180,7 +180,7 @@ def _examine_standing(
     search = Search(HypothesisFitter(ready), say)
     base = search.base(given)
     # a single effect accounts for most of the image's movement
-    guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
+    guide = min([base, *search.expand(base, _GUIDES)], key=by_score).fit
     bent = remove_curvature(search.fitter, guide)
     found = search_in(bent) if bent else _search_standing(search, base, jobs)
     if not found.adequate:
@@ -230,7 +230,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
             grown = [s for s in grown if _may_replace(base, best, equal, s)]
         if not grown:
             break
-        champion = min(grown, key=lambda s: s.score)
+        champion = min(grown, key=by_score)
         if champion.score >= best.score:
             break
         best = search.with_events_moved(champion)
@@ -241,7 +241,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         frontier = [best]
         if complete or level == 1:  # the best solutions, one per set of names
             sets = {tuple(sorted(s.names)): s for s in sorted(grown, key=lambda s: -s.score)}
-            frontier = sorted(sets.values(), key=lambda s: s.score)[:_WIDTH]
+            frontier = sorted(sets.values(), key=by_score)[:_WIDTH]
     # rejected larger combinations are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > kept:
@@ -271,7 +271,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
 def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ...]:
     """List the solutions that cannot be excluded beside the best one, best first."""
     out: list[Solution] = []
-    for s in sorted(seen, key=lambda s: s.score):
+    for s in sorted(seen, key=by_score):
         mine = [t for t in best.terms if t.effect not in s.names]
         theirs = [t for t in s.terms if t.effect not in best.names]
         # one drive in place of another is compared by the fit alone
@@ -296,10 +296,10 @@ def _compare_ties(
         return best, seen
     fitter = search.fitter
     again: list[Solution] = []
-    for s in sorted(close.values(), key=lambda s: s.score)[:6]:
+    for s in sorted(close.values(), key=by_score)[:6]:
         objective = fitter.suit_thermometers(s.fit)
         again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
-    again.sort(key=lambda s: s.score)
+    again.sort(key=by_score)
     others = [s for s in seen if s.terms not in close]
     return again[0], [*again, *others]
 
@@ -314,9 +314,8 @@ def _may_replace(
     """
     fewer = [s for s in equal if set(s.names) <= set(champion.names)]
     if not fewer:
-        more = _measure_px(best, champion) >= criteria.CURVATURE_PX
         return (
-            more
+            _measure_px(best, champion) >= criteria.CURVATURE_PX
             and champion.score < best.score - criteria.BAND
             and champion.fit.chi2 < best.fit.chi2
         )
@@ -374,7 +373,7 @@ def _examine_beside_mount(
     tried = iter(beside.as_slips)
     as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)
     rivals: list[Solution] = []
-    for s in sorted(seen, key=lambda s: s.score):
+    for s in sorted(seen, key=by_score):
         names = [t.effect for t in s.terms if t not in knocks]
         own = [t.effect for t in best.terms if t not in knocks]
         # between readings the temperature is unknown, so that a delay and its rate look alike
@@ -421,6 +420,6 @@ def _keep_named(
 
 def _drop_effect(search: Search, base: Solution, best: Solution, number: int) -> Solution:
     """Fit a solution again without one of its effects."""
-    terms = [t for i, t in enumerate(best.terms) if i != number]
-    penalties = [p for i, p in enumerate(best.penalties) if i != number]
+    terms = best.terms[:number] + best.terms[number + 1 :]
+    penalties = best.penalties[:number] + best.penalties[number + 1 :]
     return search.refine(terms, penalties) if len(terms) > len(base.terms) else base

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.discovery.search import Search
+from thermocald.discovery.search import Search, by_score
 from thermocald.errors import DataError, UsageError
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
@@ -87,7 +87,7 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
     base = search.base()
     drives = all(catalogue.get(name).is_drive for name in (first, second))
     better, worse = sorted(
-        (_find_best(search, base, name) for name in (first, second)), key=lambda s: s.score
+        (_find_best(search, base, name) for name in (first, second)), key=by_score
     )
     return Separation(
         better.names[-1], worse.names[-1], worse.score - better.score,
@@ -97,7 +97,8 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
 
 def _find_best(search: Search, base: Solution, name: str) -> Solution:
     """Find the best solution with one effect, over the sets of parameters that it can act on."""
-    promises = [search.scan(c, base) for c in search.candidates if c.effect == name]
+    own = [c for c in search.candidates if c.effect == name]
+    promises = [search.promise(c, search.scanner.scan(c, base.fit)) for c in own]
     if not promises:
         raise UsageError(
             f"{name} cannot be tested in this series: it needs a quantity that was not recorded"

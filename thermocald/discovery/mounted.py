@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from thermocald.discovery import criteria
-from thermocald.discovery.search import Search, Solution
+from thermocald.discovery.search import Search, Solution, by_score
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Proportional
@@ -60,7 +60,7 @@ def search_beside_mount(
     guess = guess_mount_motion(fitter, start.fit, W)
     say("movement of the mount")
     trials = [_fit_beside(start, Mount(W, guess, corner), 4) for corner in _CORNERS]
-    plain = best = min(trials, key=lambda t: t.score)
+    plain = best = min(trials, key=by_score)
     ranking, seen = list[Solution](), list[Solution]()
     for level in range(_LEVELS):
         say(f"alongside the mount: {', '.join(best.names) or 'the base'}")
@@ -75,14 +75,14 @@ def search_beside_mount(
         if not grown:
             break
         if level == 0:
-            ranking = sorted(grown, key=lambda s: s.score)
+            ranking = sorted(grown, key=by_score)
             # after the scan: a converged movement explains drifts too, and a scan would find none
             plain = best = _settle(plain, ranking[0].score)
         seen += grown
         allowed = [g for g in grown if _is_allowed(g, best, plain, len(start.terms))]
         if not allowed:
             break
-        best = min(allowed, key=lambda g: g.score)
+        best = min(allowed, key=by_score)
     return best, ranking, seen, first
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from thermocald.discovery import criteria
 from thermocald.discovery.formulas import FormulaSearch, condense
 from thermocald.discovery.gap import image_chi2
+from thermocald.discovery.search import by_score
 from thermocald.discovery.validation import SurrogateTest
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import explained
@@ -84,7 +85,7 @@ def propose(
             here = condense(fitter, base.fit, moving, best.fit.weightings)
             search = FormulaSearch(here, criteria.MARGIN, search)
         _fit_formulas(base, moving, search.best(further=turn > 0), tried)
-        best = min([base, *tried.values()], key=lambda s: s.score)
+        best = min([base, *tried.values()], key=by_score)
         if best.score > before.score - criteria.MARGIN or all(
             a.adequate for a in examine_all(fitter, best.fit)
         ):
@@ -186,7 +187,7 @@ def _simplify(base: Solution, best: Solution) -> Solution:
                     solutions.append(solution)
         if not solutions:
             return best
-        best = min(solutions, key=lambda s: s.score)
+        best = min(solutions, key=by_score)
 
 
 def _choose_parameters(base: Solution, best: Solution) -> Solution:

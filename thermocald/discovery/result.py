@@ -248,8 +248,8 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
     e = x.fitter.series[0]
     number = k - len(x.base.terms)
     estimates = _widen_estimates(x, estimated, k, estimate_term(estimated, k, e))
-    others = x.fitter.refine(x.fitter.fit([t for i, t in enumerate(x.best.terms) if i != k]))
-    without = others.objective + sum(p for i, p in enumerate(x.best.penalties) if i != k)
+    others = x.fitter.refine(x.fitter.fit(x.best.terms[:k] + x.best.terms[k + 1 :]))
+    without = others.objective + sum(x.best.penalties) - x.best.penalties[k]
     blocks = [float(g) for g in x.cross_validation[number]]
     evidence: dict[str, Any] = {
         "score_gain": float(without - x.best.score),
@@ -329,7 +329,7 @@ def _widen_estimates(
 def _find_epochs(x: Examination, fit: Fit, k: int) -> list[int]:
     """Return the first and last epoch with more than a quarter of the effect's largest movement."""
     e = x.fitter.series[0]
-    other = x.fitter.fit([t for i, t in enumerate(fit.terms) if i != k], only=[0])
+    other = x.fitter.fit(fit.terms[:k] + fit.terms[k + 1 :], only=[0])
     size = np.sqrt(np.maximum(e.squares(fit.parameters(0) - other.parameters(0)), 0.0))
     large = np.flatnonzero(size > 0.25 * size.max())
     return [int(e.numbers[large[0]]), int(e.numbers[large[-1]])]

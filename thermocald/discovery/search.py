@@ -16,6 +16,7 @@ European Physical Journal C 70, 525-530 (look-elsewhere effect).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -115,6 +116,10 @@ class Solution:
         return tuple(t.effect for t in self.fit.terms)
 
 
+by_score = attrgetter("score")
+"""The order of solutions, the best one first."""
+
+
 class Search:
     """A search for effects in a fitter's series."""
 
@@ -148,10 +153,6 @@ class Search:
         return Solution(fit, (0.0,) * len(terms), self.fitter)
 
     # -- scanning --------------------------------------------------------------------------
-
-    def scan(self, candidate: Candidate, solution: Solution) -> Scanned:
-        """Scan a candidate beside a solution."""
-        return self.promise(candidate, self.scanner.scan(candidate, solution.fit))
 
     def promise(self, candidate: Candidate, scan: Scan) -> Scanned:
         """Return the best term of a candidate's scan."""
@@ -200,7 +201,7 @@ class Search:
         least: gain beyond its penalty that a scan must promise, except for an event.
         """
         grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
-        return sorted(grown, key=lambda s: s.score)
+        return sorted(grown, key=by_score)
 
     def expand_all(
         self, solutions: Sequence[Solution], width: int, most: int, below: float = np.inf
@@ -217,7 +218,7 @@ class Search:
             names = frozenset((*solution.names, promise.term.effect))
             if len(grown) < most and names not in grown:
                 grown[names] = self._with(solution, promise)
-        return sorted(grown.values(), key=lambda s: s.score)
+        return sorted(grown.values(), key=by_score)
 
     def _with(self, solution: Solution, promise: Scanned) -> Solution:
         penalties = (*solution.penalties, promise.penalty)
@@ -231,7 +232,9 @@ class Search:
         """
         if solution.fit not in self._scanned:
             self._scanned[solution.fit] = [
-                self.scan(c, solution) for c in self.candidates if c.effect not in solution.names
+                self.promise(c, self.scanner.scan(c, solution.fit))
+                for c in self.candidates
+                if c.effect not in solution.names
             ]
             solution.fit.forget()
         enough = [
@@ -299,11 +302,11 @@ class Search:
         while len(solution.terms) > kept + 1:
             fewer = []
             for number in range(kept, len(solution.terms)):
-                terms = tuple(t for j, t in enumerate(solution.terms) if j != number)
-                penalties = [p for j, p in enumerate(solution.penalties) if j != number]
+                terms = solution.terms[:number] + solution.terms[number + 1 :]
+                penalties = solution.penalties[:number] + solution.penalties[number + 1 :]
                 # the rest may have been fitted before, perhaps with a better score
                 fewer.append(self._known.get(_kinds(terms)) or self.refine(terms, penalties))
-            best = min(fewer, key=lambda s: s.score)
+            best = min(fewer, key=by_score)
             if best.score > solution.score:
                 break
             solution = best

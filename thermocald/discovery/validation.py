@@ -90,7 +90,7 @@ def measure_block_gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> li
     whole = _predict_blocks(fitter, fit, every)[1]
     out = []
     for i in range(kept, len(fit.terms)):
-        fewer = fitter.fit([t for j, t in enumerate(fit.terms) if j != i])
+        fewer = fitter.fit(fit.terms[:i] + fit.terms[i + 1 :])
         out.append(_predict_blocks(fitter, fitter.refine(fewer), every)[1] - whole)
     return out
 

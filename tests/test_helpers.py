@@ -1,0 +1,202 @@
+"""Helpers of everything: files of YAML and JSON, host names, numbers, several processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+
+import pytest
+
+from thermocald.addresses import HostNames, is_loopback
+from thermocald.errors import ConfigurationError, DataError, RecordingError
+from thermocald.files import dump_yaml, overwrite_json, read_json, read_yaml
+from thermocald.numbers import typeset_powers, with_sd
+from thermocald.parallel import in_order
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_text(text: str):
+        path = tmp_path / "file.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write_text
+
+
+def test_a_mapping_is_read_in_its_order_also_with_anchors(write):
+    document = {"b": 1, "a": {"x": [1, 2.5, "ä"], "y": None}}
+    path = write(dump_yaml(document))
+    assert read_yaml(path) == document
+    assert list(read_yaml(path)) == ["b", "a"]
+    assert read_yaml(write("a: &x {k: 1}\nb: {<<: *x, l: 2}\n"))["b"] == {"k": 1, "l": 2}
+
+
+def test_a_file_s_name_that_is_no_text_is_written_so_that_it_can_be_read(write):
+    named = os.fsdecode(b"M\xe9 \xff")
+    assert read_yaml(write(dump_yaml({"series": [named]}))) == {"series": ["M\\udce9 \\udcff"]}
+
+
+BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
+
+BAD = [
+    ("", "is empty"),
+    ("# only a comment\n", "is empty"),
+    ("- 1\n", "must hold `key: value` lines"),
+    ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"),
+    ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
+    ("a: 010\n", "line 1, column 4: 010 is octal in YAML"),
+    ("a: [1\n", "line 2"),
+    ("1: x\n", "key 1 must be text"),
+    ("a: !!python/object:os.system x\n", "could not determine a constructor"),
+    ("a: !!bool x\n", "no YAML"),
+    ("a: 2020-99-99\n", "no YAML"),
+    ("[" * 5000, "file.yaml"),
+    (BOMB, "aliases without end"),
+    ("a: &a [*a]\n", "aliases without end"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD)
+def test_one_clear_error(write, text, message):
+    path = write(text)
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        read_yaml(path)
+    assert str(path) in str(caught.value)
+
+
+def test_the_caller_chooses_the_error(tmp_path):
+    with pytest.raises(RecordingError, match="No such file"):
+        read_yaml(tmp_path / "none.yaml", RecordingError)
+
+
+@pytest.mark.slow
+def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
+    """The status on a full disk is so; each document holds its number at both ends."""
+    path, ended = tmp_path / "status.json", threading.Event()
+    texts = [json.dumps({"a": n, "x": [10 + n] * (3 + 9000 * (n % 3)), "z": n}) for n in range(9)]
+    path.write_bytes(texts[0].encode().ljust(131072))
+
+    def write():
+        while not ended.is_set():
+            for text in texts:
+                assert overwrite_json(path, text.encode())
+                time.sleep(1e-3)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        # on a busy machine a read may always meet the writer, which here writes far too often
+        seen = [document for _ in range(1000) if (document := read_json(path))]
+        assert all(document["a"] == document["z"] for document in seen)
+        assert len(seen) > 900
+    finally:
+        ended.set()
+        writer.join()
+
+
+@pytest.mark.parametrize("text", [None, "", "{", '{"a": 1', "[1]", "1", "\xff", '{"a": 1}{'])
+def test_a_file_that_is_no_mapping_is_none(tmp_path, text):
+    path = tmp_path / "x.json"
+    if text is not None:
+        path.write_text(text, encoding="latin-1")
+    assert read_json(path) == {}
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1", "127.0.0.1:8437", "127.1.2.3:80", "localhost", "LOCALHOST:8437", "localhost.",
+     "localhost.:8437", "[::1]", "[::1]:8437", "[::ffff:127.0.0.1]:1", "127.0.0.1.",
+     "192.168.1.5:8437", "Pi.Local:8437", "pi.local.", "[fe80::1]:80", "127.0.0.1:"],
+)  # fmt: skip
+def test_ours(host):
+    assert HostNames("192.168.1.5", ["pi.local", "fe80::1"]).allow_host(host)
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1.evil.com", "127.evil.com", "127.0.0.1.evil.com:8437", "localhost.evil.com", "",
+     "evil.com", "evil.com:127", "127.0.0.1@evil.com", "[::1].evil.com", "[::1", "::1", ":8437",
+     "[127.0.0.1]", "127.0.0.1:99999", "127.0.0.1:80:80", "127.0.0.1:8O", "2130706433", "127.1",
+     "0x7f.0.0.1", "0.0.0.0", "192.168.1.50", "pi.local.evil.com", "127.0.0.1..",
+     "localhost,evil.com",
+     "127.0.0.1 evil.com", "127.0.0.1\t", "１２７.0.0.1", "[::ffff:8.8.8.8]", "[::1]8437"],
+)  # fmt: skip
+def test_foreign(host):
+    assert not HostNames("192.168.1.5", ["pi.local"]).allow_host(host)
+
+
+@pytest.mark.parametrize(
+    ("origin", "allowed"),
+    [("http://127.0.0.1:8437", True), ("https://localhost", True), ("http://[::1]:1", True),
+     ("null", False), ("http://127.0.0.1.evil.com", False), ("file://", False), ("", False),
+     ("http://evil.com", False), ("http://[", False), ("ftp://localhost", False)],
+)  # fmt: skip
+def test_origins(origin, allowed):
+    assert HostNames("127.0.0.1").allow_origin(origin) is allowed
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [("127.0.0.1", True), ("127.9.9.9", True), ("localhost", True), ("::1", True),
+     ("127.0.0.1.evil.com", False), ("127.evil.com", False), ("0.0.0.0", False), ("::", False)],
+)  # fmt: skip
+def test_what_reaches_this_machine_alone(host, loopback):
+    assert is_loopback(host) is loopback
+
+
+@pytest.mark.parametrize(
+    ("text", "set_"),
+    [
+        ("a_B1 = (-7.69 ± 0.33)e-7 mm-1/K, 2.0e-06", "a_B1 = (−7.69 ± 0.33)·10⁻⁷ mm⁻¹/K, 2.0·10⁻⁶"),
+        ("A2 = (4.9 ± 0.3)e+12 mm-4", "A2 = (4.9 ± 0.3)·10¹² mm⁻⁴"),
+        ("above 40.2 ± 0.3 degC; --unit degC", "above 40.2 ± 0.3 °C; --unit degC"),
+        ("series mm-1-b of IMG_1e5.jpg at 10 mm", "series mm-1-b of IMG_1e5.jpg at 10 mm"),
+        ("(see M1)e-7, 0x1e5, 1e5b", "(see M1)e-7, 0x1e5, 1e5b"),
+    ],
+)  # fmt: skip
+def test_powers_are_raised_and_names_are_left(text, set_):
+    assert typeset_powers(text) == set_
+    assert with_sd(-7.49e-7, 0.47e-7, "mm-1/K") == "(−7.49 ± 0.47)·10⁻⁷ mm⁻¹/K"
+
+
+def test_nothing_is_no_negative_nothing():
+    assert with_sd(-1e-9, 1e-6) == "(0.0 ± 1.0)·10⁻⁶"
+
+
+def scaled(factor, item):
+    if item == "bad":
+        raise ValueError("this one is bad")
+    if item == "dies":
+        os._exit(3)
+    return factor * item
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_results_come_in_order_and_an_error_comes_through(jobs):
+    assert list(in_order(scaled, 3, range(12), jobs)) == [3 * k for k in range(12)]
+    assert list(in_order(scaled, 3, [], jobs)) == []
+    with pytest.raises(ValueError, match="this one is bad"):
+        list(in_order(scaled, 3, [1, "bad", 2], jobs))
+
+
+def test_items_are_taken_as_results_are_asked_for():
+    """Items handed out are in memory, which a year of blocks must not be."""
+    taken = []
+
+    def items():
+        for k in range(100):
+            taken.append(k)
+            yield k
+
+    results = in_order(scaled, 1, items(), 2)
+    assert next(results) == 0
+    assert len(taken) <= 8
+    results.close()
+
+
+def test_a_process_that_dies_is_an_error_in_words():
+    with pytest.raises(DataError, match="give fewer --jobs"):
+        list(in_order(scaled, 1, [1, "dies", 2, 3], 2))

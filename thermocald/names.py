@@ -200,7 +200,7 @@ def _is_of(kind: str, value: Any) -> bool:
         return True
     if isinstance(value, str):  # a list of its letters is never meant
         return False
-    if outer == "Mapping":
+    if isinstance(value, Mapping):
         return all(_accepts(inner.partition(", ")[2], one) for one in value.values())
     if outer == "tuple":
         kinds = inner.split(", ")

@@ -78,8 +78,14 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'thermocald' has no attribute {name!r}")
     from importlib import import_module
+    from inspect import isfunction
 
     value = getattr(import_module(f"thermocald.{_MODULES[name]}"), name)
+    if isfunction(value):
+        from thermocald.names import checked
+
+        value = checked(value)
+        value.__module__ = __name__  # where pickle finds it
     globals()[name] = value
     return value
 

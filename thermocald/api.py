@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 Progress = Callable[[int], None] | None
-Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path
 
 
 def import_photographs(
@@ -221,7 +220,7 @@ def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
 
 def fit(
     *series: Series,
-    effects: Effects = (),
+    effects: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str = (),
     model: ThermalCamera | ThermalModel | Path | str | None = None,
     T0: float | None = None,
     kind: str | Path | ThermalModel | None = None,
@@ -378,7 +377,7 @@ def simulate(
     model: Path | str | None = None,
     camera: Path | str | None = None,
     programme: Path | str | None = None,
-    effects: Effects = (),
+    effects: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str = (),
     own_effects: bool = True,
     lamp: Sequence[tuple[float, float]] | None = None,
     seed: int = 0,
@@ -419,7 +418,7 @@ def simulate(
 
     require_within(seed=(seed, 0), epochs=(epochs, 1))
     if lamp is not None and (
-        not lamp
+        not len(lamp)
         or [t for t, _ in lamp] != sorted({t for t, _ in lamp})
         or not all(math.isfinite(v) for pair in lamp for v in pair)
     ):
@@ -480,12 +479,16 @@ def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
 
 
 def _model_of(model: ThermalCamera | ThermalModel | Path | str | None) -> ThermalModel | None:
-    if isinstance(model, str | Path):
-        return load_camera(model).model
-    return model.model if isinstance(model, ThermalCamera) else model
+    from thermocald.physics.model import ThermalModel
+
+    if model is None or isinstance(model, ThermalModel):
+        return model
+    return (model if isinstance(model, ThermalCamera) else load_camera(model)).model
 
 
-def _effects(given: Effects) -> list[ModelEffect]:
+def _effects(
+    given: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str,
+) -> list[ModelEffect]:
     from thermocald.physics.model_file import read_effects
     from thermocald.thermal.hypothesis import effect_with, parse_effect
 

@@ -28,7 +28,7 @@ _buffers = threading.local()  # by name
 def seconds(times: ArrayLike) -> Array:
     """Return times in s; datetime64, datetimes and pandas times count from 1970-01-01 UTC.
 
-    Raises UsageError for anything else, and for a time that is unknown (NaN, NaT).
+    Raises UsageError for anything else, and for a time that is unknown (NaN, NaT, masked).
     """
     given = np.asarray(times)
     try:
@@ -43,7 +43,7 @@ def seconds(times: ArrayLike) -> Array:
         found = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
         found = np.full(1, np.nan)
-    if not np.isfinite(found).all():
+    if not np.isfinite(found).all() or np.ma.is_masked(times):
         raise UsageError("a time is not known: give seconds since 1970-01-01 UTC, or datetime64")
     return found
 

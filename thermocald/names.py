@@ -1,4 +1,4 @@
-"""Names and paths from outside the program, checked where they enter it.
+"""Names, paths and arguments from outside the program, checked where they enter it.
 
 Channels are named by devices, users and files and become columns of tables. A channel with the name
 of one of this program's columns would replace it, and a character that separates columns would
@@ -10,14 +10,19 @@ a file's name holds no separator and no control character.
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
+import re
 import stat
+from collections.abc import Callable, Collection, Iterable, Mapping
+from numbers import Integral, Real
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from thermocald.errors import ThermocaldError
 
 WITH_VALUES = ("ok", "predicted", "resected", "last_pose")
@@ -139,3 +144,65 @@ class FileFolder:
     def _is_inside(self, path: str) -> bool:
         real = os.path.realpath(path)
         return real == self._root or real.startswith(self._root.rstrip("/") + "/")
+
+
+# of an annotation: the type that a value must have, and what a message calls it
+_KINDS: dict[str, tuple[type, str]] = {
+    "str": (str, "text"),
+    "Path": (Path, "a path"),
+    "float": (Real, "a number"),
+    "int": (Integral, "a whole number"),
+    "None": (type(None), "None"),
+    "tuple": (Collection, "a tuple"),
+    "Iterable": (Iterable, "a list"),
+    "Sequence": (Iterable, "a list"),
+    "Mapping": (Mapping, "a mapping"),
+}
+
+
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a public function that raises UsageError for an argument of a wrong type.
+
+    Its annotations are read as text; a type that is not listed in `_KINDS` accepts anything.
+    """
+    signature = inspect.signature(function)
+    kinds = {name: str(p.annotation) for name, p in signature.parameters.items()}
+
+    @functools.wraps(function)
+    def called(*given: Any, **named: Any) -> Any:
+        for name, value in signature.bind(*given, **named).arguments.items():
+            if not _accepts(kinds[name], value):
+                words = [_KINDS[kind.split("[")[0]][1] for kind in _alternatives(kinds[name])]
+                wanted = " or ".join(word for word in words if word != "None")
+                raise UsageError(f"{name} is {repr(value)[:80]}; it must be {wanted}")
+        return function(*given, **named)
+
+    return called
+
+
+def _alternatives(annotation: str) -> list[str]:
+    """Return the types between the outermost bars of an annotation."""
+    return re.split(r" \| (?![^\[]*\])", annotation)
+
+
+def _accepts(annotation: str, value: Any) -> bool:
+    """Return whether a value and its elements have one of the types of an annotation."""
+    return any(_is_of(kind, value) for kind in _alternatives(annotation))
+
+
+def _is_of(kind: str, value: Any) -> bool:
+    outer, _, inner = kind.removesuffix("]").partition("[")
+    if outer not in _KINDS:
+        return True
+    if isinstance(value, bool) or not isinstance(value, _KINDS[outer][0]):
+        return False
+    if not inner or not isinstance(value, Collection):  # an iterator can be read only once
+        return True
+    if isinstance(value, str):  # a list of its letters is never meant
+        return False
+    if isinstance(value, Mapping):
+        return all(_accepts(inner.partition(", ")[2], one) for one in value.values())
+    if outer == "tuple":
+        kinds = inner.split(", ")
+        return len(kinds) == len(value) and all(map(_accepts, kinds, value))
+    return all(_accepts(inner, one) for one in value)

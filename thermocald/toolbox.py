@@ -5,6 +5,7 @@ Each does what a command does; units and errors are those of `thermocald.api`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from thermocald.analysis.camera.camera import Camera, CameraDifference
     from thermocald.analysis.thermal.places import Places
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
     Model = ThermalCamera | Path | str
     LogRead = LogOptions | Mapping[str, Any] | None
-    Point = tuple[float, float, float]
 
 
 def convert_camera(
@@ -105,6 +105,7 @@ def predict(
     """
     from thermocald.analysis.thermal import predictions
 
+    test = list(test)
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
     if channels is not None and temperature is None:
@@ -392,8 +393,8 @@ def check_testfield(
     *,
     camera: Camera | Path | str | None = None,
     pixel_pitch: float | None = None,
-    place: Point | None = None,
-    look_at: Point | None = None,
+    place: tuple[float, float, float] | None = None,
+    look_at: tuple[float, float, float] | None = None,
     roll: float = 0.0,
     sigma_px: float = 0.03,
 ) -> FieldCheck:
@@ -430,4 +431,8 @@ def _thermal(model: Model) -> ThermalCamera:
 
 
 def _log_options(given: LogRead) -> LogOptions:
-    return given if isinstance(given, LogOptions) else log_options(**(given or {}))
+    if isinstance(given, LogOptions):
+        return given
+    if not isinstance(given, Mapping | None):
+        raise UsageError(f"log_options is {repr(given)[:80]}; it must be a mapping")
+    return log_options(**(given or {}))

@@ -310,7 +310,31 @@ OUT_OF_BOUNDS = {
     "jobs is 999; it must be from 1 to 256": lambda M1, field: M1.calibrate(jobs=999),
     "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
     "jobs is '2'; it must be a whole number": lambda M1, field: tc.study(M1, jobs="2"),
-    "None is not a path": lambda M1, field: tc.open(None),
+    "source is None; it must be a path": lambda M1, field: tc.open(None),
+    "images is 3; it must be a path or text or a list": lambda M1, field: tc.calibrate(3, field),
+    "effects is None": lambda M1, field: tc.fit(M1, effects=None),
+    "labels is 'M1'; it must be a list": lambda M1, field: tc.study(M1, labels="M1"),
+    "verify is None": lambda M1, field: tc.discover(M1, verify=None),
+    "size is 3; it must be a tuple": lambda M1, field: tc.correct(
+        "points.csv", "camera.yaml", log="M1", size=3
+    ),
+    "size is '3x'": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size="3x"),
+    "timezone is 2; it must be text": lambda M1, field: tc.correct(
+        "points.csv", "camera.yaml", log="M1", timezone=2
+    ),
+    "log_options is ';'; it must be a mapping": lambda M1, field: tc.predict(
+        "camera.yaml", log="logger.csv", log_options=";"
+    ),
+    "calibrations is {'cold.json': '26'}": lambda M1, field: tc.fit_calibrations(
+        {"cold.json": "26"}
+    ),
+    "place is \\(1, 2\\); it must be a tuple": lambda M1, field: tc.check_testfield(
+        field, place=(1, 2)
+    ),
+    "pixel_pitch is '1 µm'; it must be a number": lambda M1, field: tc.import_photographs(
+        "photos", log="logger.csv", testfield=field, timezone="UTC", pixel_pitch="1 µm"
+    ),
+    "the path of a model is 3": lambda M1, field: tc.fit(M1, model=3),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
     "give finite": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(0, float("nan"))]),
@@ -321,8 +345,8 @@ OUT_OF_BOUNDS = {
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
     "'M1' is not a series: open it": lambda M1, field: tc.fit("M1"),
     "'M2' is not a series": lambda M1, field: tc.discover(M1, verify=["M2"]),
-    "give a list of series": lambda M1, field: tc.discover(M1, verify=M1),
-    "M1: give a list": lambda M1, field: tc.predict("camera.yaml", test=M1),
+    "verify is <Series": lambda M1, field: tc.discover(M1, verify=M1),
+    "test is <Series .*; it must be a list": lambda M1, field: tc.predict("camera.yaml", test=M1),
     "channels belong to a temperature": lambda M1, field: tc.predict(
         "camera.yaml", log="M1", channels={"temperature": 30.0}
     ),
@@ -345,6 +369,9 @@ OF_A_CAMERA = {
     "temperature_sd is -1": lambda camera: camera.at(35.0, temperature_sd=-1.0),
     "times run backwards": lambda camera: camera.along([120.0, 60.0, 0.0], HOT),
     "a time is not known": lambda camera: camera.along(["noon"] * 3, HOT),
+    "a time is not known: .* datetime64": lambda camera: camera.along(
+        np.ma.masked_array([0.0, 60.0, 120.0], [False, True, False]), HOT
+    ),
     "a time is not known: give": lambda camera: camera.live().update(np.nan, 30.0),
     "a temperature is no number": lambda camera: camera.along([0.0, 60.0, 120.0], "hot"),
     "give °C, NaN for a failed": lambda camera: camera.live().update(0.0, None),
@@ -352,7 +379,7 @@ OF_A_CAMERA = {
 
 
 @pytest.mark.parametrize("message", OUT_OF_BOUNDS)
-def test_an_argument_out_of_bounds_is_refused(M1, message):
+def test_an_argument_out_of_bounds_is_refused(inside, M1, message):
     with pytest.raises(UsageError, match=message):
         OUT_OF_BOUNDS[message](M1, M1.testfield)
 
@@ -361,6 +388,16 @@ def test_an_argument_out_of_bounds_is_refused(M1, message):
 def test_what_no_camera_can_answer_is_refused(camera, message):
     with pytest.raises(UsageError, match=message):
         OF_A_CAMERA[message](camera)
+
+
+def test_numbers_and_paths_are_taken_as_notebooks_hold_them(inside, M1, camera):
+    """Scalars, rows and columns of NumPy, an iterator of files; functions are found by pickle."""
+    assert tc.predict(camera, np.float64(35.0)).document["temperature"] == 35.0
+    lamp = np.array([[0.0, 1.0], [60.0, 2.0]])
+    assert len(tc.simulate("nexus5-cold", lamp=lamp, epochs=np.int64(3))) == 3
+    told = {"log": "logger.csv", "timezone": "UTC", "testfield": M1.testfield, "pixel_pitch": 0.001}
+    assert len(tc.import_photographs(Path("photos").glob("*.jpg"), **told)) == 6
+    assert pickle.loads(pickle.dumps(tc.study)) is tc.study
 
 
 def test_times_of_pandas_with_and_without_a_zone(camera):

@@ -13,6 +13,7 @@ import pytest
 import typer
 
 from tests.commands import call, every_command
+from thermocald import cli
 from thermocald.cli import application, commands
 from thermocald.errors import OutputError
 from thermocald.files import check_output
@@ -34,7 +35,22 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("predict", "--model", "m", "--temperature", "nan"), "--temperature: nan is no finite"),
         (("testfield", "check", "--from", "0", "inf", "0"), "--from: inf is no finite number"),
         (("testfield", "print", "--out", "f", "--square", "30"), "--square, --marker: give --char"),
-        (("fit", "a", "-o", "o", "--separator", "abc"), "--separator abc: must be one character"),
+        (
+            ("predict", "--model", "m", "--log", "l", "--separator", "abc"),
+            "--separator abc: must be one character",
+        ),
+        # options that would do nothing
+        (("fit", "a", "-o", "o", "--separator", ";"), "error: --separator needs --log"),
+        (("replay", "p", "--timezone", "UTC"), "error: --timezone needs --model"),
+        (
+            ("replay", "p", "--model", "m", "--log", "l", "--store", "s"),
+            "error: --store does nothing with --model",
+        ),
+        (("discover", "M1", "--plan", "--report", "r"), "--report does nothing with --plan"),
+        (("camera", "at", "m", "--temperature", "9", "--frame", "f"), "--frame needs --renew"),
+        # the names are those of the help
+        (("correct", "p", "--size", "9", "--model"), "error: option '--model' requires"),
+        (("measure", "--model", "/dev/null/m"), r"error: missing argument 'POINTS\.csv'"),
         (("study", "M1", "--seed", "x"), "error: .*--seed"),
         (("predict", "--temperature", "20"), "error: missing option '--model'"),
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
@@ -165,3 +181,18 @@ def test_outputs_that_can_be(tmp_path):
         OutputError, match="the folder belongs to the kernel; choose another folder"
     ):
         check_output(tmp_path / "/proc/a.csv")
+
+
+def test_a_file_that_is_no_store_gets_no_page(tmp_path):
+    (tmp_path / "notes.txt").write_text("a gauge")
+    status, lines = _typed("dashboard", "--store", tmp_path / "notes.txt")
+    assert (status, len(lines)) == (1, 1)
+    assert "notes.txt: is not a store" in lines[0]
+
+
+def test_an_input_in_a_closed_folder_cannot_be_read(monkeypatch):
+    """The tests may run as root, to whom no folder is closed."""
+    monkeypatch.setattr(cli.os, "access", lambda *_: False)
+    assert cli._is_read(PermissionError(13, "Permission denied", "closed/recording.yaml"))
+    monkeypatch.setattr(cli.os, "access", lambda *_: True)
+    assert not cli._is_read(PermissionError(13, "Permission denied", "read-only/new.html"))

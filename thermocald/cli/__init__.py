@@ -125,8 +125,9 @@ def _print_usage_error(error: Any) -> int:
     if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
         return status
-    message = re.sub(r"^Invalid value for '([^']+)': (?:Input )?", r"\1: ", message)
     message = message[0].lower() + message[1:]
+    named = r"^invalid value for '([^']+)'(?: / '[^']+')*: (?:Input )?"
+    message = re.sub(named, r"\1: ", message)
     say(f"error: {' '.join(message.split()).rstrip('.')}; see '{command} --help'")
     return status
 
@@ -155,5 +156,10 @@ def _end(*_: object) -> None:
 
 
 def _is_read(error: OSError) -> bool:
-    """Return whether the error concerns a missing input, not an output."""
-    return isinstance(error, FileNotFoundError) and not os.path.lexists(str(error.filename))
+    """Return whether the error concerns an input that is missing or in a closed folder.
+
+    An output is tried before anything is computed.
+    """
+    absent = not os.path.lexists(str(error.filename))
+    closed = not os.access(os.path.dirname(str(error.filename)) or ".", os.X_OK)
+    return absent and (isinstance(error, FileNotFoundError) or closed)

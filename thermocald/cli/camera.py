@@ -228,7 +228,9 @@ def correct(
         metavar="POINTS.csv",
         help="Columns time, x, y (px) and any others; or time, image; - is standard input.",
     ),
-    out: Path | None = typer.Option(None, help="CSV file (points) or folder (images) to write."),
+    out: Path | None = typer.Option(
+        None, "--out", "-o", help="CSV file (points) or folder (images) to write."
+    ),
     to: float | None = expert(None, help="Temperature to correct to, °C; default: the model's T0."),
     temperature_sd: float | None = expert(
         None,

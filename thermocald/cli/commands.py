@@ -32,6 +32,24 @@ _OUTPUTS: dict[str, Output] = {
     "simulate out": "recording",
     "testfield print out": "folder",
 }  # fmt: skip
+_READING = (
+    "temperature_column name unit date_order time_column log_timezone log_clock separator decimal"
+)
+# by command and option: the options that do nothing without it
+_NEEDED = {
+    "camera at": {"renew": "reference frame"},
+    "discover": {"plan": "preset testfield programme strength seeds"},
+    "fit": {"log": _READING},
+    "predict": {"log": _READING, "programme": "camera wanted", "temperature": "channel"},
+    "replay": {"model": "log times timezone recording_out"},
+}
+# … and those that do nothing with it
+_IDLE = {
+    "discover": {"plan": "verify model_out effect_out report jobs"},
+    "fit": {"log": "jobs"},
+    "replay": {"model": "store exterior free jobs"},
+    "study": {"reference": "exterior free"},
+}
 ADVANCED = "Advanced"
 """The help section of the options that only experts need."""
 
@@ -103,12 +121,12 @@ _SHOWN = {"Path": "path", "path": "path", "str": "text", "int": "number", "float
 class Command(TyperCommand):
     """A command whose help lists the advanced options in their own section.
 
-    A number that is not finite and an output that cannot be written are refused before anything is
-    computed.
+    A number that is not finite, an option that does nothing beside the others, and an output that
+    cannot be written are refused before anything is computed.
     """
 
     def invoke(self, ctx: Any) -> Any:
-        """Check numbers and outputs, then run the command."""
+        """Check numbers, options and outputs, then run the command."""
         for parameter in self.get_params(ctx):
             given = ctx.params.get(parameter.name)
             for value in given if isinstance(given, tuple | list) else (given,):
@@ -116,6 +134,7 @@ class Command(TyperCommand):
                     raise UsageError(f"{parameter.opts[0]}: {value} is no finite number")
         if not ctx.params.get("dry_run"):
             _check_outputs(ctx)
+        _check_use(ctx)
         return super().invoke(ctx)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -132,11 +151,28 @@ class Command(TyperCommand):
                 formatter.write_dl(sections[title])
 
 
+def _check_use(ctx: Any) -> None:
+    """Raise UsageError for an option that does nothing without another, or beside it."""
+    options = {p.name: max(p.opts, key=len) for p in ctx.command.params}
+    given = {n for n in options if ctx.get_parameter_source(n).name == "COMMANDLINE"}
+    for table, here in ((_NEEDED, False), (_IDLE, True)):
+        for name, others in table.get(_words(ctx), {}).items():
+            for other in given.intersection(others.split()) if (name in given) is here else ():
+                does = "does nothing with" if here else "needs"
+                raise UsageError(f"{options[other]} {does} {options[name]}")
+
+
+def _words(ctx: Any) -> str:
+    """Return the words of a command, without the program's name."""
+    words, above = [ctx.info_name], ctx.parent
+    while above is not None and above.parent is not None:
+        words, above = [above.info_name, *words], above.parent
+    return " ".join(words)
+
+
 def _check_outputs(ctx: Any) -> None:
     """Raise OutputError for an output that cannot be written, UsageError for one given twice."""
-    command, above = ctx.info_name, ctx.parent
-    while above is not None and above.parent is not None:
-        command, above = f"{above.info_name} {command}", above.parent
+    command = _words(ctx)
     written: dict[str, str] = {}
     for name, given in ctx.params.items():
         kind = _OUTPUTS.get(f"{command} {name}", _OUTPUTS.get(name))

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
 
 def demo(
-    out: Path = typer.Option(Path("thermocald-demo"), help="Folder for store and recording."),
+    out: Path = typer.Option(
+        Path("thermocald-demo"), "--out", "-o", help="Folder for store and recording."
+    ),
     epochs: int = typer.Option(150, min=10, help="Number of epochs, of 10 s each."),
     seed: SeedOption = 0,
     discovery: bool = typer.Option(
@@ -102,7 +104,7 @@ def simulate(
     programme: Path | None = typer.Option(
         None, help="Programme (YAML): epochs, ambient temperatures, heat sources."
     ),
-    out: Path | None = typer.Option(None, help="The recording to write."),
+    out: Path | None = typer.Option(None, "--out", "-o", help="The recording to write."),
     frames: bool = typer.Option(
         False, "--frames", help="Render frames instead of simulating measured image points."
     ),

@@ -125,6 +125,7 @@ def dashboard(
     from thermocald.config import load_config
     from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
+    from thermocald.store.sources import is_store
 
     names = name or []
     if config is not None:
@@ -139,8 +140,9 @@ def dashboard(
     if store is None:
         raise UsageError("give --store FILE or --config FILE")
     # with --config the page may be started before the daemon has created its store
-    if config is None and live is None and not store.exists():
-        raise StoreError(f"{store}: does not exist; give the store that the daemon writes")
+    if config is None and live is None and not is_store(store):
+        what = "is not a store" if store.exists() else "does not exist"
+        raise StoreError(f"{store}: {what}; give the store that the daemon writes")
     serve(store, live or find_state(store), host, port, token_file, names)
 
 

@@ -192,7 +192,7 @@ def reprocess(
     archives: list[str] = typer.Argument(
         ..., metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"
     ),
-    out: Path = typer.Option(..., help="Folder for the results."),
+    out: Path = typer.Option(..., "--out", "-o", help="Folder for the results."),
     do: str = typer.Option("calibrate", help="calibrate epochs, or discover or study series."),
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: JobsOption = 1,

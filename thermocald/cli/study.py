@@ -66,10 +66,8 @@ def replay(
     """
     from thermocald.store.recording.sense import doubt_lines
 
-    if (model is None) != (log is None):
+    if model is not None and log is None:
         raise UsageError("--model and --log go together")
-    if recording_out is not None and model is None:
-        raise UsageError("--recording-out needs --model: it stores the static points of a scene")
     if model is not None and log is not None:
         from thermocald.store.logger.photographs import find_photographs
 
@@ -200,8 +198,6 @@ def study(
             if not inputs
             else "--reference studies the presets; give no recordings with it"
         )
-    if window % 2 == 0:
-        raise UsageError(f"--window is {window}; it must be odd, so that it has a centre")
     settings: dict[str, Any] = {
         "window": window, "alpha": alpha, "sets": sets, "seed": seed,
         "distance_mm": 1000 * distance, "grid": grid, "focus_mm": 1000 * focus,

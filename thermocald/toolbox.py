@@ -10,9 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
-from thermocald.errors import UsageError
+from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry import camera_files
 from thermocald.series import COLDEST_C, Series, require_series, require_within, source_of
 from thermocald.store.logger.clock import device_clock
@@ -224,9 +226,15 @@ def measure(
     _, near = first_times(path, clock)
     table = read_model_log(thermal, source_of(log), _log_options(log_options), near)
     rows = list(row_blocks(path, ("x", "y", "sx", "sy"), clock))
+    unknown = "its temperature is not known: outside the log, or in a gap of over ten intervals"
+    known = [block.kept(table.known_at(block.times), unknown) for block in rows]
+    if any(block.lines for block in known):  # without any, the error tells the log's span
+        rows = known
     for line, why in (refused for block in rows for refused in block.refused):
         tell(f"{path}, line {line}: {why}; left out")
     when = seconds_of(seen, clock)
+    if not table.known_at(np.array([when])).all():
+        raise DataError(f"--seen {seen}: the log {log} does not tell the temperature of that time")
     return measure_places(thermal, table, controls, when, plane, rows, extrapolate)
 
 

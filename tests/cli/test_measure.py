@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
+from tests.analysis.test_gauge import World, thermal_camera
 from tests.commands import call
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.analysis.thermal.correction import RowBlock
+from thermocald.analysis.thermal.places import measure_places
+from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.epoch.measuring import Plane
+from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics import model_file
 from thermocald.physics.model import ThermalModel
+from thermocald.store.logger.temperatures import TemperatureLog
 
 POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 ORIGIN_M = np.array([192_000.0, 313_000.0, 138.0])  # a national grid
@@ -255,6 +266,8 @@ def beyond_the_camera(_, row):
      (beyond_the_camera, "or a sign is wrong"),
      (lambda i, _: {"X": 192_000 + i, "Y": 313_020, "Z": 138}, "lie on one line"),
      (lambda i, r: {} if i < 3 else {"x": "", "y": ""}, "3 control points; a pose needs at least"),
+     (lambda i, r: {"Z": 100 * float(r["Z"])} if i == 3 else {}, "g3: is 13"),
+     (lambda i, r: {} if i else {n: 100 * float(r[n]) for n in "XYZ"}, "g0: is 3"),
      (lambda i, r: {"y": float(r["y"]) + (0, 90, -50, 0, 70, -30)[i % 6]}, "contradict the ot")],
 )  # fmt: skip
 def test_control_points_that_cannot_be_are_one_line_that_says_why(tmp_path, change, words):
@@ -270,3 +283,97 @@ def test_heights_of_one_time_that_contradict_each_other_are_said(tmp_path):
         "\n".join([points[0], ",".join(moved), *points[2:]]) + "\n"
     )
     assert "the places contradict each other" in measured(tmp_path).stdout
+
+
+def posed(world: World, seen: Observations, camera: Camera):
+    return ControlPoints(world.field, seen, np.zeros(3), "mm").pose(camera)
+
+
+def test_four_good_control_points_give_a_pose():
+    """Three of them gave a bad start for the fourth: 8 of these gauges were once refused."""
+    camera = thermal_camera().at(20.0)
+    for seed in range(200):
+        world = World(seed, n=4)
+        nearer = world.points[:, 0] * np.random.default_rng(seed).uniform(-0.7, 0.0, 4)
+        world.points[:, 0] += nearer
+        shifted = world.field.points + nearer[:, None] * [1, 0, 0]
+        world.field = replace(world.field, points=shifted)
+        assert posed(world, world.seen(20.0), camera).ok
+
+
+def test_the_mistake_in_a_few_control_points_is_named():
+    camera = thermal_camera().at(20.0)
+    for seed in range(3):
+        world = World(seed, n=6)
+        seen = world.seen(20.0)
+        with pytest.raises(DataError, match="with g0 and g1 exchanged they fit"):
+            posed(world, replace(seen, points=seen.points[[1, 0, 2, 3, 4, 5]]), camera)
+        world = World(seed, n=5)
+        world.points[2] += [0.0, 0.0, 1500.0]
+        with pytest.raises(DataError, match="without g2 they fit"):
+            posed(world, world.seen(20.0), camera)
+
+
+def test_what_an_error_may_do_unnoticed_is_what_it_does():
+    """A click that is moved changes χ² and the places as the stated reliability says."""
+    world, camera, T = World(2, n=4), thermal_camera(), 20.0
+    at_T0 = [CAMERA[n] for n in NAMES]
+    exact = Observations(
+        np.arange(4), project(world.field.points, POSE, *at_T0), np.full((4, 2), NOISE_PX)
+    )
+    water, log = (
+        Plane(np.zeros(3), np.array([0.0, 0.0, 1.0])),
+        TemperatureLog(MORNING + np.array([0.0, 60.0]), {"temperature": np.array([T, T])}),
+    )
+    image = np.column_stack([project(PLACES, POSE, *at_T0), np.full((3, 2), NOISE_PX)])
+    row = RowBlock([], [1, 2, 3], [{}] * 3, np.full(3, MORNING), image, [])
+
+    def measure(seen):
+        control = ControlPoints(world.field, seen, np.zeros(3), "mm")
+        return measure_places(camera, log, control, MORNING, water, [row])
+
+    still, largest = measure(exact), {}
+    for k, way in itertools.product(range(4), np.linspace(0.0, np.pi, 90)):
+        points = exact.points.copy()
+        points[k] += 0.1 * np.array([np.cos(way), np.sin(way)])
+        moved = measure(replace(exact, points=points))
+        chi2 = moved.pose.sigma0**2 * moved.pose.redundancy
+        shift = np.abs(moved.points - still.points).max() * np.sqrt(19.7 / chi2)
+        largest[k] = max(shift, largest.get(k, 0.0))
+    assert still.unnoticed_mm == pytest.approx(max(largest.values()), rel=0.03)
+    assert f"g{max(largest, key=largest.get)}" in still.unchecked
+    assert f"by {still.unnoticed_mm:.0f} mm unnoticed" in still.lines()[0]
+
+
+def test_well_checked_control_points_are_not_doubted(tmp_path):
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    document = json.loads(measured(tmp_path, "--json", "-").stdout)
+    assert document["pose"]["unchecked"] == []
+    assert document["refused"] == []
+
+
+def test_a_row_without_a_temperature_is_left_out_and_the_others_are_measured(tmp_path):
+    """The thermometer failed for an hour; once, the whole day was refused."""
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    head, *rows = (tmp_path / "log.csv").read_text().splitlines()
+    hour = range(1000, 1360)
+    gap = [r for k, r in enumerate(rows) if k not in hour]
+    (tmp_path / "log.csv").write_text("\n".join([head, *gap]) + "\n")
+    with (tmp_path / "points.csv").open("a") as file:
+        file.write(f"{rows[1180].split(',')[0]},in the gap,1640,1700,0.2,0.2\n")
+    done = called(tmp_path, "--json", tmp_path / "places.json")
+    document = json.loads((tmp_path / "places.json").read_text())
+    assert [place["name"] for place in document["places"]] == ["stone 0", "stone 1", "stone 2"]
+    assert [one["line"] for one in document["refused"]] == [5]
+    assert "points.csv, line 5: its temperature is not known" in done.stderr
+    assert (done.returncode, done.stderr.count("error")) == (1, 1)
+
+
+def test_control_points_seen_while_the_thermometer_failed_are_named(tmp_path):
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    done = called(tmp_path, "--seen", f"{MORNING - 7200:.0f}")
+    assert done.returncode == 1
+    assert f"--seen {MORNING - 7200:.0f}: the log" in done.stderr

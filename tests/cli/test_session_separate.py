@@ -57,7 +57,7 @@ def test_a_dry_run_prints_a_programme_that_a_session_takes(config, tmp_path):
     ("arguments", "said"),
     [
         (["--until-separated", "creep"], "give two different effects"),
-        (["--dry-run"], "are for --until-separated"),
+        (["--dry-run"], "--dry-run needs --until-separated"),
         (["--until-separated", "creep,slip", "--max-temperature", "23"], "of warming above"),
     ],
 )

@@ -133,8 +133,6 @@ def archive(
     from thermocald.store.database.archive import archive_store
 
     read = None
-    if retention and config is None:
-        raise UsageError("--retention needs --config FILE, which holds the limits")
     if config is not None:
         read = load_config(config)
         store, frames = store or read.store.path, frames or read.frames.folder

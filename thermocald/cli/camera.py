@@ -303,7 +303,8 @@ def measure(
     """Measure the positions of image points on a water surface, a plane or a staff.
 
     Each position has a standard deviation, and is compared with the position that would result
-    without the thermal model.
+    without the thermal model. A row that cannot be measured is reported with its line number; the
+    exit status then is 1.
 
     Example: thermocald measure points.csv --model camera.thermal.yaml --log weather.csv
     --control gcp.csv --seen 2026-05-04T09:00:00Z --plane water.yaml --length-unit m
@@ -316,3 +317,5 @@ def measure(
             extrapolate=extrapolate, say=say,
         )  # fmt: skip
     show(found, json)
+    if found.refused:
+        raise DataError(f"{points}: {len(found.refused)} rows were left out")

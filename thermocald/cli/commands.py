@@ -37,11 +37,14 @@ _READING = (
 )
 # by command and option: the options that do nothing without it
 _NEEDED = {
+    "archive": {"config": "retention"},
     "camera at": {"renew": "reference frame"},
     "discover": {"plan": "preset testfield programme strength seeds"},
     "fit": {"log": _READING},
     "predict": {"log": _READING, "programme": "camera wanted", "temperature": "channel"},
     "replay": {"model": "log times timezone recording_out"},
+    "run": {"recording": "fast"},
+    "session start": {"until_separated": "evidence dry_run max_temperature max_rate max_duty"},
 }
 # … and those that do nothing with it
 _IDLE = {

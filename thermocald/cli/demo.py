@@ -54,28 +54,17 @@ def demo(
 
 
 def _print_drift(document: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
     low, high = document["temperature"]
     typer.echo(
         f"{document['ok']} of {document['epochs']} epochs calibrated, {document['targets']} "
         f"targets, {low:.1f} to {high:.1f} °C, sigma0 {document['sigma0']:.2f}"
     )
     typer.echo("Drift from the first epoch to the hottest, px:")
-    table = Table(box=None, pad_edge=False)
-    for title in ("", "true", "estimated", "sd", "scatter / sd"):
-        table.add_column(title, justify="left" if not title else "right")
+    typer.echo("       true  estimated     sd  scatter / sd")
     for row in document["parameters"]:
-        table.add_row(
-            row["name"],
-            f"{row['drift_in_px']:+.3f}",
-            f"{row['drift_found_px']:+.3f}",
-            f"{row['sd_drift_found_px']:.3f}",
-            f"{row['scatter_over_sd']:.2f}",
-        )
-    console.print(table, highlight=False)
+        drifts = f"{row['drift_in_px']:+8.3f}  {row['drift_found_px']:+9.3f}"
+        scatter = f"{row['sd_drift_found_px']:.3f}  {row['scatter_over_sd']:12.2f}"
+        typer.echo(f"{row['name']:<2} {drifts}  {scatter}")
     typer.echo(f"store:     {document['store']}")
     typer.echo(f"recording: {document['recording']}")
 

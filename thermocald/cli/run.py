@@ -67,8 +67,6 @@ def run(
         raise UsageError("give one of --config FILE, --mock, --recording FOLDER")
     if not mock and recording is None:
         config = require_config(config, "one of --config FILE, --mock, --recording FOLDER")
-    if fast and recording is None:
-        raise UsageError("--fast is for --recording: devices have their own pace")
 
     def with_options(read: Config) -> Config:
         page = {"enabled": True} if dashboard else {}

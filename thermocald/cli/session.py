@@ -78,8 +78,6 @@ def start(
         (typer.echo if dry_run else say)(text)
         if dry_run:
             return
-    elif dry_run or evidence is not None:
-        raise UsageError("--dry-run and --evidence are for --until-separated A,B")
     path = output / f"{session.camera}-{series}"
     if path.exists():
         raise DataError(f"{path}: the recording exists already; choose another --series")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +34,7 @@ _LEAST_EXTENT_MM = 50.0  # of a gauge's points; it is smaller for metres read as
 _LEAST_OF_A_GRID_MM = 1000.0  # of points more than a hundred times as far from the origin
 _LARGEST_EXTENT_MM = 2e6  # it is larger for mm read as metres
 _FITS = 3.0  # largest sigma0 of a pose that fits after mirroring
+_EXCHANGED = 20  # points of which each two are exchanged, in search of a mistake
 _ROUND_MM = 1e6  # the origin is rounded to this
 _SURVEYED_MM = 20.0  # a GNSS receiver with corrections, if no standard deviation is given
 _CLICKED_PX = 1.0
@@ -90,6 +92,13 @@ class ControlPoints:
         if not np.isfinite(points).all():
             row = int(np.argmin(np.isfinite(points).all(axis=1)))
             raise DataError(f"{where}, {names[row]}: a control point needs X, Y and Z")
+        away = scale * np.abs(points - np.median(points, axis=0)).max(axis=1)
+        if (far := away > _LARGEST_EXTENT_MM).any() and far.mean() < 0.5:
+            row = int(np.argmax(away))
+            raise DataError(
+                f"{where}, {names[row]}: is {away[row] / 1000:.0f} m away from the other control "
+                f"points: are its coordinates in {unit}?"
+            )
         extent = scale * float(np.ptp(points[:, :2], axis=0).max())
         grid = np.abs(scale * points.mean(axis=0)[:2]).max() > 100.0 * extent
         if 0 < extent < (_LEAST_OF_A_GRID_MM if unit == "mm" and grid else _LEAST_EXTENT_MM):
@@ -133,12 +142,30 @@ class ControlPoints:
             )
         elif pose.ok:
             return pose
-        field = replace(self.field, points=self.field.points[:, [1, 0, 2]])
-        turned = replace(seen, points=seen.points[:, ::-1])
-        mirrored = (camera.resect(field, seen, 0.0), camera.resect(self.field, turned, 0.0))
-        if any(other.ok and other.sigma0 < _FITS for other in mirrored):
-            why += "; mirrored they fit: X and Y, or x and y, are exchanged, or a sign is wrong"
-        raise DataError(why)
+        raise DataError(why + self._remedy(camera))
+
+    def _remedy(self, camera: Camera) -> str:
+        """Return the change with which the points fit, as the end of a sentence; else ""."""
+        field, seen, n = self.field, self.seen, len(self.seen)
+        names = [field.names[row] for row in seen.targets]
+        mirrored = "mirrored they fit: X and Y, or x and y, are exchanged, or a sign is wrong"
+        changes = [
+            (mirrored, replace(field, points=field.points[:, [1, 0, 2]]), seen),
+            (mirrored, field, replace(seen, points=seen.points[:, ::-1])),
+        ]
+        for i, j in combinations(range(min(n, _EXCHANGED)), 2):
+            order = np.arange(n)
+            order[[i, j]] = j, i
+            text = f"with {names[i]} and {names[j]} exchanged they fit: is a name or a click wrong?"
+            changes.append((text, field, replace(seen, points=seen.points[order])))
+        for i in range(n):
+            text = f"without {names[i]} they fit: has it moved, or is its unit another?"
+            changes.append((text, field, seen.select(np.arange(n) != i)))
+        for text, points, image in changes:
+            pose = camera.resect(points, image, 0.0)
+            if pose.ok and pose.sigma0 < _FITS:
+                return f"; {text}"
+        return ""
 
 
 def _from_table(path: Path, unit: str) -> ControlPoints:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,10 +21,11 @@ import numpy as np
 from scipy.special import chdtrc
 
 from thermocald.analysis.thermal.control_points import UNITS
+from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
 from thermocald.files import read_yaml
-from thermocald.photogrammetry.camera.camera_model import EOP
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 from thermocald.result import Result, jsonable, new_figure, with_sds
 
@@ -39,11 +40,16 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.correction import RowBlock
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.store.logger.temperatures import TemperatureLog
 
 
 _FARTHEST = 100.0  # largest distance of the surface, in extents of the control points
+_MISSED = 19.7  # noncentral χ² of a gross error that the test (0.1 %) misses one time in five
+_UNCHECKED = 10.0  # standard deviations by which such an error may move a place
+_SOME = 50  # places for which this is computed
+_NONE = 1e-6  # share of a variance, or mm, that is rounding
 _CONTRADICTED = 1e-3  # heights whose differences are less probable contradict each other
 
 
@@ -159,7 +165,9 @@ class Places(Result):
     names (n); points (n, 3) in the unit and the coordinates of the control points, with their joint
     covariance (3n, 3n); without (n, 3): without thermal correction, from the camera at the control
     points' time; pose: the resection; rejected: control points left out; temperatures (n,) °C, NaN
-    if unknown; times (n,) s UTC; levels: of the water, if the places are on a staff or a profile.
+    if unknown; times (n,) s UTC; levels: of the water, if the places are on a staff or a profile;
+    unchecked: control points that the others hardly check; unnoticed_mm: by how much a gross error
+    of theirs may move a place unnoticed; refused: (line, reason) of the rows left out.
     """
 
     names: list[str]
@@ -172,6 +180,9 @@ class Places(Result):
     temperatures: Array
     times: Array
     levels: tuple[Level, ...] = ()
+    unchecked: tuple[str, ...] = ()
+    unnoticed_mm: float = 0.0
+    refused: tuple[tuple[int, str], ...] = ()
 
     @cached_property
     def sd(self) -> Array:
@@ -205,7 +216,9 @@ class Places(Result):
                 "control_points": self.pose.n_observations, "rejected": list(self.rejected),
                 "sd_angles_deg": np.degrees(self.pose.sd[EOP][:3]).tolist(),
                 "sd_centre_mm": self.pose.sd[EOP][3:].tolist(),
+                "unchecked": list(self.unchecked), "unnoticed_mm": self.unnoticed_mm,
             },
+            "refused": [{"line": line, "reason": why} for line, why in self.refused],
         }  # fmt: skip
 
     def lines(self) -> list[str]:
@@ -219,6 +232,11 @@ class Places(Result):
             single = len(self.rejected) == 1
             words = "contradicts the others and is" if single else "contradict the others and are"
             pose += f", {', '.join(self.rejected)} {words} left out"
+        if self.unchecked:
+            pose += (
+                f"; the others hardly check {', '.join(self.unchecked)}: a gross error there could "
+                f"move a place by {self.unnoticed_mm:.0f} mm unnoticed; add control points"
+            )
         names = list(self.names)
         if np.ptp(self.times):
             names = [f"{n} {_utc(t):%H:%M:%S}" for n, t in zip(names, self.times, strict=True)]
@@ -287,14 +305,51 @@ def measure_places(
             f"image point {names[row]} at {image[row, 0]:.0f}, {image[row, 1]:.0f} px is outside "
             f"the camera's {sensor.width} × {sensor.height} px"
         )
+    unchecked, unnoticed = _reliability(sensor, control, pose, image, surface, covariance)
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
     levels = () if isinstance(surface, Plane) else _levels(points, covariance, moments, member)
     return Places(
         names, points, covariance, (without + control.origin) / scale, control.unit, pose,
         tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
-        levels,
+        levels, unchecked, unnoticed,
+        tuple(refused for block in rows for refused in block.refused),
     )  # fmt: skip
+
+
+def _reliability(
+    sensor: Sensor,
+    control: ControlPoints,
+    pose: Adjustment,
+    image: Array,
+    surface: Plane | Line | Profile,
+    covariance: Array,
+) -> tuple[tuple[str, ...], float]:
+    """Return the control points that the others hardly check, and what they may do, mm.
+
+    covariance (3n, 3n) mm²: of the places. It is the external reliability: the largest movement of
+    a place by a gross error that data snooping misses. Source: Baarda (1968).
+    """
+    exact: Plane | Line | Profile = replace(surface, sd_mm=0.0)
+    if isinstance(exact, Plane):
+        exact = replace(exact, sd_tilt=0.0)
+    seen = control.seen.select(~np.isin(control.seen.targets, pose.rejected))
+    some = spread_rows(len(image), _SOME)
+    sd = np.sqrt(covariance.diagonal()).reshape(-1, 3)[some].ravel()
+    Q = pose.covariance / max(1.0, pose.sigma0**2)
+    names, worst = [], 0.0
+    for target, sigma in zip(seen.targets, seen.sigmas, strict=True):
+        at = control.field.points[target]
+        _, (A,), (B,) = partials(sensor, pose.values[IOP], pose.values[EOP], at[None])
+        noise = np.diag(sigma**2) + B * control.field.sigmas[target] ** 2 @ B.T
+        variance, axes = np.linalg.eigh(noise - A @ Q @ A.T)  # of the residuals
+        lever = Q @ A.T @ axes / np.sqrt(np.maximum(variance, _NONE * noise.trace()))
+        _, moved = place_on(sensor, pose.values, _MISSED * lever @ lever.T, image[some], 0.0, exact)
+        largest = np.sqrt(np.maximum(moved.diagonal(), 0.0))
+        if (largest > np.maximum(_UNCHECKED * sd, _NONE)).any():
+            names.append(control.field.names[target])
+            worst = max(worst, float(largest.max()))
+    return tuple(names), worst
 
 
 def _utc(time: float) -> datetime:

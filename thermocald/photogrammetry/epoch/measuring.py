@@ -36,7 +36,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     failed,
     is_ambiguous,
 )
-from thermocald.photogrammetry.orientation import approximate_orientation
+from thermocald.photogrammetry.orientation import approximate_orientation, resection
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
+_START = 0.005  # of the image's width: largest RMS residual of a start from four control points
 _THIN = 0.005  # extent across over extent along, up to which points count as one line
 _BESIDE_PX = 5.0  # an image point may be this far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # least angle of a ray to a plane; below, a pixel means metres
@@ -83,10 +84,13 @@ def resect(
             _, pose, fits = approximate_orientation(
                 sensor, points, observations.points, interior=interior
             )
+            suspects = ~fits
         except GeometryError:
-            why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
-            return failed("no_orientation", why, observations)
-        suspects = ~fits
+            # of four points it draws three, whose pose may miss the fourth
+            rms, pose = resection(sensor, interior, points, observations.points)[0]
+            if n > _FEWEST or rms > _START * sensor.width:
+                why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
+                return failed("no_orientation", why, observations)
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
     if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
         why = "too many control points contradict the others; check that x, y belong to X, Y, Z"

@@ -49,6 +49,8 @@ def test_a_block_knows_the_frame_before_it(jobs):
     epochs[first] = replace(epochs[first - 1], number=first)
     done = list(calibrated_epochs(calibrator(), epochs, jobs))[first - 1 :]
     assert [d.adjustment.status for d in done] == ["ok", "repeated_frame", "ok"]
+    rest = calibrated_epochs(calibrator(), epochs[first:], jobs, before=epochs[first - 1])
+    assert [d.adjustment.status for d in rest] == ["repeated_frame", "ok"]
 
 
 def test_an_epoch_that_is_calibrated_late_is_not_the_last_one():

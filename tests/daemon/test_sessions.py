@@ -81,6 +81,18 @@ def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(l
     ]  # fmt: skip
 
 
+def test_a_series_begins_with_a_new_observation(live):
+    """Regression: a frozen camera's first epoch was a repeated frame of the series before."""
+    daemon = live(camera=[{"kind": "stuck", "at": 3, "count": 500}])
+    daemon.until(lambda: len(series_of(daemon.store).get("watch", ("", []))[1]) > 3)
+    daemon.ask("session start", session={**SESSION, "epochs": 3})
+    daemon.until(lambda: daemon.session().get("state") == "done")
+    assert daemon.stop() == 0
+    with Store.open(daemon.store) as store:
+        found = store.series_columns(store.series_of("phone-1", "M7"), ["status"])
+    assert found["status"].tolist() == ["ok", "repeated_frame", "repeated_frame"]
+
+
 def test_a_daemon_that_is_killed_goes_on_with_the_session(live):
     daemon = live()
     daemon.ask("session start", session={**SESSION, "epochs": 5})

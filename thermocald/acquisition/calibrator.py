@@ -155,9 +155,6 @@ class Calibrator(EpochCalibrator):
     def reset(self) -> None:
         """Forget the last epoch, and where the camera was."""
         super().reset()
-        self._start_anew()
-
-    def _start_anew(self) -> None:
         self._last: Adjustment | None = None
         self._usual = float("nan")
         self._tracker.reset()
@@ -167,7 +164,9 @@ class Calibrator(EpochCalibrator):
         self.reset()
         if before is not None:
             self.calibrate(before)
-            self._start_anew()
+            seen = self._seen
+            self.reset()
+            self._seen = seen
 
     def calibrate(
         self,
@@ -237,28 +236,29 @@ EPOCHS_OF_A_BLOCK = 200
 
 
 def calibrated_epochs(
-    calibrator: Calibrator, epochs: Iterable[Epoch], jobs: int = 1
+    calibrator: Calibrator, epochs: Iterable[Epoch], jobs: int = 1, before: Epoch | None = None
 ) -> Iterator[CalibratedEpoch]:
     """Yield calibrated epochs in their order.
 
-    calibrator: one that has not calibrated an epoch yet; jobs: number of processes. Never raises
-    for bad data: an epoch without a result has a status and a reason.
+    calibrator: one that has not calibrated an epoch yet; jobs: number of processes; before: the
+    epoch before the first one. Never raises for bad data: an epoch without a result has a status
+    and a reason.
     """
+    blocks = _blocks(epochs, before)
     if jobs <= 1:
-        before = None
-        for number, epoch in enumerate(epochs):
-            if number % EPOCHS_OF_A_BLOCK == 0:
-                calibrator.begin_block(before)
-            yield calibrator.calibrate(epoch)
-            before = epoch
+        for last, block in blocks:
+            calibrator.begin_block(last)
+            yield from map(calibrator.calibrate, block)
         return
-    for block in in_order(_calibrate_block, calibrator, _blocks(epochs), jobs):
-        yield from block
+    for done in in_order(_calibrate_block, calibrator, blocks, jobs):
+        yield from done
 
 
-def _blocks(epochs: Iterable[Epoch]) -> Iterator[tuple[Epoch | None, list[Epoch]]]:
+def _blocks(
+    epochs: Iterable[Epoch], before: Epoch | None
+) -> Iterator[tuple[Epoch | None, list[Epoch]]]:
     """Yield blocks of epochs, each with the epoch before it."""
-    source, before = iter(epochs), None
+    source = iter(epochs)
     while block := list(islice(source, EPOCHS_OF_A_BLOCK)):
         yield before, block
         before = block[-1]

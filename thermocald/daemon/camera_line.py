@@ -312,8 +312,6 @@ class CameraLine:
         """
         run = None if series is None else SeriesRun(self, series, start, limit)
         self._replace(run, checking=False)
-        if self.plan.calibrator is not None:
-            self.plan.calibrator.reset()  # a frame of the check or of another series is no repeat
         if run is not None and self._started:
             run.pipeline.start()
 
@@ -329,6 +327,8 @@ class CameraLine:
         if old is not None and self._started and not old.finish(_SWITCH_GRACE_S):
             log.error("camera %s: its last epochs take too long to be stored", self.plan.name)
         # only now, since all series share the calibrator
+        if self.plan.calibrator is not None:
+            self.plan.calibrator.reset()  # nothing repeats a frame of another series
         self._checking = checking
 
     def _capture(self) -> None:

@@ -159,8 +159,9 @@ def replay_into(
         # a store names frames in its own folder only, relative to it
         home, folder = path.resolve().parent, recording.path.resolve()
         inside = folder.relative_to(home) if folder.is_relative_to(home) else None
-        epochs = islice(recording.iter_epochs(), stored, None)
-        for done in calibrated_epochs(calibrator, epochs, jobs):
+        epochs = islice(recording.iter_epochs(), max(stored - 1, 0), None)
+        before = next(epochs) if stored else None
+        for done in calibrated_epochs(calibrator, epochs, jobs, before):
             if last is None or done.epoch.number > last:
                 result = EpochResult.from_adjustment(done.adjustment)
                 frame = done.epoch.frame

@@ -91,7 +91,7 @@ class Site:
             for name, X, uv in zip(world.field.names, world.field.points, clicks, strict=True):
                 rows.writerow([name, *X, 8, 8, 8, *uv, 1, 1])
         spec = CameraSpec("gauge", self.thermal.model.sensor, 3.04)
-        head = Head("gauge", "M1", PERIOD_S, spec, {"temperature": Channel("degC", 0.01)})
+        head = Head("gauge", "M1", PERIOD_S, spec, {"temperature": Channel(0.01)})
         write_recording(folder / "recording", head, world.field, self.epochs(ticks))
 
     def epochs(self, count: int):

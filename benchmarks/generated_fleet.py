@@ -51,7 +51,7 @@ class GeneratedCamera:
     @property
     def series(self) -> StoredSeries:
         camera = CameraSpec(self.camera, Sensor(3280, 2464, PITCH), 3.04)
-        channels = {"temperature": Channel("degC", 0.0625), "board": Channel("degC")}
+        channels = {"temperature": Channel(0.0625), "board": Channel()}
         head = Head("watch", "watch", self.interval, camera, channels)
         return StoredSeries(0, head, _field(), "", {"model": self.model}, {}, self.end)
 

@@ -18,9 +18,8 @@ from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
-from thermocald.numbers import UNITS, plain, typeset_powers, with_sd
+from thermocald.numbers import typeset_powers, with_sd
 from thermocald.output.study.summary import study_document, study_lines
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
 from thermocald.store.logger.photographs import focal_length
@@ -217,9 +216,10 @@ class Calibration(Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
+        from thermocald.output.calibration import interior_table
+
         document = self.as_dict()
         lines: list[str] = []
-        interior = document["interior"]
         if document["status"] == "ok":
             used = sum(p["exterior"] is not None for p in document["photographs"])
             lines.append(
@@ -227,17 +227,8 @@ class Calibration(Result):
                 f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
                 + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
             )
-            rows = [("", "value ± sd", "in px")]
-            pitch = document["camera"]["pixel_pitch"]
-            for name in IOP_NAMES:
-                sd = interior.get(f"sd_{name}")
-                if sd is None:
-                    rows.append((name, f"{plain(interior[name], UNITS[name], 6)} (held)", ""))
-                    continue
-                px = (
-                    with_sd(interior[name] / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
-                )
-                rows.append((name, with_sd(interior[name], sd, UNITS[name]), px))
+            table = interior_table(self.photographs, self.file.sensor, str)
+            rows = [("", *table.headings[1:]), *table.rows]
             width = [max(len(row[k]) for row in rows) for k in range(3)]
             lines += [
                 "  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows

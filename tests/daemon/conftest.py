@@ -208,7 +208,7 @@ def make_recording(
             reading = {"temperature": round(temperature * 16) / 16}
             yield Epoch(k + 1, time_s, time_s + 0.001, reading, observations=seen)
 
-    channels = {"temperature": Channel("degC", 0.0625)}
+    channels = {"temperature": Channel(0.0625)}
     head = Head("small", "M1", interval, CameraSpec("rpi", model.sensor, 3.04), channels)
     write_recording(path, head, field, generate())
     return path

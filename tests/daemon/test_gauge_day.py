@@ -65,7 +65,7 @@ def record(folder: Path, first_s: float, rng: np.random.Generator) -> Path:
             yield Epoch(k + 1, time_s, time_s, {"temperature": reading}, observations=seen)
 
     spec = CameraSpec("gauge", MODEL.sensor, 3.04)
-    head = Head("day", "M1", PERIOD_S, spec, {"temperature": Channel("degC", 0.01)})
+    head = Head("day", "M1", PERIOD_S, spec, {"temperature": Channel(0.01)})
     write_recording(folder, head, FIELD, epochs())
     return folder
 

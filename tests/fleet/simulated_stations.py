@@ -44,7 +44,7 @@ class Writer:
             [f"t{i}" for i in range(TARGETS)], rng.uniform(0, 2000, (TARGETS, 3)), 0.02
         )
         camera = CameraSpec("rpi", Sensor(3280, 2464, 0.00112), 3.04)
-        head = Head("watch", "watch", INTERVAL_S, camera, {"temperature": Channel("degC", 0.0625)})
+        head = Head("watch", "watch", INTERVAL_S, camera, {"temperature": Channel(0.0625)})
         self.series = self.store.create_series(head, field, created_utc=START)
 
     def write(self, epoch: int) -> None:

@@ -60,7 +60,7 @@ def test_server_and_store_give_the_same(filled, server, make_result):
         assert np.array_equal(found.testfield.points, series.testfield.points)
         with ServerStore(address(server)) as another:
             assert another.series_columns(found, ["epoch"])["epoch"].tolist() == [*range(1, 21)]
-        names = [*["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels], "blur"]
+        names = [*COLUMN_NAMES, *series.head.channels, "blur"]
         mine, theirs = store.series_columns(series, names), there.series_columns(found, names)
         for name in names:
             assert np.array_equal(mine[name], theirs[name], equal_nan=name != "status"), name

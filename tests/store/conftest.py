@@ -33,7 +33,7 @@ def field() -> TestField:
 @pytest.fixture
 def head() -> Head:
     camera = CameraSpec("rpi", Sensor(3280, 2464, 0.00112), 3.04)
-    channels = {"temperature": Channel("degC", 0.0625), "board_temperature": Channel()}
+    channels = {"temperature": Channel(0.0625), "board_temperature": Channel()}
     return Head("small", "M1", 10.0, camera, channels)
 
 

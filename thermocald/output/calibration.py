@@ -21,7 +21,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, pro
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
     from thermocald.arrays import Array
@@ -38,7 +38,7 @@ _FEW_NAMES = 3  # for which a legend or a line has room
 def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
     """Return the report as HTML text."""
     posed = [p for p in result.photographs if len(p.points)]
-    tables = (_interior(result, sensor), _correlations(result))
+    tables = (interior_table(result, sensor), _correlations(result))
     sections = (
         Section("Residuals and coverage", figures=_figures(posed, sensor) if posed else ()),
         Section("Interior orientation", tables=tuple(t for t in tables if t.rows)),
@@ -195,7 +195,9 @@ def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> Figure:
     )  # fmt: skip
 
 
-def _interior(result: Photographs, sensor: Sensor) -> Table:
+def interior_table(
+    result: Photographs, sensor: Sensor, label: Callable[[str], str] = parameter_label
+) -> Table:
     """Return the values with their standard deviations, c, x0 and y0 in px too."""
     values = () if result.interior is None else result.interior.as_array()
     sds = np.sqrt(np.diag(result.covariance)[:10])
@@ -203,9 +205,9 @@ def _interior(result: Photographs, sensor: Sensor) -> Table:
     pitch = sensor.pixel_pitch
     rows = [
         (
-            parameter_label(n),
+            label(n),
             with_sd(v, sd, UNITS[n]) if sd > 0 else f"{plain(v, UNITS[n], 6)} (held)",
-            with_sd(v / pitch, sd / pitch, "px") if sd > 0 and n in ("c", "x0", "y0") else "",
+            with_sd(v / pitch, sd / pitch) if sd > 0 and n in ("c", "x0", "y0") else "",
         )
         for n, v, sd in zip(IOP_NAMES, values, sds, strict=False)
     ]

@@ -134,7 +134,7 @@ class Simulation:
             self.programme.interval,
             CameraSpec(self.device.name, sensor, float(round(self.model.interior.c, 2))),
             {
-                name: Channel("degC", t.resolution or None)
+                name: Channel(t.resolution or None)
                 for name, t in self.device.thermometers.items()
             },
             {"simulated": {"model": self.model.name, "version": self.model.version,

@@ -39,14 +39,19 @@ _EPOCH: tuple[tuple[str, tuple[str, str]], ...] = (
 )
 EPOCH_TEXTS = tuple(name for name, types in _EPOCH if types == _TEXT)
 EPOCH_NUMBERS = tuple(name for name, types in _EPOCH if types != _TEXT)
-COLUMN_NAMES = tuple(
-    name.replace("centre_", "") for name in EPOCH_NUMBERS if name not in ("revision", "measured")
+_INTERNAL = ("number", "revision", "measured")
+COLUMN_NAMES = (
+    "epoch",
+    *(name.replace("centre_", "") for name in EPOCH_NUMBERS if name not in _INTERNAL),
+    "status",
 )
-"""The numbers of an epoch by the names that the program uses."""
+"""The columns over a series by the names that the program uses."""
 
 
 def sql_name(name: str) -> str:
-    """Return the column of a number: SQL ignores case, and X0 must differ from x0."""
+    """Return the column in the tables: SQL ignores case, and X0 must differ from x0."""
+    if name == "epoch":
+        return "number"
     return f"{name[:-2]}centre_{name[-2:]}" if name[-2:] in ("X0", "Y0", "Z0") else name
 
 

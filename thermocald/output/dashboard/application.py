@@ -117,6 +117,7 @@ def _metrics(request: Request) -> Response:
 
 _STATIC = Path(__file__).parent / "static"
 _FILES = {
+    "index.html": "text/html",
     "page.js": "text/javascript; charset=utf-8",
     "page.css": "text/css; charset=utf-8",
     "icon.svg": "image/svg+xml",
@@ -145,7 +146,7 @@ def build_application(
     """
     application = Starlette(
         routes=[
-            Route("/", _page),
+            Route("/", _static),
             Route("/static/plotly.js", _plotly),
             Route("/static/{name}", _static),
             Route("/api/stream", _stream),
@@ -250,12 +251,8 @@ def _view(request: Request) -> View:
     return view
 
 
-def _page(_: Request) -> Response:
-    return Response((_STATIC / "index.html").read_bytes(), media_type="text/html")
-
-
 def _static(request: Request) -> Response:
-    name = request.path_params["name"]
+    name = request.path_params.get("name", "index.html")
     if name not in _FILES:
         raise DataError("there is no such file")
     return Response((_STATIC / name).read_bytes(), media_type=_FILES[name])

@@ -107,28 +107,28 @@ def insert_row(connection: sqlite3.Connection, table: str, row: Mapping[str, Any
 
 def examined_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
-) -> Iterator[tuple[dict[str, Any], StoreError | None]]:
-    """Yield rows as {column: value}, each with the error of its damage or None."""
+) -> Iterator[dict[str, Any]]:
+    """Yield rows as {column: value}, each with its `damage`, a sentence or empty."""
     names, count = ROW[table], len(KEPT[table][0])
     key = "number" if table == "epoch" else "id"
     select = f"SELECT {', '.join(f'{table}.{name}' for name in names)} FROM {table} {condition}"
     for found in connection.execute(select, values):
-        row, damage = dict(zip(names, found, strict=True)), None
+        row = dict(zip(names, found, strict=True), damage="")
         try:
             what = f"{table} {row[key]}"
             require_checksum(row["checksum"], what, found[:count], found[count:-1])
         except DamageError as error:
-            damage = error
-        yield row, damage
+            row["damage"] = str(error)
+        yield row
 
 
 def read_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
     """Yield rows as {column: value}. Raises DamageError for a damaged row."""
-    for row, damage in examined_rows(connection, table, condition, values):
-        if damage is not None:
-            raise damage
+    for row in examined_rows(connection, table, condition, values):
+        if row["damage"]:
+            raise DamageError(row["damage"])
         yield row
 
 

@@ -489,19 +489,18 @@ def examine(connection: sqlite3.Connection) -> Examination:
 def whole_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
-    """Yield rows of a table in KEPT as {column: value}, damaged ones too.
+    """Yield rows of a table in KEPT as `examined_rows` does.
 
-    An epoch also has `covariance` and `observations`, packed bytes or None. Every row has `damage`,
-    a sentence or empty.
+    An epoch also has `covariance` and `observations`, packed bytes or None.
     """
-    for row, damage in examined_rows(connection, table, condition, values):
-        if table == "epoch" and damage is None:
+    for row in examined_rows(connection, table, condition, values):
+        if table == "epoch" and not row["damage"]:
             try:
                 covariance, observations = read_details(connection, row)
                 row |= {"covariance": covariance or None, "observations": observations or None}
             except StoreError as error:
-                damage = error
-        yield {**row, "damage": "" if damage is None else str(damage)}
+                row["damage"] = str(error)
+        yield row
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,7 +60,6 @@ log = logging.getLogger(__name__)
 _EPOCHS_AT_ONCE = 100
 _READINGS_AT_ONCE = 1000
 _CLAIMED_BUSY_MS = 500
-_DERIVED = ("epoch", "status")
 
 
 class Store(SeriesReader):
@@ -221,7 +220,7 @@ class Store(SeriesReader):
                     yield LoggedReading(name, row["utc"], values, trusted)
             if len(page) < _READINGS_AT_ONCE:
                 return
-            after = page[-1][0]["id"]
+            after = page[-1]["id"]
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """Return the events of one series, or of all, oldest first."""
@@ -286,8 +285,7 @@ class Store(SeriesReader):
         found = replace(found, damaged=tuple(damaged), unfinished=tail.unfinished)
         if not found.damaged:
             for series in self.all_series():
-                names = ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
-                self.series_columns(series, names)
+                self.series_columns(series, [*COLUMN_NAMES, *series.head.channels])
             self.events()
         return found
 
@@ -355,7 +353,7 @@ class Store(SeriesReader):
         blur. Raises StoreError if the number is not above the last one, StoreFullError if the disk
         is full; nothing of the epoch is then stored. An epoch without observations is smaller.
         """
-        if taken := {*COLUMN_NAMES, *_DERIVED, *series.head.channels} & set(extra or ()):
+        if taken := {*COLUMN_NAMES, *series.head.channels} & set(extra or ()):
             raise StoreError(f"an extra column cannot be called {min(taken)!r}")
         stored = StoredEpoch(
             epoch, result or EpochResult(NOT_CALIBRATED), extra or {}, clock_trusted, 0
@@ -463,19 +461,17 @@ class Store(SeriesReader):
                 raise
 
 
-def _intact(rows: Iterable[tuple[dict[str, Any], StoreError | None]]) -> Iterator[dict[str, Any]]:
+def _intact(rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Yield undamaged rows; skip others with a warning, since no result depends on them."""
-    for row, damage in rows:
-        if damage is None:
-            yield row
+    for row in rows:
+        if row["damage"]:
+            log.warning("%s; it is skipped", row["damage"])
         else:
-            log.warning("%s; it is skipped", damage)
+            yield row
 
 
 def _chunk_name(name: str, series: StoredSeries) -> str:
     """Return the name in chunks of a column, given its public name."""
-    if name == "epoch":
-        return "number"
-    if name in COLUMN_NAMES or name == "status":
+    if name in COLUMN_NAMES:
         return sql_name(name)
     return f"temperatures.{name}" if name in series.head.channels else f"extra.{name}"

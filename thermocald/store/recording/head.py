@@ -22,9 +22,8 @@ _LONGEST_NAME = 200
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A temperature column: its unit, always degC, and the thermometer's resolution in K."""
+    """A temperature column, °C: the thermometer's resolution, K, None if unknown."""
 
-    unit: str = "degC"
     resolution: float | None = None
 
 
@@ -120,13 +119,12 @@ def _channels(top: _Reader) -> dict[str, Channel]:
         if value is not None and not isinstance(value, dict):
             raise reader.fail(name, "must hold `unit: degC, resolution: …`")
         inner = _Reader(top._path, value or {}, f"temperatures.{name}.")
-        unit = inner.text("unit", "degC")
-        if unit != "degC":
+        if (unit := inner.text("unit", "degC")) != "degC":
             raise inner.fail("unit", f"is {unit!r}; temperatures must be in degC: convert them")
         resolution = None
         if inner.mapping.get("resolution") is not None:
             resolution = inner.number("resolution", "K", above=0.0, low=1e-6, high=100.0)
-        channels[name] = Channel(unit, resolution)
+        channels[name] = Channel(resolution)
     return channels
 
 
@@ -139,7 +137,7 @@ def head_document(head: Head) -> dict[str, Any]:
         "interior": interior and asdict(interior),
     }  # fmt: skip
     temperatures = {
-        name: _known({"unit": channel.unit, "resolution": channel.resolution})
+        name: _known({"unit": "degC", "resolution": channel.resolution})
         for name, channel in head.channels.items()
     }
     document = {

@@ -180,10 +180,8 @@ def _expression(name: str, series: StoredSeries) -> Composable:
 
     if name == "status":
         return sql.SQL("string_agg(status, chr(10))")
-    if name == "epoch":
-        number: Composable = sql.SQL("number")
-    elif name == "clock_trusted":
-        number = sql.SQL("clock_trusted::int")
+    if name == "clock_trusted":
+        number: Composable = sql.SQL("clock_trusted::int")
     elif name in COLUMN_NAMES:
         number = sql.Identifier(sql_name(name))
     else:

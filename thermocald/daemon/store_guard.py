@@ -32,7 +32,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from thermocald.epoch import Epoch
@@ -291,7 +291,8 @@ class StoreGuard:
                 self._series_store = self.store
                 self._series.clear()
             if key not in self._series:
-                self._series[key] = self.find(*key) or self.store.create_series(
+                stored = self.store.series_of(*key)
+                self._series[key] = stored or self.store.create_series(
                     wanted.head,
                     wanted.testfield,
                     start=wanted.start,
@@ -308,15 +309,20 @@ class StoreGuard:
         with self._lock:
             return list(self.store.epochs(series, first, last, details=details))
 
-    def last_epoch(self, series: StoredSeries) -> int:
-        """Return the number of the last stored epoch, 0 if there is none."""
+    def last_epoch(self, series: StoredSeries, *, waiting: bool = True) -> int:
+        """Return the number of the last epoch that is stored or waits, 0 if there is none."""
         with self._lock:
-            return self.store.last_epoch(series) or 0
+            rows = self._waiting_of(series.camera, series.name) if waiting else ()
+            return max(self.store.last_epoch(series) or 0, *(r.epoch.number for r in rows), 0)
 
     def find(self, camera: str, name: str) -> StoredSeries | None:
-        """Return a camera's series of this name, None if there is none."""
+        """Return a camera's series of this name, also one whose rows wait; None without one."""
         with self._lock:
-            return self.store.series_of(camera, name)
+            waiting = (row.series for row in self._waiting_of(camera, name))
+            return self.store.series_of(camera, name) or next(waiting, None)
+
+    def _waiting_of(self, camera: str, name: str) -> Iterator[Row]:
+        return (r for r in self._waiting if (r.series.camera, r.series.name) == (camera, name))
 
     def stored_events(self) -> list[Event]:
         """Return all events in the store, oldest first."""

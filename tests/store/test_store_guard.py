@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import threading
 import time
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import pytest
 
 from thermocald.daemon.store_guard import Row, StoreGuard
 from thermocald.errors import StoreBusyError
+from thermocald.store.database.store import Store
 
 
 def test_a_row_that_found_no_room_waits(tmp_path, head, field, make_epoch, make_result):
@@ -81,6 +83,17 @@ def test_a_lock_of_another_program_is_waited_for_and_loses_nothing(guard, keep, 
     guard.flush()
     assert (guard.away, guard.lost, guard.waiting) == ("", 0, 0)
     assert numbers(guard) == [*range(1, 11)]
+
+
+def test_at_the_end_a_lock_is_waited_for(guard, keep):
+    other = sqlite3.connect(guard.path, isolation_level=None, check_same_thread=False)
+    other.execute("BEGIN IMMEDIATE")
+    keep(1)
+    threading.Timer(1.5, other.close).start()
+    guard.close()
+    assert guard.lost == 0
+    with Store.open(guard.path) as store:
+        assert store.last_epoch(store.find_series()) == 1
 
 
 def test_numbers_go_on_after_the_rows_that_wait(guard, keep, monkeypatch, head, field):

@@ -219,6 +219,7 @@ _ENOUGH_BYTES = 20_000_000
 _MOST_WITH_OBSERVATIONS = 100
 _MOST_WAITING = 20_000
 _FLUSH_S = 5.0  # of writing what waited, then others get their turn: the watchdog does not wait
+_LAST_WAIT_S = 15.0  # for a lock, when the daemon is stopped
 _TELL_EVERY_S = 60.0  # losses are reported this often
 
 
@@ -258,6 +259,7 @@ class StoreGuard:
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
         self._retry_at = -math.inf
+        self._locked = False  # whether it is away because another program locks it
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
         self._series_store: Store | None = None  # the store of `_series`
@@ -274,9 +276,12 @@ class StoreGuard:
         return len(self._waiting)
 
     def close(self) -> None:
-        """Try once more to store what waits, then close."""
+        """Try once more to store what waits, also for a lock to end, then close."""
+        deadline = time.monotonic() + _LAST_WAIT_S
         with self._lock:
             self.flush(math.inf)
+            while self._waiting and self._locked and time.monotonic() < deadline:
+                self.flush(math.inf)  # each waits for the lock for a while
             if self._waiting:
                 first, count = self._waiting[0].epoch.number, len(self._waiting)
                 self.lose(f"epoch {first}{' and later' if count > 1 else ''}: {self.away}", count)
@@ -486,6 +491,7 @@ class StoreGuard:
         self.away = str(error)
 
     def _hold_back(self, error: StoreError) -> None:
+        self._locked = isinstance(error, StoreBusyError)
         self._mark_out(error, self._waiting[0].epoch.frame_time)
         self._limit_waiting()
 

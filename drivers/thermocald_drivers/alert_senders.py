@@ -281,7 +281,9 @@ class MailAlert(AlertOutput):
                     server.login(o.username, password)
                 if letter is not None:
                     server.send_message(letter)
-        except smtplib.SMTPAuthenticationError:
+        except smtplib.SMTPAuthenticationError as error:
+            if error.smtp_code < 500:
+                raise DeviceGone(f"{self.where}: cannot check the password now") from None
             raise DeviceDenied(
                 f"{self.where}: rejects the password; check username and password_file"
             ) from None

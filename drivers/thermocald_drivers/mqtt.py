@@ -55,6 +55,8 @@ if TYPE_CHECKING:
 
     from thermocald_drivers.alert import Alert
 
+_NOT_YET_VALID = 9  # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID
+_UNAVAILABLE = 136  # MQTT's reason code of a broker that starts or is busy
 SENSORS: Mapping[str, tuple[str, str | None, str | None, int | None]] = {
     # column of the result: (name, unit, Home Assistant's device class, decimals shown)
     "temperature": ("Temperature", "°C", "temperature", 2),
@@ -186,7 +188,9 @@ class _Broker(Output):
         try:
             client.connect(self.options.host, self.port, keepalive=30)
         except ssl.SSLCertVerificationError as error:
-            raise DeviceDenied(f"{self.where}: {support.reason(error)}; check ca") from error
+            # a clock without a battery is before the certificate's time until it is set
+            kind = DeviceGone if error.verify_code == _NOT_YET_VALID else DeviceDenied
+            raise kind(f"{self.where}: {support.reason(error)}; check ca") from error
         except (OSError, ValueError) as error:
             why = support.reason(error)
             raise DeviceGone(f"{self.where}: cannot connect ({why})") from error
@@ -200,6 +204,8 @@ class _Broker(Output):
             raise DeviceTimeout(f"{self.where}: {why}") from None
         if code.is_failure:
             _Broker.close(self)
+            if code.value == _UNAVAILABLE:
+                raise DeviceGone(f"{self.where}: {code}")
             why = f"refused the connection ({code}); check username and password_file"
             raise DeviceDenied(f"{self.where}: {why}")
 

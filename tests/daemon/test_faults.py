@@ -14,9 +14,12 @@ import pytest
 
 from tests.daemon.conftest import make_photographs
 from tests.marks import mostly_slow
+from thermocald.config import load_config
 from thermocald.daemon.plan import recording_config
 from thermocald.daemon.service import Service
+from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
+from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
 
 
@@ -219,6 +222,32 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
             numbers = store.series_columns(series, ["epoch"])["epoch"].tolist()
             assert numbers == list(range(1, len(numbers) + 1))
     assert daemon.events().count("reload_failed") == 1
+
+
+def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
+    daemon, measured, monkeypatch
+):
+    """It went on without any device, and looked healthy."""
+    daemon.configure(**measured)
+    service = Service(load_config(daemon.config), daemon.config, on_turn=lambda _: reload())
+    turns, built = [], []
+
+    def reload():
+        turns.append(True)
+        if len(turns) == 1:
+            daemon.configure(**measured, logging={"level": "error"})
+            service._reload = True
+        return len(turns) > 20
+
+    def build(*arguments):
+        built.append(True)
+        if len(built) == 3:  # after the first and the one that is only a trial
+            raise StoreError("its disk is gone")
+        return Station(*arguments)
+
+    monkeypatch.setattr("thermocald.daemon.service.Station", build)
+    with pytest.raises(StoreError, match="disk is gone"):
+        service.run()
 
 
 def test_a_reload_opens_a_failed_device_also_without_a_change(daemon, devices, recording, tmp_path):

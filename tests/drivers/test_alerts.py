@@ -11,7 +11,13 @@ import pytest
 from tests.drivers.fakes.alert_servers import MailServer, WebServer
 from tests.drivers.fakes.certificate import own_context
 from tests.drivers.fakes.mqtt_broker import Broker
-from thermocald.errors import ConfigurationError, DeviceDenied, DeviceError, DeviceTimeout
+from thermocald.errors import (
+    ConfigurationError,
+    DeviceDenied,
+    DeviceError,
+    DeviceGone,
+    DeviceTimeout,
+)
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 
@@ -151,9 +157,10 @@ def test_a_letter_by_starttls(start, tmp_path):
     assert "Subject: [thermocald] alert: cam: c is 0.8 px from the start" in letter
     assert all(secure for _, secure in server.logins)
     assert server.logins
-    server.refuse_login = True
-    with pytest.raises(DeviceDenied, match="password"):
-        device.open()
+    for answer, error in (("454 later", DeviceGone), ("535 no", DeviceDenied)):
+        server.login_answer = answer
+        with pytest.raises(error, match="password"):
+            device.open()
     del options["ca"]
     with pytest.raises(DeviceError, match=r"certificate|CERTIFICATE"):
         open_device("output", "alert_mail", options, VirtualClock()).open()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import ssl
 import time
 
 import pytest
@@ -73,6 +74,28 @@ def test_a_wrong_password(broker):
     broker.refuse = 5
     with pytest.raises(DeviceDenied, match="check username"):
         output(broker).open()
+
+
+def test_a_broker_that_only_starts_is_asked_again(broker):
+    broker.refuse = 3
+    with pytest.raises(DeviceGone, match="Server unavailable"):
+        output(broker).open()
+
+
+def test_a_certificate_is_not_yet_valid_until_the_clock_is_set(broker, monkeypatch):
+    """A Raspberry Pi without a battery boots before the certificate's time."""
+    error = ssl.SSLCertVerificationError(1, "certificate verify failed")
+    error.verify_code, error.verify_message = 9, "certificate is not yet valid"
+
+    def refuse(*_, **__):
+        raise error
+
+    monkeypatch.setattr("paho.mqtt.client.Client.connect", refuse)
+    with pytest.raises(DeviceGone, match="not yet valid"):
+        output(broker, tls=True).open()
+    error.verify_code = 10
+    with pytest.raises(DeviceDenied, match="check ca"):
+        output(broker, tls=True).open()
 
 
 def test_a_broker_that_hangs_at_the_beginning(broker):

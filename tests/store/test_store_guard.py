@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import threading
 import time
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import pytest
 
 from thermocald.daemon.store_guard import Row, StoreGuard
 from thermocald.errors import StoreBusyError
+from thermocald.store.database.store import Store
 
 
 def test_a_row_that_found_no_room_waits(tmp_path, head, field, make_epoch, make_result):
@@ -81,6 +83,37 @@ def test_a_lock_of_another_program_is_waited_for_and_loses_nothing(guard, keep, 
     guard.flush()
     assert (guard.away, guard.lost, guard.waiting) == ("", 0, 0)
     assert numbers(guard) == [*range(1, 11)]
+
+
+def test_at_the_end_a_lock_is_waited_for(guard, keep):
+    other = sqlite3.connect(guard.path, isolation_level=None, check_same_thread=False)
+    other.execute("BEGIN IMMEDIATE")
+    keep(1)
+    threading.Timer(1.5, other.close).start()
+    guard.close()
+    assert guard.lost == 0
+    with Store.open(guard.path) as store:
+        assert store.last_epoch(store.find_series()) == 1
+
+
+def test_numbers_go_on_after_the_rows_that_wait(guard, keep, monkeypatch, head, field):
+    """A reload or a session began anew at the last stored number, and lost all that followed."""
+    (series,) = guard.store.all_series()
+    append = guard.store.append
+    keep(1)
+    monkeypatch.setattr(guard.store, "append", lambda *_, **__: refuse())
+    keep(2)
+    keep(3)
+    other = replace(series, id=0, head=replace(head, series="new"))
+    guard.append(Row(other, guard._waiting[0].epoch, None, {}, True))
+    assert (guard.last_epoch(series), guard.last_epoch(series, waiting=False)) == (3, 1)
+    assert guard.find(other.camera, "new") == other
+    assert guard.find(other.camera, "none") is None
+    assert guard.last_epoch(other) == 2
+    monkeypatch.setattr(guard.store, "append", append)
+    guard.flush()
+    assert (guard.lost, guard.waiting) == (0, 0)
+    assert [s.name for s in guard.store.all_series()] == [series.name, "new"]
 
 
 def test_a_row_that_cannot_be_written_at_all_is_lost_and_stops_nothing(guard, keep):

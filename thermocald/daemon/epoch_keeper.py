@@ -212,7 +212,7 @@ class EpochKeeper:
         first = self._searched_to + 1
         if series is None or first >= below:
             return False
-        end = min(below - 1, self._guard.last_epoch(series))
+        end = min(below - 1, self._guard.last_epoch(series, waiting=False))
         if end < first:
             return False
         last = min(end, first + _CATCH_UP_BATCH - 1)

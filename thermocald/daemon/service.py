@@ -339,6 +339,8 @@ class Service:
         try:
             text = self._apply_configuration()
         except ThermocaldError as error:
+            if self._station.stopped:
+                raise  # a daemon that takes nothing would look healthy: a restart may help
             text = f"the configuration cannot be reloaded, the old one stays in force: {error}"
             log.error("%s", text, extra={"event": "reload_failed"})
             self._record("reload_failed", str(error))

@@ -96,6 +96,11 @@ class Station:
         self._retention.join(1.0)
         return done
 
+    @property
+    def stopped(self) -> bool:
+        """Whether it was told to stop; it cannot be started again."""
+        return self._stop.is_set()
+
     def stalled(self) -> list[str]:
         """Return a sentence for each device and pipeline that hangs."""
         busy = [(loop.link.called, loop.busy_s()) for loop in self._loops]

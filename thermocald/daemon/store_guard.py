@@ -32,7 +32,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from thermocald.epoch import Epoch
@@ -219,6 +219,7 @@ _ENOUGH_BYTES = 20_000_000
 _MOST_WITH_OBSERVATIONS = 100
 _MOST_WAITING = 20_000
 _FLUSH_S = 5.0  # of writing what waited, then others get their turn: the watchdog does not wait
+_LAST_WAIT_S = 15.0  # for a lock, when the daemon is stopped
 _TELL_EVERY_S = 60.0  # losses are reported this often
 
 
@@ -258,6 +259,7 @@ class StoreGuard:
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
         self._retry_at = -math.inf
+        self._locked = False  # whether it is away because another program locks it
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
         self._series_store: Store | None = None  # the store of `_series`
@@ -274,9 +276,12 @@ class StoreGuard:
         return len(self._waiting)
 
     def close(self) -> None:
-        """Try once more to store what waits, then close."""
+        """Try once more to store what waits, also for a lock to end, then close."""
+        deadline = time.monotonic() + _LAST_WAIT_S
         with self._lock:
             self.flush(math.inf)
+            while self._waiting and self._locked and time.monotonic() < deadline:
+                self.flush(math.inf)  # each waits for the lock for a while
             if self._waiting:
                 first, count = self._waiting[0].epoch.number, len(self._waiting)
                 self.lose(f"epoch {first}{' and later' if count > 1 else ''}: {self.away}", count)
@@ -291,7 +296,8 @@ class StoreGuard:
                 self._series_store = self.store
                 self._series.clear()
             if key not in self._series:
-                self._series[key] = self.find(*key) or self.store.create_series(
+                stored = self.store.series_of(*key)
+                self._series[key] = stored or self.store.create_series(
                     wanted.head,
                     wanted.testfield,
                     start=wanted.start,
@@ -308,15 +314,20 @@ class StoreGuard:
         with self._lock:
             return list(self.store.epochs(series, first, last, details=details))
 
-    def last_epoch(self, series: StoredSeries) -> int:
-        """Return the number of the last stored epoch, 0 if there is none."""
+    def last_epoch(self, series: StoredSeries, *, waiting: bool = True) -> int:
+        """Return the number of the last epoch that is stored or waits, 0 if there is none."""
         with self._lock:
-            return self.store.last_epoch(series) or 0
+            rows = self._waiting_of(series.camera, series.name) if waiting else ()
+            return max(self.store.last_epoch(series) or 0, *(r.epoch.number for r in rows), 0)
 
     def find(self, camera: str, name: str) -> StoredSeries | None:
-        """Return a camera's series of this name, None if there is none."""
+        """Return a camera's series of this name, also one whose rows wait; None without one."""
         with self._lock:
-            return self.store.series_of(camera, name)
+            waiting = (row.series for row in self._waiting_of(camera, name))
+            return self.store.series_of(camera, name) or next(waiting, None)
+
+    def _waiting_of(self, camera: str, name: str) -> Iterator[Row]:
+        return (r for r in self._waiting if (r.series.camera, r.series.name) == (camera, name))
 
     def stored_events(self) -> list[Event]:
         """Return all events in the store, oldest first."""
@@ -480,6 +491,7 @@ class StoreGuard:
         self.away = str(error)
 
     def _hold_back(self, error: StoreError) -> None:
+        self._locked = isinstance(error, StoreBusyError)
         self._mark_out(error, self._waiting[0].epoch.frame_time)
         self._limit_waiting()
 

@@ -65,7 +65,7 @@ class MailServer(_Started):
     """The part of SMTP that smtplib uses; `letters` holds the text of each e-mail."""
 
     def __init__(self, port=0, context=None):
-        self.letters, self.logins, self.refuse_login = [], [], False
+        self.letters, self.logins, self.login_answer = [], [], "235 yes"
         outer = self
 
         class Handler(socketserver.StreamRequestHandler):
@@ -89,7 +89,7 @@ class MailServer(_Started):
                         secure = True
                     elif word == "AUTH":
                         outer.logins.append((words, secure))
-                        self.say("535 no" if outer.refuse_login else "235 yes")
+                        self.say(outer.login_answer)
                     elif word == "DATA":
                         self.say("354 go on")
                         lines = []

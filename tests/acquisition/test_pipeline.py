@@ -198,6 +198,15 @@ def test_the_nearest_reading_is_taken_and_a_stale_one_is_not(housing):
     assert housing.nearest("housing", 35.1) is None
 
 
+def test_a_channel_that_is_missing_is_logged_once_and_in_the_status(housing, caplog):
+    for k in range(3):
+        housing.add("housing", Reading({"lens": 20.0}, k, k, {"air": "an open wire"}))
+    assert caplog.text.count("an open wire") == 1
+    assert housing.missing("housing") == ["an open wire"]
+    housing.add("housing", Reading({"lens": 20.0, "air": 5.0}, 9.0, 9.0))
+    assert housing.missing("housing") == []
+
+
 def test_a_reading_that_is_being_taken_is_waited_for(housing):
     housing.add("housing", reading(0.0))
     late = threading.Timer(0.05, lambda: housing.add("housing", reading(10.4)))

@@ -18,6 +18,7 @@ import numpy as np
 from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import seconds
 from thermocald.errors import DataError, UsageError
+from thermocald.figures import BAND
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
@@ -220,8 +221,18 @@ class ModelledCamera:
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance of the parameters: the file's matrix, or its sds uncorrelated."""
-        return self.model.covariance_of(self.parameters)
+        """The covariance of the parameters: the file's matrix, or its sds uncorrelated.
+
+        That of a type is widened so that 95 % of further cameras are within 1.96 sds: the scatter
+        of few specimens is itself uncertain (Student's t).
+        """
+        covariance: Array = self.model.covariance_of(self.parameters)
+        specimens = sum("camera" in fit for fit in self.model.fitted_on)
+        if specimens > 1:
+            from scipy.special import stdtrit
+
+            covariance = covariance * (float(stdtrit(specimens - 1, 0.975)) / BAND) ** 2
+        return covariance
 
     @cached_property
     def validity(self) -> Validity | None:

@@ -168,7 +168,7 @@ def delay(draws: int, rng: np.random.Generator) -> list[Row]:
             late = float(rng.uniform(-90.0, 90.0))
             source = read_apart(s, late, interval)
             f = fitted(source, ModelEffect("time_offset", {"d": 0.0}))
-            if "read_seldom" in f.fitted:
+            if {"read_seldom", "read_poorly"} & set(f.fitted):
                 continue
             shift.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
             rate.append(rate_errors(f, s))

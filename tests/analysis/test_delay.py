@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from benchmarks.audit_thermal import fitted, rate_errors, read_apart, simulated, switched
+from benchmarks.audit_thermal import fitted, rate_errors, read_apart, seen, simulated, switched
 from tests.marks import mostly_slow
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.noise import calibrate_thermometers
@@ -51,6 +53,36 @@ def test_a_wrong_clock_with_any_interval_of_readings(interval):
     assert np.max(np.abs(off)) < 3.5
     # the RMS of twelve draws scatters by 0.2
     assert np.sqrt(np.mean(np.square(off))) < 1.6
+
+
+def read_with(s, noise_k):
+    source, rng = seen(s), np.random.default_rng([s.seed, 3])
+    poor = {n: r + rng.normal(0, noise_k, len(r)) for n, r in source.readings.items()}
+    return replace(source, readings=poor, resolutions=dict.fromkeys(poor))
+
+
+def test_a_delay_by_a_thermometer_of_1_k():
+    """Where frames are half-way between readings, its sd was a tenth of its error."""
+    off = {}
+    for seed in range(9106, 9118):
+        true = float(np.random.default_rng([seed, 4]).uniform(-25, 25))
+        s = simulated(seed, (replace(DELAY, values={"d": true}),))
+        f = fitted(read_with(s, 1.0), DELAY)
+        if "read_poorly" not in f.fitted:
+            off[seed] = (f.model.effects[0].values["d"] - true) / f.model.sd("time_offset.d")
+    assert len(off) >= 8
+    assert np.max(np.abs(list(off.values()))) < 3.0, off
+
+
+@pytest.mark.parametrize("noise_k", [0.05, 1.0])
+def test_a_gradient_by_a_poor_thermometer_is_doubted(noise_k):
+    """With 1 K of noise, the images alone determine it, to a tenth of the errors."""
+    gradient = ModelEffect("thermal_gradient", {"c": 2e-3, "x0": 6e-3, "y0": -4e-3})
+    f = fitted(read_with(simulated(9105, (gradient,)), noise_k), gradient)
+    assert ("read_poorly" in f.fitted) == (noise_k == 1.0)
+    assert ("thermal_gradient: the thermometer is too noisy" in " ".join(f.lines())) == (
+        noise_k == 1.0
+    )
 
 
 def test_a_lamp_switched_between_two_readings_is_no_delay():

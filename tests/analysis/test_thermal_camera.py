@@ -9,8 +9,8 @@ import pytest
 
 import thermocald as tc
 from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.analysis.thermal.modelled_camera import ExtrapolationWarning
 from thermocald.analysis.thermal.predictions import predict_along, warm_up
-from thermocald.analysis.thermal.steady import ExtrapolationWarning
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays

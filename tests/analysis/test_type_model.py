@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.thermal.camera_fit import shrink_to_type, type_model
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics.model import ModelEffect, ThermalModel
@@ -67,6 +68,21 @@ def test_the_type_improves_a_camera_measured_at_few_temperatures():
     assert found.evidence["shrunk_to_type"] == "rpi-v2.1"
     assert found.camera == "cam0"
     assert found.validity == new.validity
+
+
+@pytest.mark.parametrize("specimens", [2, 3])
+def test_a_further_camera_of_a_type_of_few(specimens):
+    """95 % are within 1.96 sds of a prediction; with the scatter as it is, 70 and 82 %."""
+    rng, within = np.random.default_rng(10), []
+    for _ in range(200):
+        true, fleet = cameras(rng, specimens + 1, 0.1)
+        kind = ThermalCamera(type_model(fleet[1:], "rpi"))
+        for temperature in (25.0, 40.0):
+            state = kind.at(temperature)
+            c = true[0, 0] + (temperature - 25.0) * true[0, 1]
+            within.append(abs(state.interior.c - c) < 1.96 * state.sd["c"])
+    # two temperatures share the level: 400 decisions scatter by 0.015
+    assert np.mean(within) == pytest.approx(0.95, abs=0.04)
 
 
 def test_models_of_different_kinds_are_refused():

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from thermocald.acquisition.calibrator import Calibrator
 from thermocald.config import parse_config
 from thermocald.daemon.plan import demo_config
 from thermocald.daemon.service import Service
-from thermocald.hal import VirtualClock
+from thermocald.epoch import Epoch
+from thermocald.hal import VirtualClock, open_device
 from thermocald.names import channel_fault
 from thermocald.store.database.store import Store
 
@@ -75,3 +77,18 @@ def test_a_camera_that_repeats_its_frame_is_reported_once(run):
         assert seen == [status == "ok" for status in statuses]
         (frozen,) = [event for event in store.events() if event.kind == "frozen"]
     assert "its last 3 frames are identical" in frozen.text
+
+
+def test_a_uniform_area_shows_no_target(small_camera, small_field):
+    """As below the damage of a JPEG. Regression: a grey frame was `ok`, with sigmas of 0."""
+    options = {"testfield": str(small_field), "model": str(small_camera)}
+    with open_device("camera", "mock", options, VirtualClock()) as camera:
+        frames = [np.array(camera.capture().image) for _ in range(4)]
+        calibrator = Calibrator(*camera.known_scene(), nominal_c=3.04)
+    middle = frames[1].shape[1] // 2
+    frames[1][:, :middle] = frames[2][:] = 128
+    epochs = [calibrator.calibrate(Epoch(k, 0.0, 0.0), frame) for k, frame in enumerate(frames)]
+    seen = [epoch.epoch.observations for epoch in epochs]
+    assert seen[1].points[:, 0].min() > middle - 2
+    assert [epoch.adjustment.status for epoch in epochs[2:]] == ["no_observations", "ok"]
+    assert len(seen[3]) > 0.9 * len(seen[0])

@@ -186,12 +186,13 @@ class Calibrator(EpochCalibrator):
                 return repeated
             if image is not None:
                 measured = self._tracker.measure(image)
-                searched = measured.searched
-                epoch = replace(epoch, observations=measured.observations)
-                extra = frame_figures(measured.observations, self.sensor)
+                searched, seen = measured.searched, measured.observations
+                # a corner in a uniform area, as of a damaged JPEG, is none: it has no residuals
+                seen = seen.select(np.flatnonzero((seen.sigmas > 0).all(axis=1)))
+                epoch = replace(epoch, observations=seen)
+                extra = frame_figures(seen, self.sensor)
                 if not measured.status.ok:
-                    status = measured.status.word, measured.status.reason
-                    bad = failed(*status, measured.observations)
+                    bad = failed(measured.status.word, measured.status.reason, seen)
                     return CalibratedEpoch(epoch, bad, extra, searched)
         except ImageError as error:
             return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)

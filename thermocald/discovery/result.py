@@ -124,7 +124,8 @@ class Discovery:
     """The result of a discovery.
 
     stages: the gap before and after each effect; base_fit, final_fit: constants from M1 alone;
-    doubts: probable mistakes in the recorded data, one sentence each.
+    doubts: probable mistakes in the recorded data, one sentence each; estimated: the
+    estimate of the effects of the catalogue from M1 alone, None if there are none.
     """
 
     verdict: str
@@ -135,6 +136,7 @@ class Discovery:
     final_fit: Fit
     cross_validation: tuple[float, float]
     doubts: tuple[str, ...] = ()
+    estimated: tuple[HypothesisFitter, Fit] | None = None
 
     def effects_with_gaps(self) -> list[tuple[EffectFound, Gap, Gap]]:
         """Return each effect with the gap in M1 before and after it, from the last stages."""
@@ -220,13 +222,16 @@ def discover_series(
         stages.append(measure_stage(x, entry.effect, fits[0], k))
     if not x.adequate:
         return _conclude_unexplained(x, fits[0], stages, n, progress)
-    estimated = estimate_first(x, fits[-1].terms)[1] if len(terms) > known else fits[-1]
+    estimated = estimate_first(x, fits[-1].terms) if len(terms) > known else None
     for k in range(known, len(terms)):
         stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
-        found.append(_describe_effect(x, fits[-1], estimated, k))
+        assert estimated is not None
+        found.append(_describe_effect(x, fits[-1], estimated[1], k))
     blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
-    return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
+    return Discovery(
+        verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks, estimated=estimated
+    )
 
 
 def estimate_first(x: Examination, terms: Sequence[Term]) -> tuple[HypothesisFitter, Fit]:
@@ -425,7 +430,9 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
     x = discovery.examination
     own = [t for t in discovery.final_fit.terms if t not in x.knocks]
     # an effect before the knocks, which may have its name
-    fitter, fit = estimate_first(x, [t for t in (*own, *x.knocks) if t.values(0) is not None])
+    terms = tuple(t for t in (*own, *x.knocks) if t.values(0) is not None)
+    known = discovery.estimated if terms == discovery.final_fit.terms else None
+    fitter, fit = known or estimate_first(x, terms)
     listed = [m for e in discovery.effects if e.term is None for m in effects_of(e)]
     found = {t.effect for t in own} | {m.name for m in listed}
     listed += [m for m in (old.effects if old else ()) if m.name not in found]

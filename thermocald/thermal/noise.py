@@ -25,7 +25,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.linalg import orthonormal_combinations, scaled_solve, symmetric_power
+from thermocald.photogrammetry.linalg import (
+    orthonormal_combinations,
+    scaled_inverse,
+    scaled_solve,
+    symmetric_power,
+)
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import detect_tremble, weight_jumps_down
@@ -38,11 +43,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.hypothesis import Fit, Term
 
 _JUMP_SD = 4.0  # standard deviations of the images' slope, from which its change is a jump
 
 _LEAST = 0.005  # least noise, as a fraction of that at T0
+
+_FEIGNED = 0.8  # of a delay's sd half an interval between readings later: a smaller one is feigned
+_BY_READINGS = 0.9  # of a rate's sd beside known readings: a smaller one comes from the images
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +261,40 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
         history = replace(e.history, readings={**e.history.readings, name: trajectory})
         out.append(replace(e, history=history, thermometers={**e.thermometers, name: new}))
     return out
+
+
+def find_poorly_read(fitter: HypothesisFitter, fit: Fit) -> list[str]:
+    """Return the effects for which the thermometer is too noisy or too coarse.
+
+    Where a delay puts the frames half-way between two readings, noise of the estimated temperature
+    along its slope seems to determine the delay; half an interval later, it does not. A rate is not
+    known better than the readings show it, however precisely the images, by what the parameters do
+    not have in common, determine the temperature. A coarse thermometer shows neither.
+    """
+
+    def sds(terms: Sequence[Term], x: Array, at: slice) -> Array:
+        normals = fitter.normal_equations(fitter.fit(terms, x, 1))[0]
+        return np.asarray(np.sqrt(np.diag(scaled_inverse(normals))[at]))
+
+    found, known = [], [e.thermometers[e.history.reference] for e in fitter.series]
+    coarse = any(k.coarse for k in known)
+    half = 0.5 * float(np.median(np.diff(known[0].times[known[0].real])))
+    for place, (i, name) in enumerate(fit.searched, len(fit.coefficients)):
+        term, at = fit.terms[i], slice(place, place + 1)
+        if term.kind.nonlinear[name].role == "delay":
+            later = term.with_value(name, float(dict(term.nonlinear)[name]) + half)
+            terms = [later if t is term else t for t in fit.terms]
+            least = _FEIGNED * sds(terms, fit.coefficients, at)
+            if coarse or sds(fit.terms, fit.coefficients, at) < least:
+                found.append(term.effect)
+    for block in fit.blocks[1:]:
+        if fit.terms[block.term].kind.follows_rate:
+            at, without = slice(block.start, block.stop), fit.coefficients.copy()
+            without[at] = 0.0
+            least = _BY_READINGS * sds(fit.terms, without, at)
+            if coarse or (sds(fit.terms, fit.coefficients, at) < least).any():
+                found.append(fit.terms[block.term].effect)
+    return found
 
 
 def _find_alike(series: ReducedSeries, ok: Mask) -> Mask:

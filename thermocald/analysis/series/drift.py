@@ -51,7 +51,7 @@ def _p_value(change: float, sd: float) -> float:
     return float(2 * ndtr(-abs(change) / sd)) if sd > 0 else 0.0
 
 
-def _slow_errors(table: Epochs) -> tuple[Array, Array]:
+def _course_of_targets(table: Epochs) -> tuple[Array, Array]:
     """Return the course (E,) of the targets' slow errors, and their variances (16,)."""
     if table.adjustment is None:
         return slow_course(len(table), 0), np.zeros(16)
@@ -67,7 +67,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """
     found, ok = [], table.ok
     time = table.frame_time[ok]
-    course, slow = _slow_errors(table)
+    course, slow = _course_of_targets(table)
     # targets' slow errors have opposite signs in the first and the last epoch
     of_targets = -2.0 * course[0] * course[-1] * slow
     for name in names:
@@ -106,7 +106,7 @@ def courses(table: Epochs) -> list[Course]:
     temperature, time = table.temperature[have], table.frame_time[have]
     if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
         warming = temperature - temperature.mean()
-        course, slow = _slow_errors(table)
+        course, slow = _course_of_targets(table)
         per_kelvin = float(warming @ course[have] / (warming @ warming))
         for name, line in lines.items():
             column = IOP_NAMES.index(name)

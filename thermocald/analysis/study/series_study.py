@@ -100,13 +100,13 @@ def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array
     return np.asarray(seen - points)
 
 
-def displacement_covariance(series: MeasuredSeries, points: Array) -> Array:
+def displacement_covariance(series: MeasuredSeries, points: Array) -> Array | None:
     """Return the covariance (k, 2, 2) px² of `image_displacement` from the first to the last epoch.
 
-    It is zero if the series has no correlations.
+    It is None, unknown, if the series has no correlations.
     """
     if not len(series.correlations):
-        return np.zeros((len(points), 2, 2))
+        return None
     scene = directions(series.sensor, series.values[0], points)
     J = partials(series.sensor, series.values[-1], np.zeros(6), scene)[1][..., :10]
     sds = np.nan_to_num(series.sds[[0, -1]])
@@ -221,7 +221,7 @@ class SeriesStudy:
 
     deviations: of the IOP, `sigma0` and the thermometers; grid, displacement (k, 2) px: image
     points of a static scene and their shifts from the first to the last epoch, y down;
-    displacement_covariance (k, 2, 2) px²: of the shifts, zero if unknown; columns,
+    displacement_covariance (k, 2, 2) px²: of the shifts, None if unknown; columns,
     matrix (n, n): Pearson's r among free IOP, sigma0 and thermometers; noise_ratio: scatter between
     neighbouring epochs over the stated standard deviations, NaN if it could not be estimated.
     """
@@ -231,7 +231,7 @@ class SeriesStudy:
     focus: FocusChange | None
     grid: Array
     displacement: Array | None
-    displacement_covariance: Array
+    displacement_covariance: Array | None
     significance: Mapping[str, Significance]
     channels: tuple[ChannelStudy, ...]
     columns: tuple[str, ...]
@@ -259,7 +259,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         if (short := [parameter_label(n) for n, d in c.dependences.items() if d.too_short])
     ]
     grid = image_grid(series.sensor)
-    displacement, covariance = None, np.zeros((len(grid), 2, 2))
+    displacement = covariance = None
     if len(series) > 1:
         try:
             displacement = image_displacement(

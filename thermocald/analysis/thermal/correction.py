@@ -55,7 +55,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
-    from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
+    from thermocald.analysis.thermal.modelled_camera import Along
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.store.logger.temperatures import TemperatureLog
 

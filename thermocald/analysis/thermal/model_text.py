@@ -84,6 +84,12 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
             "not known, and times may be wrong by several standard deviations; read the "
             "thermometer more often"
         )
+    if poorly := document.get("read_poorly"):
+        lines.append(
+            f"  {', '.join(poorly['effects'])}: the thermometer is too noisy or too coarse for the "
+            "changes between its readings: values may be wrong by several standard deviations; "
+            "use a better thermometer or heat faster"
+        )
     for effect in document["effects"]:
         parts = [
             f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"

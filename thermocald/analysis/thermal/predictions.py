@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermocald.analysis.camera.camera import Camera
-    from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
+    from thermocald.analysis.thermal.modelled_camera import Along
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.store.recording.head import CameraSpec
     from thermocald.thermal.series import SeriesInput

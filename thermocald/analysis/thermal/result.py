@@ -36,6 +36,7 @@ from thermocald.physics.formula import is_formula, known_together
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
 from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.movement import detect_tremble
+from thermocald.thermal.noise import find_poorly_read
 from thermocald.thermal.scan import examine
 from thermocald.thermal.series import COLUMNS
 
@@ -334,6 +335,8 @@ def build_camera(
     bulge = max(s.thermometers[s.history.reference].bulge for s in fitter.series)
     if delays and bulge > _SELDOM:
         fitted["read_seldom"] = {"effects": delays, "bulge": bulge}
+    if poorly := find_poorly_read(fitter, fit):
+        fitted["read_poorly"] = {"effects": poorly}
     share = sd["interior.c"] / model.interior.c
     rates = {p: (r, sd[f"rates.{p}"]) for p, r in model.rates.items() if r}
     if carried := carried_by_c(share, rates):

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -28,7 +27,13 @@ import numpy as np
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
-from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera, widened
+from thermocald.analysis.thermal.modelled_camera import (
+    NUMBER,
+    ModelledCamera,
+    require_sd,
+    steady_camera,
+    widened,
+)
 from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
@@ -41,58 +46,21 @@ from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
     from thermocald.physics.model import ThermalModel
 
 
 USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
-_CHUNK = 20_000  # times predicted at once
-_STEP = 1e-3  # relative step of a parameter for its derivative
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _REMEMBERED = 6  # readings that the present effects follow from, besides two of each channel
-_NUMBER = (int, float, np.number)
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
 
-@dataclass(frozen=True, eq=False)
-class Along:
-    """The camera along a history; indexing gives a Camera.
-
-    times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K.
-    """
-
-    sensor: Sensor
-    times: Array
-    temperatures: Array
-    values: Array
-    covariance: Array
-    extrapolated: Array
-    camera: str = "camera"
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    def __getitem__(self, i: int) -> Camera:
-        return Camera(
-            self.sensor,
-            float(self.temperatures[i]),
-            self.values[i],
-            self.covariance[i],
-            float(self.extrapolated[i]),
-            self.camera,
-        )
-
-    @property
-    def sd(self) -> Array:
-        """Standard deviations (E, 10); 0 for a parameter that was held."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-
-
 @dataclass(frozen=True, repr=False)
-class ThermalCamera(Result):
+class ThermalCamera(ModelledCamera, Result):
     """A camera whose interior orientation is given for any temperature and history.
 
     model: the thermal model; fitted: what `fit` reports besides, None for a camera from a file.
@@ -179,7 +147,7 @@ class ThermalCamera(Result):
         25.0
         """
         if size is not None and (
-            len(np.atleast_1d(size)) != 2 or not all(isinstance(n, _NUMBER) for n in size)
+            len(np.atleast_1d(size)) != 2 or not all(isinstance(n, NUMBER) for n in size)
         ):
             raise UsageError(f"size is {size!r}: give (width, height) px")
         return LiveCamera(self if size is None else self.for_images(*size))
@@ -242,18 +210,6 @@ class ThermalCamera(Result):
         sd = self.thermometer_sd
         return USUAL_THERMOMETER_SD if sd is None else sd
 
-    @cached_property
-    def parameters(self) -> tuple[str, ...]:
-        """The parameters with a standard deviation, as the model file names them."""
-        if self.model.covariance is not None:
-            return self.model.covariance_names
-        return (*self.model.sds, *(f"{e.name}.{k}" for e in self.model.effects for k in e.sds))
-
-    @cached_property
-    def covariance(self) -> Array:
-        """The covariance of the parameters: the file's matrix, or its sds uncorrelated."""
-        return self.model.covariance_of(self.parameters)
-
     def at(
         self,
         temperature: float,
@@ -273,7 +229,7 @@ class ThermalCamera(Result):
             T = math.nan
         if math.isnan(T):
             raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
-        _require_sd(temperature_sd)
+        require_sd(temperature_sd)
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
@@ -294,28 +250,6 @@ class ThermalCamera(Result):
             beyond = max(beyond, float(np.max(outside)))
         return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
 
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """The other thermometers that the model's effects follow."""
-        named = (e.values.get("channel") for e in self.model.effects)
-        return tuple(dict.fromkeys(str(c) for c in named if c))
-
-    def _beyond(
-        self, readings: Mapping[str, Array], extrapolate: bool
-    ) -> tuple[Array | float, Array | float]:
-        """Return by how many kelvin (E,) other thermometers are outside, and the drift (E, 10)."""
-        outside: Array | float = 0.0
-        drift: Array | float = 0.0
-        for effect in self.model.effects:
-            name = str(effect.values.get("channel", ""))
-            if name in readings and name in self.model.validity:
-                of_fit = Validity(*self.model.validity[name], name)
-                beyond = of_fit.check(readings[name], extrapolate)
-                rates = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
-                outside = np.maximum(outside, beyond)
-                drift = drift + np.abs(beyond[:, None] * rates)
-        return outside, drift
-
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
         if not isinstance(given, Mapping):
@@ -327,150 +261,6 @@ class ThermalCamera(Result):
                 raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
-
-    def along(
-        self,
-        times: ArrayLike,
-        temperatures: ArrayLike | Mapping[str, ArrayLike],
-        at: ArrayLike | None = None,
-        extrapolate: bool = False,
-        relative_to: float | None = None,
-        temperature_sd: float = 0.0,
-    ) -> Along:
-        """Return the camera along a temperature log, including effects with a memory.
-
-        times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
-        the reference first; at (E,): the times to predict for, by default `times`. The history
-        begins with the first time. relative_to °C: the covariance is that of the difference from
-        the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
-        the covariance (as if no effect had a memory, which would average it). Raises UsageError far
-        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
-        that run backwards, DataError for times `at` that the log does not cover.
-
-        >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
-        >>> along.values.shape, along.sd.shape
-        ((3, 10), (3, 10))
-        """
-        _require_sd(temperature_sd)
-        if not isinstance(relative_to, (*_NUMBER, type(None))):
-            raise UsageError(f"relative_to is {relative_to!r}: give one number, °C")
-        t = seconds(times)
-        columns = (
-            temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
-        )
-        try:
-            readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
-        except (TypeError, ValueError):
-            raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
-        instants = t if at is None else np.atleast_1d(seconds(at))
-        sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
-        shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
-        if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
-            raise UsageError(
-                f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
-                "each of its times, and at least one time"
-            )
-        if (np.diff(t) < 0).any():
-            raise UsageError("the times run backwards: give a log in the order of time")
-        reference = next(iter(readings))
-        if at is not None:
-            _require_known(t, readings[reference], instants)
-        begin = float(min(t[0], instants.min()))
-        history = History(instants - begin, t - begin, readings, reference, self.model.T0)
-        outside = np.zeros(len(instants))
-        if self.validity is not None:
-            outside = self.validity.check(history.temperature(), extrapolate)
-        others = {name: history.temperature(name) for name in self.channels if name in readings}
-        further, drift = self._beyond(others, extrapolate)
-        values, covariance = [], []
-        steady = None if relative_to is None else self._steady.at(relative_to)[2]
-        for first in range(0, len(instants), _CHUNK):
-            part = history.at(history.times[first : first + _CHUNK])
-            drive, beyond = self.model.drive(part), outside[first : first + _CHUNK]
-            linear = self._linear(part, drive)
-            carried = self.model.carried(linear)
-            matrix = self._propagate(part, drive, linear, beyond, steady)
-            if temperature_sd:
-                rates = np.broadcast_to(self.model.rate_vector[:, None], (len(carried), 10, 1))
-                slope = self.model.carried_derivatives(linear, rates)
-                share = _noise_share(t - begin, part.times) * temperature_sd**2
-                matrix += share[:, None, None] * slope * np.swapaxes(slope, 1, 2)
-            values.append(carried)
-            covariance.append(matrix)
-        return Along(
-            self.model.sensor,
-            instants,
-            history.temperature(),
-            np.concatenate(values),
-            widened(np.concatenate(covariance), drift),
-            np.maximum(outside, further),
-            self.model.camera,
-        )
-
-    def _linear(self, history: History, drive: Array) -> Array:
-        """Return level plus rates plus effects, (E, 10); drive (E,) °C: what the rates follow."""
-        model = self.model
-        linear: Array = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
-        for effect in model.effects:
-            if not catalogue.get(effect.name).is_drive:
-                linear = linear + model.influence(effect.name, history)
-        return linear
-
-    def _propagate(
-        self,
-        history: History,
-        drive: Array,
-        linear: Array,
-        outside: Array,
-        steady: Array | None = None,
-        driven: Mapping[tuple[str, float], Array] | None = None,
-    ) -> Array:
-        """Return the covariance (E, 10, 10) of the orientations that follow from `linear` (E, 10).
-
-        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
-        """
-        J = np.zeros((*linear.shape, len(self.parameters)))
-        for i, name in enumerate(self.parameters):
-            group, key = name.rsplit(".", 1)  # a formula may contain dots
-            if group == "interior":
-                J[:, IOP_NAMES.index(key), i] = 1.0
-            elif group == "rates":
-                J[:, IOP_NAMES.index(key), i] = drive - self.model.T0
-            elif not catalogue.get(group).is_drive:
-                up, down = (self._moved(name, s).influence(group, history) for s in (1.0, -1.0))
-                J[:, :, i] = (up - down) / (2.0 * self._step(name))
-            else:
-                if driven is None:
-                    up, down = (self._moved(name, s).drive(history) for s in (1.0, -1.0))
-                else:
-                    up, down = driven[name, 1.0], driven[name, -1.0]
-                slope = (up - down) / (2.0 * self._step(name))
-                J[:, :, i] = slope[:, None] * self.model.rate_vector
-        J = self.model.carried_derivatives(linear, J, self.parameters)
-        if steady is not None:
-            J -= steady
-        covariance: Array = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
-        rows = np.arange(10)
-        covariance[:, rows, rows] += (np.abs(self.model.rate_vector) * outside[:, None]) ** 2
-        return covariance
-
-    def _step(self, name: str) -> float:
-        """Return the step of a parameter for its difference quotient."""
-        return _STEP * max(abs(self.model.value(name)), 1e-9)
-
-    def _moved(self, name: str, sign: float) -> ThermalModel:
-        """Return the model with one parameter moved by a step."""
-        return self.model.with_values({name: self.model.value(name) + sign * self._step(name)})
-
-    @cached_property
-    def validity(self) -> Validity | None:
-        """The temperatures that the model was fitted on; None if it does not state them."""
-        limits = next(iter(self.model.validity.values()), None)
-        return None if limits is None else Validity(*limits)
-
-    @cached_property
-    def _steady(self) -> SteadyCamera:
-        return steady_camera(self.model, self.parameters, None)
 
     def steady_polynomials(self) -> tuple[Array, Array, Array]:
         """Return the steady camera's linear parameters as polynomials in T - T0: arrays (10,).
@@ -484,36 +274,6 @@ class ThermalCamera(Result):
     def steady_knees(self) -> tuple[tuple[float, ...], ...]:
         """Return each knee's temperature °C and the ten parameters' change per kelvin beyond it."""
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
-
-
-def _require_known(log: Array, readings: Array, times: Array) -> None:
-    """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
-    from thermocald.store.recording.reader import TemperatureLog
-
-    outside = ~TemperatureLog(log, {"": readings}).known_at(times)
-    if outside.any():
-        from thermocald.store.logger.clock import iso
-
-        raise DataError(
-            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
-            f"({iso(log[0])} to {iso(log[-1])}) or in a gap of over ten of its intervals, the "
-            f"first is {iso(times[outside][0])}"
-        )
-
-
-def _require_sd(temperature_sd: float) -> None:
-    if not isinstance(temperature_sd, _NUMBER) or not 0.0 <= temperature_sd < math.inf:
-        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
-
-
-def _noise_share(times: Array, at: Array) -> Array:
-    """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
-    if len(times) < 2:
-        return np.ones(len(at))
-    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    step = np.maximum(times[after] - times[after - 1], 1e-9)
-    share = np.clip((at - times[after - 1]) / step, 0.0, 1.0)
-    return share**2 + (1.0 - share) ** 2
 
 
 def load_camera(path: Path | str) -> ThermalCamera:

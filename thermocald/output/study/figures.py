@@ -161,7 +161,7 @@ def _movement_figure(camera: CameraStudy) -> Figure | None:
         lengths = np.linalg.norm(vectors, axis=1)
         k = int(lengths.argmax())
         length, along = float(lengths[k]), vectors[k] / lengths[k]
-        sd = float(np.sqrt(along @ covariance[k] @ along))
+        sd = float("nan") if covariance is None else float(np.sqrt(along @ covariance[k] @ along))
         words.append(f"{with_sd(length, sd, 'px')} in {s.name}")
     return Figure(
         "movement", "Movement of the image",

@@ -303,9 +303,11 @@ def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
 
 def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
-    sds = np.sqrt(np.diagonal(study.displacement_covariance, axis1=1, axis2=2))
+    covariance = study.displacement_covariance
     moved = {"points": study.grid, "displacement": study.displacement}
-    moved["sd_displacement"] = sds if sds.any() else None
+    moved["sd_displacement"] = (
+        None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    )
     return {name: getattr(s, name) for name in _OF_SERIES} | {
         **{name: getattr(study, name) for name in _OF_STUDY},
         "epochs": len(s),

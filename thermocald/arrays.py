@@ -48,6 +48,14 @@ def seconds(times: ArrayLike) -> Array:
     return found
 
 
+def floats(values: ArrayLike) -> Array:
+    """Return values as numbers, NaN where they are masked.
+
+    Raises TypeError or ValueError for what is no number.
+    """
+    return np.asarray(np.ma.asarray(values, dtype=float).filled(np.nan))
+
+
 def spread_rows(count: int, most: int) -> Index:
     """Return at most `most` of `count` rows, spread evenly from the first to the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
+from thermocald.arrays import floats
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.numbers import plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import (
@@ -257,7 +258,7 @@ class Camera(Result):
 def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Array:
     """Return an array (..., columns) of numbers. Raises UsageError for anything else."""
     try:
-        found = np.asarray(given, dtype=float)
+        found = floats(given)
     except (TypeError, ValueError):
         found = np.empty(0)
     if found.ndim == 0 or found.shape[-1] != columns:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.arrays import seconds
+from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
 from thermocald.figures import BAND
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
@@ -297,7 +297,7 @@ class ModelledCamera:
             temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
         )
         try:
-            readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
+            readings = {str(n): floats(c) for n, c in columns.items()}
         except (TypeError, ValueError):
             raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
         instants = t if at is None else np.atleast_1d(seconds(at))

@@ -79,8 +79,8 @@ class Network:
     names: of the m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,)
     rad: largest angle of intersection of each target; interior_covariance (10, 10): zero for held
     parameters; free: names of the estimated ones; unused: targets and photographs left out, with
-    reasons; sd_scale: relative; disagreement: of the photographs (`BundleAdjustment.scatter`),
-    which the covariances include.
+    reasons; sd_scale: relative; disagreement: of the photographs (`SharedErrors`), which
+    the covariances include.
     """
 
     names: tuple[str, ...]
@@ -357,18 +357,18 @@ def adjust_network(
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
-    disagreement, more = adjustment.scatter(bundle, found, variance)
-    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, more)
+    shared = adjustment.shared_errors(bundle, found, variance, redundancy)
+    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, shared)
     placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,
-        of_points * variance,
+        of_points,
         distances,
         {name: i for i, name in enumerate(kept_names)},
         None if nominal is None else np.asarray(nominal, dtype=float)[targets],
     )
     stations = []
     for i, row in enumerate(in_use):
-        x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T) * variance).tolist()
+        x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T)).tolist()
         exterior = ExteriorOrientation.from_rotation(placed.rotations[i], placed.centres[i])
         n = int(np.count_nonzero(final.photo == i))
         stations.append(Station(shown[kept[int(row)]], exterior, n, (x, y, z)))
@@ -389,7 +389,7 @@ def adjust_network(
         n_rays=np.bincount(final.target, minlength=len(kept_names)),
         angles=angles,
         camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
-        interior_covariance=of_interior * variance,
+        interior_covariance=of_interior,
         free=tuple(free),
         stations=tuple(stations),
         sigma0=float(np.sqrt(variance)),
@@ -398,7 +398,7 @@ def adjust_network(
         unused=left_out,
         datum=datum,
         sd_scale=sd_scale,
-        disagreement=disagreement,
+        disagreement=shared.disagreement,
     )
     refuse_weak(network, found)
     return network

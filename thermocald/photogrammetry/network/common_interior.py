@@ -134,20 +134,15 @@ def adjust_common_interior(
             f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
         )
     variance = every.cost(bundle, v[used], np.ones(n)) / redundancy
-    Q, f = found.cameras * variance, len(free)
+    f = len(free)
     covariance = np.zeros((16, 16))
-    covariance[np.ix_(free, free)] = Q[:f, :f]
+    covariance[np.ix_(free, free)] = found.cameras[:f, :f] * variance
     eops = bundle.exteriors()
     # how weak the geometry is, whatever the photographs disagree in
     weak = _weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)
-    disagreement = 1.0
-    if len(photographs) >= _FEWEST_TO_COMPARE:
-        with suppress(np.linalg.LinAlgError):  # the others may be too few without one of them
-            moves, cofactors = part.without_each(bundle, found)
-            disagreement, own = _between(moves, cofactors * variance, Q[:f, :f])
-            follow = np.linalg.solve(Q[:f, :f], Q[:f])
-            Q = Q + follow.T @ (own - Q[:f, :f]) @ follow
-            covariance[np.ix_(free, free)] = own
+    shared = part.shared_errors(bundle, found, variance, redundancy)
+    Q = found.cameras * shared.noise + shared.cameras.T @ shared.cameras
+    covariance[np.ix_(free, free)] = Q[:f, :f]
     ends = np.cumsum([len(o) for o in photographs])[:-1]
     return CommonInterior(
         InteriorOrientation.from_array(bundle.interior),
@@ -159,29 +154,8 @@ def adjust_common_interior(
         tuple(np.split(used, ends)),
         tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
         tuple(weak),
-        disagreement,
+        shared.disagreement,
     )
-
-
-def _between(moves: Array, cofactors: Array, own: Array) -> tuple[float, Array]:
-    """Return how many times farther than by chance the interior orientation moves if a photograph
-    is left out, and its covariance (f, f).
-
-    moves (k, f), with covariances (k, f, f) if all image points are independent; own (f, f):
-    covariance in that case. If they move too far, the errors within a photograph are correlated
-    (another focus, a board that bends, a rolling shutter); the photographs are still independent of
-    each other, and their jackknife gives the covariance where it is larger.
-    """
-    k, f = moves.shape
-    root = np.linalg.cholesky(own)
-    moves = np.linalg.solve(root, moves.T).T
-    cofactors = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, cofactors), 1, 2))
-    ratio = float(np.mean(moves * np.linalg.solve(cofactors, moves[..., None])[..., 0]))
-    if not ratio > 1 + _DISAGREE * np.sqrt(2 / (k * f)):
-        return 1.0, own
-    values, vectors = np.linalg.eigh((k - 1) / k * moves.T @ moves)
-    wide = root @ vectors
-    return float(np.sqrt(ratio)), wide * np.maximum(values, 1.0) @ wide.T
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:

@@ -202,10 +202,10 @@ def advice(network: Network) -> list[str]:
         notes.append(f"{int(low.sum())} targets have rays that intersect at less than 30°")
     if network.disagreement > 1:
         notes.append(
-            "the photographs disagree: without one of them the targets move "
-            f"{network.disagreement:.1f} times as far as the noise of image points explains "
-            "(another focus or zoom, a field that bends, a rolling shutter?); the standard "
-            "deviations include this: hold the focus, or take more photographs"
+            "the photographs disagree: what the image points of one photograph have in common is "
+            f"{network.disagreement:.1f} times as large as their noise explains (another focus or "
+            "zoom, a field that bends, a rolling shutter?); the standard deviations include this: "
+            "hold the focus, or take more photographs"
         )
     return notes
 

@@ -352,9 +352,9 @@ class BundleAdjustment:
             return SharedErrors(1.0, variance, 0 * cameras.T, 0 * targets.T)
         explained = float(np.sum((b @ vectors)[known] ** 2 / values[known]))
         noise = (variance * redundancy - explained) / left
-        sds = _variance_components(M / noise, b / noise)[:, None]
         ratio = explained / rank / noise
         disagree = ratio > 1 + _DISAGREE * np.sqrt(2 / rank + 2 / left)
+        sds = _variance_components(M / noise, b / noise, _WIDEST if disagree else 1.0)[:, None]
         return SharedErrors(
             float(np.sqrt(ratio)) if disagree else 1.0, noise, sds * cameras.T, sds * targets.T
         )
@@ -481,7 +481,7 @@ def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Arra
     return A - BD @ B.T, a - BD @ d.ravel(), inverses
 
 
-def _variance_components(M: Array, b: Array) -> Array:
+def _variance_components(M: Array, b: Array, widest: float) -> Array:
     """Return the standard deviation (k q,) of each photograph's errors by restricted maximum
     likelihood: one for all errors of a kind.
 
@@ -502,7 +502,7 @@ def _variance_components(M: Array, b: Array) -> Array:
         variances = new
         if settled:
             break
-    wider = np.minimum(freedom / np.maximum(freedom - 2, 1e-3), _WIDEST)
+    wider = np.minimum(freedom / np.maximum(freedom - 2, 1e-3), widest)
     result: Array = np.sqrt(kinds @ (variances * wider))
     return result
 

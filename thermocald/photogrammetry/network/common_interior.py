@@ -6,14 +6,11 @@ unknowns, so that the iteration ends at the minimum of the sum of squares. A pho
 an interior orientation of its own is used as well.
 
 Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
-Brown, D. C. (1976): The bundle adjustment - progress and prospects; the covariance between
-photographs as MacKinnon, J. G., White, H. (1985): Some heteroskedasticity-consistent covariance
-matrix estimators, Journal of Econometrics 29 (jackknife), by clusters.
+Brown, D. C. (1976): The bundle adjustment - progress and prospects.
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -50,8 +47,6 @@ if TYPE_CHECKING:
 _ITERATIONS = 60
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
-_FEWEST_TO_COMPARE = 3  # photographs
-_DISAGREE = 3.0  # standard deviations of the mean square of the moves
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
 
@@ -61,9 +56,8 @@ class CommonInterior:
 
     interior; covariance (16, 16): its EOP block is zero; exteriors, exterior_covariances (n, 6, 6);
     sigma0; redundancy; used: mask of the observations by photograph; residuals (n, 2) px: by
-    photograph; reasons: why the geometry is weak, empty if it is not; disagreement: how many times
-    farther than the image points explain the interior orientation moves if a photograph is left
-    out, 1 if that may be chance; covariances include it.
+    photograph; reasons: why the geometry is weak, empty if it is not; disagreement: of the
+    photographs (`SharedErrors`), which the covariances include.
     """
 
     interior: InteriorOrientation

@@ -339,7 +339,11 @@ def _measure_first(
         rows = {ring_code.parse(c): row for row, c in enumerate(nominal.codes) if is_ring(c)}
     for name, load in pictures.items():
         progress(f"codes in {name}")
-        image = load()
+        try:
+            image = load()
+        except ImageError as error:
+            notes[name] = str(error)
+            continue
         expected = None if sensor is None else (sensor.width, sensor.height)
         status = inspect_frame(image, expected)
         if status.word in ("wrong_size", "not_grey", "no_image"):

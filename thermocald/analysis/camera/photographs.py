@@ -26,7 +26,11 @@ from thermocald.photogrammetry.epoch.adjustment import (
 )
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.linalg import correlation_matrix
-from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
+from thermocald.photogrammetry.network.common_interior import (
+    CommonInterior,
+    adjust_common_interior,
+    approximate_common_interior,
+)
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import with_sds
@@ -40,7 +44,9 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
+_IMAGES = frozenset(
+    {".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"}
+)
 _ASSUMED_PITCH = 0.001
 
 _POOR = 4.0  # times the residuals of a typical photograph
@@ -192,20 +198,17 @@ def calibrate_observations(
     usable = {k: o for k, o in seen.items() if k not in failures}
     rows: list[int] = []
     together: CommonInterior | None = None
-    reason = "no photograph shows enough targets"
+    reason = (
+        "no photograph shows enough targets: do they show this test field, and is its number of "
+        "corners or markers right?"
+    )
     if not settings.free:
         reason = "the interior orientation is held (--free none)"
     elif usable:
         try:
             start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
-            rows, together = _adjust_together(usable, testfield, sensor, start, settings)
-            residuals = dict(zip(rows, together.residuals, strict=True))
-            poor = {} if together.reasons else _poor_ones(residuals, usable)
-            if poor:
-                failures |= poor
-                usable = {k: o for k, o in usable.items() if k not in poor}
-                start = together.interior
-                rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            rows, together, poor = _adjust_together(usable, testfield, sensor, start, settings)
+            failures |= poor
             reason = "; ".join(together.reasons)
         except GeometryError as error:
             reason = str(error)
@@ -272,8 +275,10 @@ def _first_camera(
 def _adjust_together(
     usable: Mapping[int, Observations], testfield: TestField, sensor: Sensor,
     interior: InteriorOrientation, settings: AdjustmentSettings,
-) -> tuple[list[int], CommonInterior]:  # fmt: skip
-    """Adjust the photographs whose targets fit a pose; return their positions and the result."""
+) -> tuple[list[int], CommonInterior, dict[int, tuple[str, str]]]:  # fmt: skip
+    """Adjust the photographs whose targets fit a pose; return their positions, the result, and
+    {position: (status, reason)} of those that contradict the others.
+    """
     rows, poses, fitting = [], [], []
     for k, o in usable.items():
         with suppress(GeometryError):
@@ -285,9 +290,14 @@ def _adjust_together(
     if not rows:
         raise GeometryError("no pose explains the targets of any photograph")
     chosen = [usable[k] for k in rows]
-    return rows, adjust_common_interior(
-        sensor, testfield, chosen, interior, poses, settings, fitting
+    interior, poses, residuals = approximate_common_interior(
+        sensor, testfield, chosen, interior, poses, settings
     )
+    poor = _poor_ones(dict(zip(rows, residuals, strict=True)), usable)
+    kept = [i for i, k in enumerate(rows) if k not in poor]
+    chosen, poses, fitting = ([given[i] for i in kept] for given in (chosen, poses, fitting))
+    together = adjust_common_interior(sensor, testfield, chosen, interior, poses, settings, fitting)
+    return [rows[i] for i in kept], together, poor
 
 
 def _poor_ones(
@@ -307,8 +317,8 @@ def _poor_ones(
         if own / usual > _POOR:
             why = (
                 f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
-                "times those of the other photographs: the camera moved during the exposure, or "
-                "the board was bent; left out"
+                "times those of the other photographs: another camera, zoom or focus, the camera "
+                "moved during the exposure, or the board was bent; left out"
             )
             poor[k] = ("large_residuals", why)
     return poor

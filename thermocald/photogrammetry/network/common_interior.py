@@ -11,6 +11,7 @@ Brown, D. C. (1976): The bundle adjustment - progress and prospects.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ITERATIONS = 60
+_STAGES = (4, 10)  # the first ones of `IOP_NAMES` that a stage frees: c, x0, y0, A1; all
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
@@ -87,30 +89,21 @@ def adjust_common_interior(
     are taken back. Raises GeometryError if the adjustment does not converge or is singular.
     """
     s = settings or AdjustmentSettings()
-    free = np.array(free_columns(s.free), dtype=np.int64)
-    seen = np.unique(np.concatenate([o.targets for o in photographs]))
-    rays = ImageRays.collect(photographs)
-    rays = replace(rays, target=np.searchsorted(seen, rays.target))
-    places, sigmas = testfield.points[seen], testfield.sigmas[seen]
-    uncertain = (sigmas > 0).any(axis=1)
-    weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
-    known = KnownTargets(places, weights, uncertain)
-    bundle = Bundle(
-        interior.as_array(),
-        np.array([e.rotation for e in exteriors]),
-        np.array([e.centre for e in exteriors]),
-        places,
-    )
+    every, bundle = _assemble(sensor, testfield, photographs, interior, exteriors, s)
+    rays, free, known, places = every.rays, every.free, every.known, bundle.points
     used = np.ones(len(rays), dtype=bool)
     if fitting is not None and s.snooping_alpha > 0:
         used = np.concatenate(list(fitting))
-    every = BundleAdjustment(sensor, rays, free, known)
     history = np.zeros(len(rays), dtype=np.int8)
     for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
         if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
             raise GeometryError("targets came to lie behind the camera during the iteration")
         part = BundleAdjustment(sensor, rays.select(used), free, known)
-        bundle = part.solve(bundle, iterations=_ITERATIONS)
+        try:
+            bundle = part.solve(bundle, iterations=_ITERATIONS)
+        except GeometryError as error:
+            reason = _frontal(bundle.exteriors(), places, s)
+            raise GeometryError(reason or str(error)) from None
         found = part.cofactors(bundle)
         v = every.residuals(bundle)
         # variance of a residual: less than the noise's if the ray was used, more if it was not
@@ -152,6 +145,52 @@ def adjust_common_interior(
     )
 
 
+def approximate_common_interior(
+    sensor: Sensor,
+    testfield: TestField,
+    photographs: Sequence[Observations],
+    interior: InteriorOrientation,
+    exteriors: Sequence[ExteriorOrientation],
+    settings: AdjustmentSettings,
+) -> tuple[InteriorOrientation, list[ExteriorOrientation], list[Array]]:
+    """Return better start values and residuals (n, 2) px by photograph, from a robust adjustment,
+    which a photograph of another camera or a moved one does not distort.
+    """
+    every, bundle = _assemble(sensor, testfield, photographs, interior, exteriors, settings)
+    for last in _STAGES:
+        with suppress(GeometryError):
+            some = replace(every, free=every.free[every.free < last])
+            bundle = some.solve(bundle, robust=True, iterations=_ITERATIONS)
+    v = replace(every, rays=every.rays.in_pixels()).residuals(bundle)
+    return (
+        InteriorOrientation.from_array(bundle.interior),
+        [ExteriorOrientation.from_array(e) for e in bundle.exteriors()],
+        np.split(v, np.cumsum([len(o) for o in photographs])[:-1]),
+    )
+
+
+def _assemble(
+    sensor: Sensor,
+    testfield: TestField,
+    photographs: Sequence[Observations],
+    interior: InteriorOrientation,
+    exteriors: Sequence[ExteriorOrientation],
+    s: AdjustmentSettings,
+) -> tuple[BundleAdjustment, Bundle]:
+    """Return the adjustment of all image points, and the start values."""
+    seen = np.unique(np.concatenate([o.targets for o in photographs]))
+    rays = ImageRays.collect(photographs)
+    rays = replace(rays, target=np.searchsorted(seen, rays.target))
+    places, sigmas = testfield.points[seen], testfield.sigmas[seen]
+    uncertain = (sigmas > 0).any(axis=1)
+    weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
+    known = KnownTargets(places, weights, uncertain)
+    free = np.array(free_columns(s.free), dtype=np.int64)
+    rotations, centres = zip(*((e.rotation, e.centre) for e in exteriors), strict=True)
+    bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
+    return BundleAdjustment(sensor, rays, free, known), bundle
+
+
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
     """Return the covariances (k, 6, 6) of exterior orientations, from the covariance (6k, 6k) of
     rotations about the object's axes and projection centres.
@@ -177,6 +216,19 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     return kept
 
 
+def _frontal(eops: Array, places: Array, s: AdjustmentSettings) -> str:
+    """Return the reason why photographs of one plane do not determine c, or an empty text."""
+    _, axes, flat = plane_fit(places)
+    angle = max(obliqueness_deg(eop, axes[2]) for eop in eops)
+    if not flat or "c" not in s.free or angle >= _LARGEST_OBLIQUENESS_NEEDED_DEG:
+        return ""
+    return (
+        f"one plane, in all {len(eops)} photographs within {angle:.0f}° of frontal (some at "
+        f"{_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal distance and "
+        "distance to the field cannot be separated, however small the residuals are"
+    )
+
+
 def _weaknesses(
     sensor: Sensor,
     values: Array,
@@ -187,17 +239,8 @@ def _weaknesses(
     s: AdjustmentSettings,
 ) -> list[str]:
     """Return the reasons why the photographs do not determine the free parameters."""
-    reasons: list[str] = []
-    _, axes, flat = plane_fit(places[np.unique(rays.target)])
-    if flat and "c" in s.free:
-        angles = [obliqueness_deg(eop, axes[2]) for eop in eops]
-        if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:
-            reasons.append(
-                f"one plane, in all {len(eops)} photographs within {max(angles):.0f}° of frontal "
-                f"(some at {_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal "
-                "distance and distance to the field cannot be separated, however small the "
-                "residuals are"
-            )
+    frontal = _frontal(eops, places[np.unique(rays.target)], s)
+    reasons = [frontal] if frontal else []
     coverage = image_coverage(sensor, rays.points)
     if coverage < s.bounds.coverage:
         reasons.append(

@@ -315,7 +315,7 @@ class EncodedImage:
                 f"{self.name}: is not an image that can be decoded ({error.err})"
             ) from error
         if image is None:
-            raise ImageError(f"{self.name}: is not an image (JPEG, PNG and TIFF are read)")
+            raise ImageError(f"{self.name}: is not an image that can be read (JPEG, PNG, TIFF); convert others, such as HEIC")
         return image
 
     def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:

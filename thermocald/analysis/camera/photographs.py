@@ -26,11 +26,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
 )
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.linalg import correlation_matrix
-from thermocald.photogrammetry.network.common_interior import (
-    CommonInterior,
-    adjust_common_interior,
-    approximate_common_interior,
-)
+from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import with_sds
@@ -48,10 +44,6 @@ _IMAGES = frozenset(
     {".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"}
 )
 _ASSUMED_PITCH = 0.001
-
-_POOR = 4.0  # times the residuals of a typical photograph
-_FEWEST_TO_COMPARE = 4  # photographs
-_ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +199,10 @@ def calibrate_observations(
     elif usable:
         try:
             start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
-            rows, together, poor = _adjust_together(usable, testfield, sensor, start, settings)
-            failures |= poor
+            rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            left_out = together.left_out
+            failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
+            rows = [k for i, k in enumerate(rows) if i not in left_out]
             reason = "; ".join(together.reasons)
         except GeometryError as error:
             reason = str(error)
@@ -275,53 +269,18 @@ def _first_camera(
 def _adjust_together(
     usable: Mapping[int, Observations], testfield: TestField, sensor: Sensor,
     interior: InteriorOrientation, settings: AdjustmentSettings,
-) -> tuple[list[int], CommonInterior, dict[int, tuple[str, str]]]:  # fmt: skip
-    """Adjust the photographs whose targets fit a pose; return their positions, the result, and
-    {position: (status, reason)} of those that contradict the others.
-    """
-    rows, poses, fitting = [], [], []
+) -> tuple[list[int], CommonInterior]:  # fmt: skip
+    """Adjust the photographs whose targets fit a pose; return their positions and the result."""
+    rows, poses = [], []
     for k, o in usable.items():
         with suppress(GeometryError):
             points = testfield.points[o.targets]
-            _, pose, fits = approximate_orientation(sensor, points, o.points, interior=interior)
+            poses.append(approximate_orientation(sensor, points, o.points, interior=interior)[1])
             rows.append(k)
-            poses.append(pose)
-            fitting.append(fits)
     if not rows:
         raise GeometryError("no pose explains the targets of any photograph")
     chosen = [usable[k] for k in rows]
-    interior, poses, residuals = approximate_common_interior(
-        sensor, testfield, chosen, interior, poses, settings
-    )
-    poor = _poor_ones(dict(zip(rows, residuals, strict=True)), usable)
-    kept = [i for i, k in enumerate(rows) if k not in poor]
-    chosen, poses, fitting = ([given[i] for i in kept] for given in (chosen, poses, fitting))
-    together = adjust_common_interior(sensor, testfield, chosen, interior, poses, settings, fitting)
-    return [rows[i] for i in kept], together, poor
-
-
-def _poor_ones(
-    residuals: Mapping[int, Array], seen: Mapping[int, Observations]
-) -> dict[int, tuple[str, str]]:
-    """Return {position: (status, reason)} of photographs whose residuals (n, 2) are too large."""
-    size = {
-        k: float(np.sqrt(np.median(np.sum((r / seen[k].sigmas) ** 2, axis=1))))
-        for k, r in residuals.items()
-        if len(r) >= _ENOUGH_TARGETS
-    }
-    if len(size) < _FEWEST_TO_COMPARE:
-        return {}
-    usual = max(float(np.median(list(size.values()))), 1.0)
-    poor = {}
-    for k, own in size.items():
-        if own / usual > _POOR:
-            why = (
-                f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
-                "times those of the other photographs: another camera, zoom or focus, the camera "
-                "moved during the exposure, or the board was bent; left out"
-            )
-            poor[k] = ("large_residuals", why)
-    return poor
+    return rows, adjust_common_interior(sensor, testfield, chosen, interior, poses, settings)
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:

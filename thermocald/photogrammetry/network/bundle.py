@@ -13,8 +13,8 @@ Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S
 adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56); Triggs, B. et al.
 (2000): Bundle adjustment — a modern synthesis, sections 6 and 9; Harville, D. A. (1977): Maximum
 likelihood approaches to variance component estimation and to related problems, Journal of the
-American Statistical Association 72 (the iteration of section 5.2); Armijo, L. (1966): Minimization of functions having Lipschitz continuous first partial derivatives,
-Pacific Journal of Mathematics 16.
+American Statistical Association 72, section 5.2; Armijo, L. (1966): Minimization of functions
+having Lipschitz continuous first partial derivatives, Pacific Journal of Mathematics 16.
 """
 
 from __future__ import annotations

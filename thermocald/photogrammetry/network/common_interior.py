@@ -48,6 +48,10 @@ if TYPE_CHECKING:
 _ITERATIONS = 60
 _STAGES = (4, 10)  # the first ones of `IOP_NAMES` that a stage frees: c, x0, y0, A1; all
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
+_GROSS = 20.0  # times the usual residual; an image point beyond it is left out at first
+_POOR = 4.0  # times the residuals of a typical photograph
+_FEWEST_TO_COMPARE = 4  # photographs
+_ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
@@ -59,7 +63,8 @@ class CommonInterior:
     interior; covariance (16, 16): its EOP block is zero; exteriors, exterior_covariances (n, 6, 6);
     sigma0; redundancy; used: mask of the observations by photograph; residuals (n, 2) px: by
     photograph; reasons: why the geometry is weak, empty if it is not; disagreement: of the
-    photographs (`SharedErrors`), which the covariances include.
+    photographs (`SharedErrors`), which the covariances include; left_out: {position: reason} of
+    photographs that contradict the others, which the n do not include.
     """
 
     interior: InteriorOrientation
@@ -72,6 +77,7 @@ class CommonInterior:
     residuals: tuple[Array, ...]
     reasons: tuple[str, ...]
     disagreement: float
+    left_out: dict[int, str]
 
 
 def adjust_common_interior(
@@ -81,19 +87,42 @@ def adjust_common_interior(
     interior: InteriorOrientation,
     exteriors: Sequence[ExteriorOrientation],
     settings: AdjustmentSettings | None = None,
-    fitting: Sequence[Mask] | None = None,
 ) -> CommonInterior:
     """Adjust photographs that share an interior orientation, from start values.
 
-    fitting: masks of the observations to use at first, by photograph; others that fit the result
-    are taken back. Raises GeometryError if the adjustment does not converge or is singular.
+    A robust adjustment comes first, which photographs of another camera and gross errors do not
+    distort. Raises GeometryError if the adjustment does not converge or is singular.
     """
     s = settings or AdjustmentSettings()
-    every, bundle = _assemble(sensor, testfield, photographs, interior, exteriors, s)
-    rays, free, known, places = every.rays, every.free, every.known, bundle.points
-    used = np.ones(len(rays), dtype=bool)
-    if fitting is not None and s.snooping_alpha > 0:
-        used = np.concatenate(list(fitting))
+    free = np.array(free_columns(s.free), dtype=np.int64)
+    seen = np.unique(np.concatenate([o.targets for o in photographs]))
+    rays = ImageRays.collect(photographs)
+    rays = replace(rays, target=np.searchsorted(seen, rays.target))
+    places, sigmas = testfield.points[seen], testfield.sigmas[seen]
+    uncertain = (sigmas > 0).any(axis=1)
+    weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
+    known = KnownTargets(places, weights, uncertain)
+    rotations, centres = zip(*((e.rotation, e.centre) for e in exteriors), strict=True)
+    bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
+    every = BundleAdjustment(sensor, rays, free, known)
+    in_pixels = replace(every, rays=rays.in_pixels())
+    used, left_out = np.ones(len(rays), dtype=bool), dict[int, str]()
+    with suppress(GeometryError):
+        for last in _STAGES:
+            some = replace(every, free=free[free < last])
+            bundle = some.solve(bundle, robust=True, iterations=_ITERATIONS)
+        size = np.linalg.norm(every.residuals(bundle), axis=1)
+        left_out = _contradicting(in_pixels.residuals(bundle), size, rays.photo)
+        if s.snooping_alpha > 0:
+            used = size <= _GROSS * max(float(np.median(size)), 1.0)
+    if left_out:
+        kept = [i for i in range(len(photographs)) if i not in left_out]
+        starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[kept]]
+        interior = InteriorOrientation.from_array(bundle.interior)
+        chosen = [photographs[i] for i in kept]
+        rest = adjust_common_interior(sensor, testfield, chosen, interior, starts, s)
+        more = {kept[i]: reason for i, reason in rest.left_out.items()}
+        return replace(rest, left_out=left_out | more)
     history = np.zeros(len(rays), dtype=np.int8)
     for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
         if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
@@ -139,56 +168,32 @@ def adjust_common_interior(
         float(np.sqrt(variance)),
         redundancy,
         tuple(np.split(used, ends)),
-        tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
+        tuple(np.split(in_pixels.residuals(bundle), ends)),
         tuple(weak),
         shared.disagreement,
+        {},
     )
 
 
-def approximate_common_interior(
-    sensor: Sensor,
-    testfield: TestField,
-    photographs: Sequence[Observations],
-    interior: InteriorOrientation,
-    exteriors: Sequence[ExteriorOrientation],
-    settings: AdjustmentSettings,
-) -> tuple[InteriorOrientation, list[ExteriorOrientation], list[Array]]:
-    """Return better start values and residuals (n, 2) px by photograph, from a robust adjustment,
-    which a photograph of another camera or a moved one does not distort.
+def _contradicting(residuals: Array, size: Array, photo: Index) -> dict[int, str]:
+    """Return {position: reason} of photographs with too large residuals (n, 2) px, after a robust
+    adjustment; size (n,): in standard deviations.
     """
-    every, bundle = _assemble(sensor, testfield, photographs, interior, exteriors, settings)
-    for last in _STAGES:
-        with suppress(GeometryError):
-            some = replace(every, free=every.free[every.free < last])
-            bundle = some.solve(bundle, robust=True, iterations=_ITERATIONS)
-    v = replace(every, rays=every.rays.in_pixels()).residuals(bundle)
-    return (
-        InteriorOrientation.from_array(bundle.interior),
-        [ExteriorOrientation.from_array(e) for e in bundle.exteriors()],
-        np.split(v, np.cumsum([len(o) for o in photographs])[:-1]),
-    )
-
-
-def _assemble(
-    sensor: Sensor,
-    testfield: TestField,
-    photographs: Sequence[Observations],
-    interior: InteriorOrientation,
-    exteriors: Sequence[ExteriorOrientation],
-    s: AdjustmentSettings,
-) -> tuple[BundleAdjustment, Bundle]:
-    """Return the adjustment of all image points, and the start values."""
-    seen = np.unique(np.concatenate([o.targets for o in photographs]))
-    rays = ImageRays.collect(photographs)
-    rays = replace(rays, target=np.searchsorted(seen, rays.target))
-    places, sigmas = testfield.points[seen], testfield.sigmas[seen]
-    uncertain = (sigmas > 0).any(axis=1)
-    weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
-    known = KnownTargets(places, weights, uncertain)
-    free = np.array(free_columns(s.free), dtype=np.int64)
-    rotations, centres = zip(*((e.rotation, e.centre) for e in exteriors), strict=True)
-    bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
-    return BundleAdjustment(sensor, rays, free, known), bundle
+    median = {
+        i: float(np.median(size[photo == i]))
+        for i, n in enumerate(np.bincount(photo))
+        if n >= _ENOUGH_TARGETS
+    }
+    if len(median) < _FEWEST_TO_COMPARE:
+        return {}
+    usual = max(float(np.median(list(median.values()))), 1.0)
+    return {
+        i: f"residuals of {np.sqrt(np.mean(residuals[photo == i] ** 2)):.2f} px, {own / usual:.0f} "
+        "times those of the other photographs: another camera, zoom or focus, the camera moved "
+        "during the exposure, or the board was bent; left out"
+        for i, own in median.items()
+        if own > _POOR * usual
+    }
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:

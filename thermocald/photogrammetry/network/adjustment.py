@@ -121,6 +121,7 @@ class Network:
 
 
 MIN_PHOTOS = 3
+GOOD_PHOTOS = 8
 MIN_TARGETS = 8
 MIN_ANGLE = np.radians(20.0)
 MAX_RELATIVE_SD_C = 0.005
@@ -200,6 +201,11 @@ def advice(network: Network) -> list[str]:
     low = np.degrees(network.angles) < 30
     if low.any():
         notes.append(f"{int(low.sum())} targets have rays that intersect at less than 30°")
+    if len(network.stations) < GOOD_PHOTOS:
+        notes.append(
+            f"take {GOOD_PHOTOS} photographs or more: in {len(network.stations)}, a focus or a "
+            "stabiliser that moves is often not noticed, and no standard deviation includes it then"
+        )
     if network.disagreement > 1:
         notes.append(
             "the photographs disagree: what the image points of one photograph have in common is "

@@ -206,8 +206,8 @@ class BundleAdjustment:
 
         A free network takes damped steps (Levenberg-Marquardt); one with known targets whole or
         shorter ones (Gauss-Newton), which follow the narrow valley of a weak geometry. robust:
-        renew weights in each iteration (Cauchy, scaled by the median residual). Raises
-        GeometryError if it does not converge.
+        renew weights in each iteration (Cauchy, scaled by the median residual); then, as in a free
+        network, the last iteration is good enough. Raises GeometryError if it does not converge.
         """
         gauge = self.known is None
         w = np.ones(len(self.rays))
@@ -251,7 +251,7 @@ class BundleAdjustment:
             if step[2] < 1e-8 or (robust and cost - new < 1e-6 * cost):
                 break
         else:
-            if not gauge:
+            if not gauge and not robust:
                 size = np.sqrt(np.mean(v * v))
                 raise GeometryError(
                     f"the adjustment did not converge in {iterations} iterations; residuals are "

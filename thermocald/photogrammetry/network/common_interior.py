@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-_ITERATIONS = 60
+_ITERATIONS = 200
 _STAGES = (4, 10)  # the first ones of `IOP_NAMES` that a stage frees: c, x0, y0, A1; all
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _GROSS = 20.0  # times the usual residual; an image point beyond it is left out at first
@@ -128,12 +128,25 @@ def adjust_common_interior(
         if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
             raise GeometryError("targets came to lie behind the camera during the iteration")
         part = BundleAdjustment(sensor, rays.select(used), free, known)
+        n = len(part.rays)
+        redundancy = 2 * n - len(free) - 6 * len(photographs)
+        if redundancy < s.bounds.minimum_redundancy:
+            raise GeometryError(
+                f"{n} image points in {len(photographs)} photographs leave a redundancy of "
+                f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
+            )
+        failure: GeometryError | None = None
         try:
             bundle = part.solve(bundle, iterations=_ITERATIONS)
-        except GeometryError as error:
-            reason = _frontal(bundle.exteriors(), places, s)
-            raise GeometryError(reason or str(error)) from None
+        except GeometryError as error:  # mostly for a reason that the start values show as well
+            failure = error
         found = part.cofactors(bundle)
+        variance = part.cost(bundle, part.residuals(bundle), np.ones(n)) / redundancy
+        # how weak the geometry is, whatever the photographs disagree in
+        Q = found.cameras * variance
+        weak = _weaknesses(bundle, part, Q[: len(free), : len(free)], s)
+        if failure is not None:
+            raise GeometryError("; ".join(weak) or str(failure)) from None
         v = every.residuals(bundle)
         # variance of a residual: less than the noise's if the ray was used, more if it was not
         signs = np.where(used, -1.0, 1.0)[:, None, None]
@@ -142,22 +155,10 @@ def adjust_common_interior(
         if kept is used:
             break
         used = kept
-    n = int(np.count_nonzero(used))
-    redundancy = 2 * n - len(free) - 6 * len(photographs)
-    if redundancy < s.bounds.minimum_redundancy:
-        raise GeometryError(
-            f"{n} image points in {len(photographs)} photographs leave a redundancy of "
-            f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
-        )
-    variance = every.cost(bundle, v[used], np.ones(n)) / redundancy
-    f = len(free)
-    covariance = np.zeros((16, 16))
-    covariance[np.ix_(free, free)] = found.cameras[:f, :f] * variance
-    eops = bundle.exteriors()
-    # how weak the geometry is, whatever the photographs disagree in
-    weak = _weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)
+    f, eops = len(free), bundle.exteriors()
     shared = part.shared_errors(bundle, found, variance, redundancy)
     Q = found.cameras * shared.noise + shared.cameras.T @ shared.cameras
+    covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[:f, :f]
     ends = np.cumsum([len(o) for o in photographs])[:-1]
     return CommonInterior(
@@ -221,36 +222,30 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     return kept
 
 
-def _frontal(eops: Array, places: Array, s: AdjustmentSettings) -> str:
-    """Return the reason why photographs of one plane do not determine c, or an empty text."""
-    _, axes, flat = plane_fit(places)
-    angle = max(obliqueness_deg(eop, axes[2]) for eop in eops)
-    if not flat or "c" not in s.free or angle >= _LARGEST_OBLIQUENESS_NEEDED_DEG:
-        return ""
-    return (
-        f"one plane, in all {len(eops)} photographs within {angle:.0f}° of frontal (some at "
-        f"{_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal distance and "
-        "distance to the field cannot be separated, however small the residuals are"
-    )
-
-
 def _weaknesses(
-    sensor: Sensor,
-    values: Array,
-    eops: Array,
-    places: Array,
-    rays: ImageRays,
-    covariance: Array,
-    s: AdjustmentSettings,
+    bundle: Bundle, adjustment: BundleAdjustment, Q: Array, s: AdjustmentSettings
 ) -> list[str]:
-    """Return the reasons why the photographs do not determine the free parameters."""
-    frontal = _frontal(eops, places[np.unique(rays.target)], s)
-    reasons = [frontal] if frontal else []
-    coverage = image_coverage(sensor, rays.points)
+    """Return the reasons why the photographs do not determine the free parameters.
+
+    Q: covariance of the free parameters from the noise of the image points.
+    """
+    reasons: list[str] = []
+    _, axes, flat = plane_fit(bundle.points[np.unique(adjustment.rays.target)])
+    if flat and "c" in s.free:
+        angles = [obliqueness_deg(eop, axes[2]) for eop in bundle.exteriors()]
+        if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:
+            reasons.append(
+                f"one plane, in all {len(angles)} photographs within {max(angles):.0f}° of frontal "
+                f"(some at {_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal "
+                "distance and distance to the field cannot be separated, however small the "
+                "residuals are"
+            )
+    coverage = image_coverage(adjustment.sensor, adjustment.rays.points)
     if coverage < s.bounds.coverage:
         reasons.append(
             f"the targets cover {coverage:.1%} of the image in all photographs together (at least "
             f"{s.bounds.coverage:.0%} are needed)"
         )
-    sd = np.sqrt(np.diag(covariance))
-    return reasons + uncertain(sensor, values, sd, s.free, s.bounds)
+    sd = np.zeros(16)
+    sd[adjustment.free] = np.sqrt(np.diag(Q))
+    return reasons + uncertain(adjustment.sensor, bundle.interior, sd, s.free, s.bounds)

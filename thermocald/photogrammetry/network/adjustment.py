@@ -19,7 +19,7 @@ Wrobel, B. (2016): Photogrammetric Computer Vision, section 4.6.4 (test of a poi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -317,14 +317,14 @@ def adjust_network(
     interior: InteriorOrientation | None = None,
     nominal: Array | None = None,
     free: Sequence[str] = IOP_NAMES,
-    start: Network | None = None,
+    places: Array | None = None,
 ) -> Network:
     """Adjust a free network of photographs taken by one camera with unchanged focus.
 
     photos: observations by photograph; names: of the m targets, in the order of their rows;
     distances: measured between targets, they give the scale; interior: approximate values, searched
     for if None; nominal: approximate coordinates (m, 3) mm, NaN if unknown; free: the interior
-    parameters to estimate; start: an earlier result for the same photographs, for start values.
+    parameters to estimate; places: better approximate coordinates than the nominal ones (m, 3) mm.
     Raises GeometryError with the reasons if the network is too weak.
     """
     rays, shown = ImageRays.collect(list(photos.values())), list(photos)
@@ -336,11 +336,8 @@ def adjust_network(
     rays = rays.select(seen[rays.target] >= MIN_RAYS)
     refuse_before(len(photos), rays, distances, names)
     free_rows = np.array([IOP_NAMES.index(name) for name in free], dtype=int)
-    bundle, kept, used = (
-        approximate(sensor, rays, len(names), interior, nominal, free_rows)
-        if start is None
-        else _resume(start, shown, names, rays)
-    )
+    approximately = nominal if places is None else places
+    bundle, kept, used = approximate(sensor, rays, len(names), interior, approximately, free_rows)
     for i in sorted(set(range(len(photos))) - set(kept)):
         left_out[shown[i]] = "could not be oriented: too few targets in common with others"
 
@@ -408,27 +405,6 @@ def adjust_network(
     )
     refuse_weak(network, found)
     return network
-
-
-def _resume(
-    start: Network, photos: Sequence[str], names: Sequence[str], rays: ImageRays
-) -> tuple[Bundle, list[int], ImageRays]:
-    """Return the bundle of an earlier result, its photographs, and their rays, renumbered."""
-    rows = {name: i for i, name in enumerate(photos)}
-    kept = [rows[s.photo] for s in start.stations]
-    number = np.full(len(photos), -1)
-    number[kept] = np.arange(len(kept))
-    points = np.full((len(names), 3), np.nan)
-    index = {name: i for i, name in enumerate(names)}
-    points[[index[name] for name in start.names]] = start.points
-    used = rays.select((number[rays.photo] >= 0) & np.isfinite(points[rays.target, 0]))
-    bundle = Bundle(
-        start.camera.interior.as_array(),
-        np.array([s.exterior.rotation for s in start.stations]),
-        np.array([s.exterior.centre for s in start.stations]),
-        np.nan_to_num(points),
-    )
-    return bundle, kept, replace(used, photo=number[used.photo])
 
 
 def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:

@@ -262,6 +262,13 @@ class BundleAdjustment:
         U, _, Vt = np.linalg.svd(bundle.rotations)
         return replace(bundle, rotations=U @ Vt)
 
+    def approach(self, bundle: Bundle, iterations: int) -> Bundle:
+        """Adjust a bundle robustly: with c, x0, y0 and A1 first, then with all that is free."""
+        for last in (4, _N_IOP):
+            stage = replace(self, free=self.free[self.free < last])
+            bundle = stage.solve(bundle, robust=True, iterations=iterations)
+        return bundle
+
     def cofactors(self, bundle: Bundle) -> Cofactors:
         """Return the cofactors at the solution. Raises GeometryError if it is undetermined."""
         normals = self._normal_equations(bundle, np.ones(len(self.rays)))
@@ -332,12 +339,12 @@ class BundleAdjustment:
             np.add.at(r[:, :, i], rays.target[mine], np.swapaxes(by_point[mine], 1, 2) @ own)
             blocks[i] = np.einsum("naq,nap->qp", own, own)
             b[i] = np.einsum("naq,na->q", own, v[mine])
-        R, r = R.reshape(len(R), -1), r.reshape(-1, k * q)
+        R_all, r_all = R.reshape(len(R), -1), r.reshape(-1, k * q)
         # how cameras and targets follow the errors
-        cameras = found.cameras @ (R + found.follow @ r)
-        targets = np.einsum("mij,mjq->miq", found.own, r.reshape(-1, 3, k * q)).reshape(r.shape)
+        cameras = found.cameras @ (R_all + found.follow @ r_all)
+        targets = (found.own @ r.reshape(-1, 3, k * q)).reshape(r_all.shape)
         targets += found.follow.T @ cameras
-        M = (-R.T @ cameras - r.T @ targets).reshape(k, q, k, q)
+        M = (-R_all.T @ cameras - r_all.T @ targets).reshape(k, q, k, q)
         np.einsum("iqip->iqp", M)[...] += blocks
         # their mean is eliminated
         of_mean = M.sum(axis=2).reshape(k * q, q)

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ITERATIONS = 200
-_STAGES = (4, 10)  # the first ones of `IOP_NAMES` that a stage frees: c, x0, y0, A1; all
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _GROSS = 20.0  # times the usual residual; an image point beyond it is left out at first
 _POOR = 4.0  # times the residuals of a typical photograph
@@ -108,20 +107,18 @@ def adjust_common_interior(
     in_pixels = replace(every, rays=rays.in_pixels())
     used, left_out = np.ones(len(rays), dtype=bool), dict[int, str]()
     with suppress(GeometryError):
-        for last in _STAGES:
-            some = replace(every, free=free[free < last])
-            bundle = some.solve(bundle, robust=True, iterations=_ITERATIONS)
+        bundle = every.approach(bundle, _ITERATIONS)
         size = np.linalg.norm(every.residuals(bundle), axis=1)
         left_out = _contradicting(in_pixels.residuals(bundle), size, rays.photo)
         if s.snooping_alpha > 0:
             used = size <= _GROSS * max(float(np.median(size)), 1.0)
     if left_out:
-        kept = [i for i in range(len(photographs)) if i not in left_out]
-        starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[kept]]
+        others = [i for i in range(len(photographs)) if i not in left_out]
+        starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[others]]
         interior = InteriorOrientation.from_array(bundle.interior)
-        chosen = [photographs[i] for i in kept]
+        chosen = [photographs[i] for i in others]
         rest = adjust_common_interior(sensor, testfield, chosen, interior, starts, s)
-        more = {kept[i]: reason for i, reason in rest.left_out.items()}
+        more = {others[i]: reason for i, reason in rest.left_out.items()}
         return replace(rest, left_out=left_out | more)
     history = np.zeros(len(rays), dtype=np.int8)
     for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
@@ -135,18 +132,8 @@ def adjust_common_interior(
                 f"{n} image points in {len(photographs)} photographs leave a redundancy of "
                 f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
             )
-        failure: GeometryError | None = None
-        try:
-            bundle = part.solve(bundle, iterations=_ITERATIONS)
-        except GeometryError as error:  # mostly for a reason that the start values show as well
-            failure = error
+        bundle = part.solve(bundle, iterations=_ITERATIONS)
         found = part.cofactors(bundle)
-        variance = part.cost(bundle, part.residuals(bundle), np.ones(n)) / redundancy
-        # how weak the geometry is, whatever the photographs disagree in
-        Q = found.cameras * variance
-        weak = _weaknesses(bundle, part, Q[: len(free), : len(free)], s)
-        if failure is not None:
-            raise GeometryError("; ".join(weak) or str(failure)) from None
         v = every.residuals(bundle)
         # variance of a residual: less than the noise's if the ray was used, more if it was not
         signs = np.where(used, -1.0, 1.0)[:, None, None]
@@ -155,7 +142,10 @@ def adjust_common_interior(
         if kept is used:
             break
         used = kept
+    variance = part.cost(bundle, v[used], np.ones(n)) / redundancy
     f, eops = len(free), bundle.exteriors()
+    # how weak the geometry is, whatever the photographs disagree in
+    weak = _weaknesses(bundle, part, found.cameras[:f, :f] * variance, s)
     shared = part.shared_errors(bundle, found, variance, redundancy)
     Q = found.cameras * shared.noise + shared.cameras.T @ shared.cameras
     covariance = np.zeros((16, 16))

@@ -195,12 +195,7 @@ class _Start:
         self.refine()
         self.extend()
         bundle, photos, used = self.bundle()
-        for stage in ([0], [0, 1, 2, 3], range(len(bundle.interior))):
-            some = free[np.isin(free, stage)]
-            bundle = BundleAdjustment(self.sensor, used, some).solve(
-                bundle, robust=True, iterations=15
-            )
-        return bundle, photos, used
+        return BundleAdjustment(self.sensor, used, free).approach(bundle, 15), photos, used
 
 
 def approximate(

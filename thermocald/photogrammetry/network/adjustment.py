@@ -32,7 +32,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (
     Bundle,
     BundleAdjustment,
@@ -249,7 +249,7 @@ def snoop(
     bundle = whole.solve(bundle, robust=True)
     limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # χ² with 2 degrees of freedom
     v2 = np.sum(whole.residuals(bundle) ** 2, axis=1)
-    rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / MEDIAN_CHI2, 1e-12)
+    rejected = v2 > _COARSE * limit * median_variance(v2)
     tests = np.zeros(len(rays))
     for _round in range(_ROUNDS):
         _drop_uncontrolled(rejected, rays)
@@ -266,7 +266,7 @@ def snoop(
         explained = adjustment.explained(part, adjustment.cofactors(part))
         tests = np.sum(v * v, axis=1)
         tests[~rejected] = point_tests(v[~rejected], np.eye(2) - explained)
-        tests /= limit * max(float(np.median(tests[~rejected])) / MEDIAN_CHI2, 1e-12)
+        tests /= limit * median_variance(tests[~rejected])
         candidates = ~rejected & (tests > 1)
         if not candidates.any():
             break

@@ -34,7 +34,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2, scaled_inverse, unit_diagonal
+from thermocald.photogrammetry.linalg import median_variance, scaled_inverse, unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -216,7 +216,7 @@ class BundleAdjustment:
         for _ in range(iterations):
             if robust:  # weights fall from 1 with the square of the residual
                 size2 = np.sum(v * v, axis=1)
-                w = 1.0 / (1.0 + size2 / (9.0 * max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)))
+                w = 1.0 / (1.0 + size2 / (9.0 * median_variance(size2)))
             cost = self.cost(bundle, v, w)
             normals = self._normal_equations(bundle, w)
             fraction = 1.0

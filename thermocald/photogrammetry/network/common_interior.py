@@ -29,7 +29,7 @@ from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
 from thermocald.photogrammetry.epoch.snooping import settle
 from thermocald.photogrammetry.field.testfield import plane_fit
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (
     BEHIND,
     Bundle,
@@ -205,7 +205,7 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     if alpha <= 0:
         return used
     # χ² with 2 degrees of freedom
-    limit = -2.0 * np.log(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
+    limit = -2.0 * np.log(alpha) * median_variance(tests[used])
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])
     kept: Mask = (tests <= limit) | (used & (tests < worst[target]))

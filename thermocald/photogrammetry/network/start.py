@@ -190,13 +190,6 @@ class _Start:
         self.points[:] = np.nan
         self.intersect()
 
-    def network(self, free: Index) -> tuple[Bundle, list[int], ImageRays]:
-        """Add the other photographs and adjust roughly. Raises GeometryError if that fails."""
-        self.refine()
-        self.extend()
-        bundle, photos, used = self.bundle()
-        return BundleAdjustment(self.sensor, used, free).approach(bundle, 15), photos, used
-
 
 def approximate(
     sensor: Sensor,
@@ -230,10 +223,14 @@ def approximate(
                     start.begin_with_pair(way)
                 else:
                     start.begin_with_nominal(np.asarray(nominal, dtype=float))
-                bundle, photos, used = start.network(free)
+                start.refine()
+                start.extend()
+                bundle, photos, used = start.bundle()
+                adjustment = BundleAdjustment(sensor, used, free)
+                bundle = adjustment.approach(bundle, 15)
             except GeometryError:
                 continue
-            off = BundleAdjustment(sensor, used.in_pixels(), free).residuals(bundle)
+            off = replace(adjustment, rays=used.in_pixels()).residuals(bundle)
             median = float(np.median(np.linalg.norm(off, axis=1)))
             # a difference of five per cent of the image points does not count
             missing = round(20 * (1 - len(used) / len(rays)))

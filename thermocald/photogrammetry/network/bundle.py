@@ -56,7 +56,8 @@ BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _LEAST_DECREASE = 0.5  # of what the step predicts
 _OF_CAMERA = ("c", "x0", "y0", "C1", "C2")
-_KINDS = (0, 1, 1, 2, 2, 3, 3, 3)  # of `_OF_CAMERA`, and of the squares of a bent field
+# of `_OF_CAMERA`, of the squares of a bent field, and of squares in the image
+_KINDS = (0, 1, 1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4)
 _FEWEST_TO_COMPARE = 3  # photographs
 _LEAST_SHARE = 1e-6  # of the largest eigenvalue, below which an error is absorbed altogether
 _DISAGREE = 3.0  # standard deviations of the ratio of two variances
@@ -164,7 +165,7 @@ class Cofactors:
 
 class SharedErrors(NamedTuple):
     """The errors that the image points of one photograph share: another focus, a shifted principal
-    point, a sheared image (rolling shutter), a bent field.
+    point, a sheared image (rolling shutter), a bent field, and what else bends the image smoothly.
 
     disagreement: how many times larger than by chance, 1 if that may be chance; noise: variance of
     unit weight without them; cameras (e, u), targets (e, 3m): roots of what the e errors add to
@@ -376,7 +377,11 @@ class BundleAdjustment:
         middle, axes, _ = plane_fit(bundle.points)
         x, y, _ = ((bundle.points - middle) @ axes.T)[self.rays.target].T
         bent = (by_point @ axes[2])[:, :, None] * np.stack([x * x, x * y, y * y], axis=1)[:, None]
-        E = np.concatenate([by_camera[:, :, : len(columns)], bent], axis=2)
+        u, w = (self.rays.points - self.sensor.centre).T
+        squares = np.stack([u * u, u * w, w * w], axis=1)
+        smooth = self.rays.whitening[..., None] * squares[:, None, None]
+        smooth = smooth.reshape(len(squares), 2, 6)
+        E = np.concatenate([by_camera[:, :, : len(columns)], bent, smooth], axis=2)
         size = np.sqrt(np.mean(np.sum(E * E, axis=1), axis=0))
         scaled: Array = E / np.where(size > 0, size, 1.0)
         return scaled

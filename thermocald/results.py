@@ -161,10 +161,11 @@ class Calibration(Result):
         found = []
         if result.disagreement > 1:
             found.append(
-                "the photographs disagree: without one of them the camera moves "
-                f"{result.disagreement:.1f} times as far as the noise of image points explains "
-                "(another focus or zoom, a board that bends, a rolling shutter, blur by motion?); "
-                "the standard deviations include this, but no error that all photographs share"
+                "the photographs disagree: what the image points of one photograph have in common "
+                f"is {result.disagreement:.1f} times as large as their noise explains (another "
+                "focus or zoom, a board that bends, a rolling shutter, blur by motion?); the "
+                "standard deviations, also of the poses, include this, but no error that all "
+                "photographs share"
             )
         if self.pitch_assumed:
             return found

@@ -355,6 +355,7 @@ def survey_testfield(
     from thermocald.photogrammetry.field.testfield import Distance
     from thermocald.photogrammetry.survey import survey
     from thermocald.photogrammetry.targets.image_file import decode_grey
+    from thermocald.store.logger.photographs import find_copies
     from thermocald.store.recording.board_file import read_distances
     from thermocald.store.recording.testfield_file import write_testfield
 
@@ -370,6 +371,9 @@ def survey_testfield(
         raise UsageError("--hold-camera needs --camera")
     paths = images_of([source_of(p) for p in photographs])
     tell = say or (lambda _: None)
+    copies = find_copies(paths)
+    for copy, first in copies.items():
+        tell(f"{paths[copy]}: is a copy of {paths[first].name}, left out")
     known = None
     if camera is not None:
         known = camera_files.read(source_of(camera), pixel_pitch=pixel_pitch).model
@@ -378,7 +382,7 @@ def survey_testfield(
         pixel_pitch = 0.001
         tell("pixel pitch not given: 0.001 mm assumed; the camera's mm depend on it")
     found = survey(
-        {str(path): partial(decode_grey, path) for path in paths},
+        {str(path): partial(decode_grey, path) for k, path in enumerate(paths) if k not in copies},
         measured,
         pixel_pitch,
         nominal=None if field is None else read_testfield(field),

@@ -12,6 +12,7 @@ from tests.photogrammetry.exact_rendering import look_at
 from tests.photogrammetry.network_cases import looking_at
 from thermocald.photogrammetry.camera.camera_model import (
     PRINCIPAL,
+    ExteriorOrientation,
     InteriorOrientation,
     Sensor,
     project,
@@ -21,6 +22,7 @@ from thermocald.photogrammetry.network.common_interior import adjust_common_inte
 from thermocald.photogrammetry.targets.boards import chessboard
 
 SENSOR = Sensor(1280, 720, 0.003)
+BOARD = chessboard(9, 6, 25.0)
 STATIONS = [
     look_at(centre, [150, 180, 160], roll)
     for centre, roll in (
@@ -73,8 +75,11 @@ def test_the_camera_is_as_accurate_as_stated():
 
 
 def test_the_camera_is_as_accurate_as_stated_if_the_focus_moves_between_photographs():
-    """The points of one photograph share its error, which sigma0 does not show."""
-    z = []
+    """The points of one photograph share its error, which sigma0 does not show.
+
+    Without it, the projection centres would be off by 4 standard deviations.
+    """
+    z, off = [], []
     for k in range(20):
         rng = np.random.default_rng([9, k])
         centres = np.array([850, 800, 800]) + rng.uniform(-250, 250, (8, 3))
@@ -85,9 +90,43 @@ def test_the_camera_is_as_accurate_as_stated_if_the_focus_moves_between_photogra
         )
         sd = np.sqrt(np.diag(r.covariance))[PRINCIPAL]
         z.append((r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / sd)
+        found, true = (np.array([e.centre for e in eops]) for eops in (r.exteriors, stations))
+        variances = np.diagonal(r.exterior_covariances, axis1=1, axis2=2)[:, 3:]
+        off.append((found - true) / np.sqrt(variances))
         assert r.disagreement > 1.5
         assert r.sigma0 < 1.5
     assert np.sqrt(np.mean(np.square(z), axis=0)) == pytest.approx(np.ones(3), abs=0.6)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.3)
+
+
+def _of_board(tilt: float, c: float, rng) -> tuple[Observations, ExteriorOrientation]:
+    """Return the image points of a chessboard seen at an angle (rad) by a camera c mm."""
+    middle, azimuth = BOARD.points.mean(axis=0), rng.uniform(0, 6.28)
+    across = np.sin(tilt) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    station = looking_at(middle + 380 * np.array([*across, np.cos(tilt)]), middle, azimuth)
+    points = project(SENSOR, np.array([c, *[0] * 9]), station.as_array(), BOARD.points)
+    points += rng.normal(0, 0.02, points.shape)
+    return Observations(np.arange(len(points)), points, np.full(points.shape, 0.02)), station
+
+
+def test_a_photograph_of_another_zoom_is_left_out():
+    """With it, steps made the distortion fold back and ended in a singular matrix."""
+    rng = np.random.default_rng(4)
+    seen = [_of_board(rng.uniform(0.3, 0.6), 3.3 if k == 3 else 2.8, rng) for k in range(8)]
+    measured, stations = zip(*seen, strict=True)
+    r = adjust_common_interior(SENSOR, BOARD, measured, InteriorOrientation(2.9), stations)
+    assert list(r.left_out) == [3]
+    assert "another camera" in r.left_out[3]
+    assert len(r.exteriors) == 7
+    assert r.interior.c == pytest.approx(2.8, abs=4 * np.sqrt(r.covariance[0, 0]))
+
+
+def test_frontal_photographs_do_not_determine_the_principal_distance():
+    rng = np.random.default_rng(5)
+    seen = [_of_board(rng.uniform(0, 0.1), 2.8, rng) for _ in range(8)]
+    measured, stations = zip(*seen, strict=True)
+    r = adjust_common_interior(SENSOR, BOARD, measured, InteriorOrientation(2.0), stations)
+    assert "within 5° of frontal (some at 20° and more are needed)" in r.reasons[0]
 
 
 def test_large_residuals_do_not_make_the_steps_overshoot():

@@ -215,8 +215,9 @@ def interior_table(
         "Values",
         ("parameter", "value ± sd", "in px"),
         tuple(rows),
-        "The standard deviations include the noise of the image points and the errors of the test "
-        "field's coordinates, but not the errors of the camera model.",
+        "The standard deviations, also of the poses, include the noise of the image points, the "
+        "errors of the test field's coordinates, and what photographs differ in (focus, rolling "
+        "shutter, a board that bends), but not the errors of the camera model.",
     )
 
 

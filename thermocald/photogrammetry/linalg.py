@@ -26,6 +26,11 @@ MEDIAN_CHI2 = 2.0 * math.log(2.0)
 _SMALL = 32  # rows
 
 
+def median_variance(squares: Array) -> float:
+    """Return the variance of unit weight of image points from the median of their squares."""
+    return max(float(np.median(squares)) / MEDIAN_CHI2, 1e-12)
+
+
 def median_known(values: Array) -> Array:
     """Return the median over the first axis, NaN ignored; NaN where all values are NaN."""
     with warnings.catch_warnings():

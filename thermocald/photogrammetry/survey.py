@@ -280,11 +280,10 @@ def survey(
             normals = sheet_normals(expected.points, labels, _NEAREST)
         photos = _measure_again(pictures, network, expected, normals, notes, progress)
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
-        # the start values of targets that the network lacks are their expected coordinates
-        start = replace(network, names=expected.names, points=expected.points)
         network = adjust_network(
-            sensor, photos, expected.names, distances, free=free, start=start, nominal=of_field
-        )
+            sensor, photos, expected.names, distances, interior=network.camera.interior,
+            nominal=of_field, free=free, places=expected.points,
+        )  # fmt: skip
     template = expected if nominal is None else nominal
     return Survey(network, surveyed_field(network, template), notes)
 
@@ -339,7 +338,11 @@ def _measure_first(
         rows = {ring_code.parse(c): row for row, c in enumerate(nominal.codes) if is_ring(c)}
     for name, load in pictures.items():
         progress(f"codes in {name}")
-        image = load()
+        try:
+            image = load()
+        except ImageError as error:
+            notes[name] = str(error)
+            continue
         expected = None if sensor is None else (sensor.width, sensor.height)
         status = inspect_frame(image, expected)
         if status.word in ("wrong_size", "not_grey", "no_image"):

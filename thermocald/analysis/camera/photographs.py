@@ -40,12 +40,10 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
+_IMAGES = frozenset(
+    {".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"}
+)
 _ASSUMED_PITCH = 0.001
-
-_POOR = 4.0  # times the residuals of a typical photograph
-_FEWEST_TO_COMPARE = 4  # photographs
-_ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +190,10 @@ def calibrate_observations(
     usable = {k: o for k, o in seen.items() if k not in failures}
     rows: list[int] = []
     together: CommonInterior | None = None
-    reason = "no photograph shows enough targets"
+    reason = (
+        "no photograph shows enough targets: do they show this test field, and is its number of "
+        "corners or markers right?"
+    )
     if not settings.free:
         reason = "the interior orientation is held (--free none)"
         if camera.interior is None:
@@ -201,13 +202,9 @@ def calibrate_observations(
         try:
             start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
             rows, together = _adjust_together(usable, testfield, sensor, start, settings)
-            residuals = dict(zip(rows, together.residuals, strict=True))
-            poor = {} if together.reasons else _poor_ones(residuals, usable)
-            if poor:
-                failures |= poor
-                usable = {k: o for k, o in usable.items() if k not in poor}
-                start = together.interior
-                rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            left_out = together.left_out
+            failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
+            rows = [k for i, k in enumerate(rows) if i not in left_out]
             reason = "; ".join(together.reasons)
         except GeometryError as error:
             reason = str(error)
@@ -276,44 +273,16 @@ def _adjust_together(
     interior: InteriorOrientation, settings: AdjustmentSettings,
 ) -> tuple[list[int], CommonInterior]:  # fmt: skip
     """Adjust the photographs whose targets fit a pose; return their positions and the result."""
-    rows, poses, fitting = [], [], []
+    rows, poses = [], []
     for k, o in usable.items():
         with suppress(GeometryError):
             points = testfield.points[o.targets]
-            _, pose, fits = approximate_orientation(sensor, points, o.points, interior=interior)
+            poses.append(approximate_orientation(sensor, points, o.points, interior=interior)[1])
             rows.append(k)
-            poses.append(pose)
-            fitting.append(fits)
     if not rows:
         raise GeometryError("no pose explains the targets of any photograph")
     chosen = [usable[k] for k in rows]
-    return rows, adjust_common_interior(
-        sensor, testfield, chosen, interior, poses, settings, fitting
-    )
-
-
-def _poor_ones(
-    residuals: Mapping[int, Array], seen: Mapping[int, Observations]
-) -> dict[int, tuple[str, str]]:
-    """Return {position: (status, reason)} of photographs whose residuals (n, 2) are too large."""
-    size = {
-        k: float(np.sqrt(np.median(np.sum((r / seen[k].sigmas) ** 2, axis=1))))
-        for k, r in residuals.items()
-        if len(r) >= _ENOUGH_TARGETS
-    }
-    if len(size) < _FEWEST_TO_COMPARE:
-        return {}
-    usual = max(float(np.median(list(size.values()))), 1.0)
-    poor = {}
-    for k, own in size.items():
-        if own / usual > _POOR:
-            why = (
-                f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
-                "times those of the other photographs: the camera moved during the exposure, or "
-                "the board was bent; left out"
-            )
-            poor[k] = ("large_residuals", why)
-    return poor
+    return rows, adjust_common_interior(sensor, testfield, chosen, interior, poses, settings)
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:

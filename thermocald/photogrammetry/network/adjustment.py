@@ -19,7 +19,7 @@ Wrobel, B. (2016): Photogrammetric Computer Vision, section 4.6.4 (test of a poi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -32,7 +32,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (
     Bundle,
     BundleAdjustment,
@@ -79,8 +79,8 @@ class Network:
     names: of the m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,)
     rad: largest angle of intersection of each target; interior_covariance (10, 10): zero for held
     parameters; free: names of the estimated ones; unused: targets and photographs left out, with
-    reasons; sd_scale: relative; disagreement: of the photographs (`BundleAdjustment.scatter`),
-    which the covariances include.
+    reasons; sd_scale: relative; disagreement: of the photographs (`SharedErrors`), which
+    the covariances include.
     """
 
     names: tuple[str, ...]
@@ -121,6 +121,7 @@ class Network:
 
 
 MIN_PHOTOS = 3
+GOOD_PHOTOS = 8
 MIN_TARGETS = 8
 MIN_ANGLE = np.radians(20.0)
 MAX_RELATIVE_SD_C = 0.005
@@ -200,12 +201,17 @@ def advice(network: Network) -> list[str]:
     low = np.degrees(network.angles) < 30
     if low.any():
         notes.append(f"{int(low.sum())} targets have rays that intersect at less than 30°")
+    if len(network.stations) < GOOD_PHOTOS:
+        notes.append(
+            f"take {GOOD_PHOTOS} photographs or more: in {len(network.stations)}, a focus or a "
+            "stabiliser that moves is often not noticed, and no standard deviation includes it then"
+        )
     if network.disagreement > 1:
         notes.append(
-            "the photographs disagree: without one of them the targets move "
-            f"{network.disagreement:.1f} times as far as the noise of image points explains "
-            "(another focus or zoom, a field that bends, a rolling shutter?); the standard "
-            "deviations include this: hold the focus, or take more photographs"
+            "the photographs disagree: what the image points of one photograph have in common is "
+            f"{network.disagreement:.1f} times as large as their noise explains (another focus or "
+            "zoom, a field that bends, a rolling shutter?); the standard deviations include this: "
+            "hold the focus, or take more photographs"
         )
     return notes
 
@@ -243,7 +249,7 @@ def snoop(
     bundle = whole.solve(bundle, robust=True)
     limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # χ² with 2 degrees of freedom
     v2 = np.sum(whole.residuals(bundle) ** 2, axis=1)
-    rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / MEDIAN_CHI2, 1e-12)
+    rejected = v2 > _COARSE * limit * median_variance(v2)
     tests = np.zeros(len(rays))
     for _round in range(_ROUNDS):
         _drop_uncontrolled(rejected, rays)
@@ -260,7 +266,7 @@ def snoop(
         explained = adjustment.explained(part, adjustment.cofactors(part))
         tests = np.sum(v * v, axis=1)
         tests[~rejected] = point_tests(v[~rejected], np.eye(2) - explained)
-        tests /= limit * max(float(np.median(tests[~rejected])) / MEDIAN_CHI2, 1e-12)
+        tests /= limit * median_variance(tests[~rejected])
         candidates = ~rejected & (tests > 1)
         if not candidates.any():
             break
@@ -311,14 +317,14 @@ def adjust_network(
     interior: InteriorOrientation | None = None,
     nominal: Array | None = None,
     free: Sequence[str] = IOP_NAMES,
-    start: Network | None = None,
+    places: Array | None = None,
 ) -> Network:
     """Adjust a free network of photographs taken by one camera with unchanged focus.
 
     photos: observations by photograph; names: of the m targets, in the order of their rows;
     distances: measured between targets, they give the scale; interior: approximate values, searched
     for if None; nominal: approximate coordinates (m, 3) mm, NaN if unknown; free: the interior
-    parameters to estimate; start: an earlier result for the same photographs, for start values.
+    parameters to estimate; places: better approximate coordinates than the nominal ones (m, 3) mm.
     Raises GeometryError with the reasons if the network is too weak.
     """
     rays, shown = ImageRays.collect(list(photos.values())), list(photos)
@@ -330,11 +336,8 @@ def adjust_network(
     rays = rays.select(seen[rays.target] >= MIN_RAYS)
     refuse_before(len(photos), rays, distances, names)
     free_rows = np.array([IOP_NAMES.index(name) for name in free], dtype=int)
-    bundle, kept, used = (
-        approximate(sensor, rays, len(names), interior, nominal, free_rows)
-        if start is None
-        else _resume(start, shown, names, rays)
-    )
+    approximately = nominal if places is None else places
+    bundle, kept, used = approximate(sensor, rays, len(names), interior, approximately, free_rows)
     for i in sorted(set(range(len(photos))) - set(kept)):
         left_out[shown[i]] = "could not be oriented: too few targets in common with others"
 
@@ -357,18 +360,18 @@ def adjust_network(
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
-    disagreement, more = adjustment.scatter(bundle, found, variance)
-    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, more)
+    shared = adjustment.shared_errors(bundle, found, variance, redundancy)
+    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, shared)
     placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,
-        of_points * variance,
+        of_points,
         distances,
         {name: i for i, name in enumerate(kept_names)},
         None if nominal is None else np.asarray(nominal, dtype=float)[targets],
     )
     stations = []
     for i, row in enumerate(in_use):
-        x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T) * variance).tolist()
+        x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T)).tolist()
         exterior = ExteriorOrientation.from_rotation(placed.rotations[i], placed.centres[i])
         n = int(np.count_nonzero(final.photo == i))
         stations.append(Station(shown[kept[int(row)]], exterior, n, (x, y, z)))
@@ -389,7 +392,7 @@ def adjust_network(
         n_rays=np.bincount(final.target, minlength=len(kept_names)),
         angles=angles,
         camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
-        interior_covariance=of_interior * variance,
+        interior_covariance=of_interior,
         free=tuple(free),
         stations=tuple(stations),
         sigma0=float(np.sqrt(variance)),
@@ -398,31 +401,10 @@ def adjust_network(
         unused=left_out,
         datum=datum,
         sd_scale=sd_scale,
-        disagreement=disagreement,
+        disagreement=shared.disagreement,
     )
     refuse_weak(network, found)
     return network
-
-
-def _resume(
-    start: Network, photos: Sequence[str], names: Sequence[str], rays: ImageRays
-) -> tuple[Bundle, list[int], ImageRays]:
-    """Return the bundle of an earlier result, its photographs, and their rays, renumbered."""
-    rows = {name: i for i, name in enumerate(photos)}
-    kept = [rows[s.photo] for s in start.stations]
-    number = np.full(len(photos), -1)
-    number[kept] = np.arange(len(kept))
-    points = np.full((len(names), 3), np.nan)
-    index = {name: i for i, name in enumerate(names)}
-    points[[index[name] for name in start.names]] = start.points
-    used = rays.select((number[rays.photo] >= 0) & np.isfinite(points[rays.target, 0]))
-    bundle = Bundle(
-        start.camera.interior.as_array(),
-        np.array([s.exterior.rotation for s in start.stations]),
-        np.array([s.exterior.centre for s in start.stations]),
-        np.nan_to_num(points),
-    )
-    return bundle, kept, replace(used, photo=number[used.photo])
 
 
 def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:

@@ -11,10 +11,10 @@ Rotations are updated in object space (`R ← exp([w]×) R`), so that there is n
 
 Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
 adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56); Triggs, B. et al.
-(2000): Bundle adjustment — a modern synthesis, sections 6 and 9; Johnstone, I. M. (2001): On the
-distribution of the largest eigenvalue in principal components analysis, Annals of Statistics 29;
-Armijo, L. (1966): Minimization of functions having Lipschitz continuous first partial derivatives,
-Pacific Journal of Mathematics 16.
+(2000): Bundle adjustment — a modern synthesis, sections 6 and 9; Harville, D. A. (1977): Maximum
+likelihood approaches to variance component estimation and to related problems, Journal of the
+American Statistical Association 72, section 5.2; Armijo, L. (1966): Minimization of functions
+having Lipschitz continuous first partial derivatives, Pacific Journal of Mathematics 16.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     project,
 )
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2, scaled_inverse, unit_diagonal
+from thermocald.photogrammetry.field.testfield import plane_fit
+from thermocald.photogrammetry.linalg import median_variance, scaled_inverse, unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +55,14 @@ _SEPARATE_NOTHING = (
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _LEAST_DECREASE = 0.5  # of what the step predicts
-_DISAGREE = 5.0  # standard deviations of the largest eigenvalue
+_OF_CAMERA = ("c", "x0", "y0", "C1", "C2")
+# of `_OF_CAMERA`, of the squares of a bent field, and of squares in the image
+_KINDS = (0, 1, 1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4)
+_FEWEST_TO_COMPARE = 3  # photographs
+_LEAST_SHARE = 1e-6  # of the largest eigenvalue, below which an error is absorbed altogether
+_DISAGREE = 3.0  # standard deviations of the ratio of two variances
+_ITERATIONS = 60
+_WIDEST = 3.0  # the factor for a variance from hardly any degree of freedom
 _CONTROLLED = 1e-3  # cofactor of a residual below which no other observation controls it
 
 
@@ -155,6 +163,21 @@ class Cofactors:
     weakest: tuple[str, ...] = ()
 
 
+class SharedErrors(NamedTuple):
+    """The errors that the image points of one photograph share: another focus, a shifted principal
+    point, a sheared image (rolling shutter), a bent field, and what else bends the image smoothly.
+
+    disagreement: how many times larger than by chance, 1 if that may be chance; noise: variance of
+    unit weight without them; cameras (e, u), targets (e, 3m): roots of what the e errors add to
+    the covariance.
+    """
+
+    disagreement: float
+    noise: float
+    cameras: Array
+    targets: Array
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleAdjustment:
     """The adjustment of one camera's image points with interior orientation, poses and targets.
@@ -184,8 +207,8 @@ class BundleAdjustment:
 
         A free network takes damped steps (Levenberg-Marquardt); one with known targets whole or
         shorter ones (Gauss-Newton), which follow the narrow valley of a weak geometry. robust:
-        renew weights in each iteration (Cauchy, scaled by the median residual). Raises
-        GeometryError if it does not converge.
+        renew weights in each iteration (Cauchy, scaled by the median residual); then, as in a free
+        network, the last iteration is good enough. Raises GeometryError if it does not converge.
         """
         gauge = self.known is None
         w = np.ones(len(self.rays))
@@ -194,7 +217,7 @@ class BundleAdjustment:
         for _ in range(iterations):
             if robust:  # weights fall from 1 with the square of the residual
                 size2 = np.sum(v * v, axis=1)
-                w = 1.0 / (1.0 + size2 / (9.0 * max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)))
+                w = 1.0 / (1.0 + size2 / (9.0 * median_variance(size2)))
             cost = self.cost(bundle, v, w)
             normals = self._normal_equations(bundle, w)
             fraction = 1.0
@@ -229,7 +252,7 @@ class BundleAdjustment:
             if step[2] < 1e-8 or (robust and cost - new < 1e-6 * cost):
                 break
         else:
-            if not gauge:
+            if not gauge and not robust:
                 size = np.sqrt(np.mean(v * v))
                 raise GeometryError(
                     f"the adjustment did not converge in {iterations} iterations; residuals are "
@@ -239,6 +262,13 @@ class BundleAdjustment:
         # orthonormal to the last bit
         U, _, Vt = np.linalg.svd(bundle.rotations)
         return replace(bundle, rotations=U @ Vt)
+
+    def approach(self, bundle: Bundle, iterations: int) -> Bundle:
+        """Adjust a bundle robustly: with c, x0, y0 and A1 first, then with all that is free."""
+        for last in (4, _N_IOP):
+            stage = replace(self, free=self.free[self.free < last])
+            bundle = stage.solve(bundle, robust=True, iterations=iterations)
+        return bundle
 
     def cofactors(self, bundle: Bundle) -> Cofactors:
         """Return the cofactors at the solution. Raises GeometryError if it is undetermined."""
@@ -289,61 +319,72 @@ class BundleAdjustment:
         )
         return total
 
-    def without_each(self, bundle: Bundle, found: Cofactors) -> tuple[Array, Array]:
-        """Return how the interior orientation moves if a photograph is left out, (k, f), and the
-        cofactors (k, f, f) of that, for each of the k photographs; to first order.
+    def shared_errors(
+        self, bundle: Bundle, found: Cofactors, variance: float, redundancy: int
+    ) -> SharedErrors:
+        """Estimate the errors that the image points of one photograph share.
 
-        Raises LinAlgError if the other photographs do not determine it.
+        variance: of unit weight, from all residuals. What all photographs have in common shows
+        nothing and is left out.
         """
-        f, moves, cofactors = len(self.free), [], []
-        for photo in range(len(bundle.centres)):
-            S, s, _ = _reduce(self._without(bundle, photo))
-            np.linalg.cholesky(unit_diagonal(S)[0])
-            Q = scaled_inverse(S)
-            moves.append(Q[:f] @ s)
-            cofactors.append((Q - found.cameras)[:f, :f])
-        return np.array(moves), np.array(cofactors)
+        rays, k, f, q = self.rays, len(bundle.centres), len(self.free), len(_KINDS)
+        E, ones = self._effects(bundle), np.ones(len(self.rays))
+        v, by_camera, by_point = self._linearised(bundle, ones)
+        R, r = np.zeros((f + 6 * k, k, q)), np.zeros((len(bundle.points), 3, k, q))
+        blocks, b = np.zeros((k, q, q)), np.zeros((k, q))
+        for i in range(k):
+            mine = rays.photo == i
+            own, J = E[mine], np.swapaxes(by_camera[mine], 1, 2) @ E[mine]
+            rows = np.r_[:f, f + 6 * i : f + 6 * i + 6]
+            R[rows, i] = J.sum(axis=0)
+            np.add.at(r[:, :, i], rays.target[mine], np.swapaxes(by_point[mine], 1, 2) @ own)
+            blocks[i] = np.einsum("naq,nap->qp", own, own)
+            b[i] = np.einsum("naq,na->q", own, v[mine])
+        R_all, r_all = R.reshape(len(R), -1), r.reshape(-1, k * q)
+        # how cameras and targets follow the errors
+        cameras = found.cameras @ (R_all + found.follow @ r_all)
+        targets = (found.own @ r.reshape(-1, 3, k * q)).reshape(r_all.shape)
+        targets += found.follow.T @ cameras
+        M = (-R_all.T @ cameras - r_all.T @ targets).reshape(k, q, k, q)
+        np.einsum("iqip->iqp", M)[...] += blocks
+        # their mean is eliminated
+        of_mean = M.sum(axis=2).reshape(k * q, q)
+        inverse = np.linalg.pinv(M.sum(axis=(0, 2)), rcond=1e-6, hermitian=True)
+        b = b.ravel() - of_mean @ inverse @ b.sum(axis=0)
+        M = M.reshape(k * q, k * q) - of_mean @ inverse @ of_mean.T
+        values, vectors = np.linalg.eigh((M + M.T) / 2)
+        known = values > _LEAST_SHARE * values[-1]
+        rank = int(known.sum())
+        left = redundancy - rank
+        if k < _FEWEST_TO_COMPARE or left < rank:
+            return SharedErrors(1.0, variance, 0 * cameras.T, 0 * targets.T)
+        explained = float(np.sum((b @ vectors)[known] ** 2 / values[known]))
+        noise = (variance * redundancy - explained) / left
+        ratio = explained / rank / noise
+        disagree = ratio > 1 + _DISAGREE * np.sqrt(2 / rank + 2 / left)
+        sds = _variance_components(M / noise, b / noise, _WIDEST if disagree else 1.0)[:, None]
+        return SharedErrors(
+            float(np.sqrt(ratio)) if disagree else 1.0, noise, sds * cameras.T, sds * targets.T
+        )
 
-    def scatter(
-        self, bundle: Bundle, found: Cofactors, variance: float
-    ) -> tuple[float, tuple[Array, Array]]:
-        """Return how many times farther than by chance the unknowns of a free network move if a
-        photograph is left out, 1 if that may be chance, and roots (k, u), (k, 3m) of what the
-        cofactors lack then, by the jackknife.
-
-        variance: of unit weight. Errors that image points of one photograph share make few large
-        combinations of moves: the largest is compared with that of independent image points.
+    def _effects(self, bundle: Bundle) -> Array:
+        """Return whitened partials (n, 2, q) of the image points by what photographs differ in
+        (`_KINDS`), with a mean square of 1.
         """
-        k, m, f = len(bundle.centres), len(bundle.points), len(self.free)
-        cameras, targets, by_points = np.zeros((k, f + 6 * k)), np.zeros((k, 3 * m)), np.zeros(k)
-        nothing = 1.0, (0 * cameras, 0 * targets)
-        for photo in range(k):
-            step = self._step(bundle, self._without(bundle, photo), 0.0)
-            if step is None:  # the others are too few
-                return nothing
-            cameras[photo], targets[photo], by_points[photo] = step[0], step[1].ravel(), step[2]
-        A, B, D, *_ = self._normal_equations(bundle, np.ones(len(self.rays)))
-        mixed, by_target = cameras @ B @ targets.T, targets.reshape(k, m, 3)
-        squares = cameras @ A @ cameras.T + mixed + mixed.T
-        squares += np.einsum("kmi,mij,lmj->kl", by_target, D, by_target)
-        # by chance each scaled move has a square of n, however unequal the photographs' weights are
-        n = f + 3 * m - 7
-        own = np.trace(self.explained(bundle, found), axis1=1, axis2=2)
-        expected = variance * (np.bincount(self.rays.photo, own) - 6)
-        scale = np.sqrt(n * by_points / expected / squares.diagonal())
-        largest = float(np.linalg.eigvalsh(squares * np.outer(scale, scale))[-1])
-        root = np.sqrt(n) + np.sqrt(k)
-        sd = root * np.cbrt(1 / np.sqrt(n) + 1 / np.sqrt(k))
-        if not largest > root**2 + _DISAGREE * sd:
-            return nothing
-        values, vectors = np.linalg.eigh(squares * ((k - 1) / k / variance))
-        excess = np.maximum(1 - (1 + n / (k - 1)) / np.maximum(values, 1), 0)
-        roots = (np.sqrt(excess * (k - 1) / k / variance) * vectors).T
-        return float(np.sqrt(largest) / root), (roots @ cameras, roots @ targets)
-
-    def _without(self, bundle: Bundle, photo: int) -> _Normals:
-        """Return the normal equations without a photograph, but for a trace that gives its pose."""
-        return self._normal_equations(bundle, np.where(self.rays.photo == photo, 1e-9, 1.0))
+        columns = np.array([IOP_NAMES.index(name) for name in _OF_CAMERA])
+        every = replace(self, free=columns, known=None)
+        _, by_camera, by_point = every._linearised(bundle, np.ones(len(self.rays)))
+        middle, axes, _ = plane_fit(bundle.points)
+        x, y, _ = ((bundle.points - middle) @ axes.T)[self.rays.target].T
+        bent = (by_point @ axes[2])[:, :, None] * np.stack([x * x, x * y, y * y], axis=1)[:, None]
+        u, w = (self.rays.points - self.sensor.centre).T
+        squares = np.stack([u * u, u * w, w * w], axis=1)
+        smooth = self.rays.whitening[..., None] * squares[:, None, None]
+        smooth = smooth.reshape(len(squares), 2, 6)
+        E = np.concatenate([by_camera[:, :, : len(columns)], bent, smooth], axis=2)
+        size = np.sqrt(np.mean(np.sum(E * E, axis=1), axis=0))
+        scaled: Array = E / np.where(size > 0, size, 1.0)
+        return scaled
 
     def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""
@@ -452,26 +493,51 @@ def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Arra
     return A - BD @ B.T, a - BD @ d.ravel(), inverses
 
 
+def _variance_components(M: Array, b: Array, widest: float) -> Array:
+    """Return the standard deviation (k q,) of each photograph's errors by restricted maximum
+    likelihood: one for all errors of a kind.
+
+    M, b: their normal equations, for a noise of 1. With few photographs the variance itself is
+    uncertain: it is that of Student's t with as many degrees of freedom as the data determine.
+    """
+    kinds = np.eye(max(_KINDS) + 1)[np.tile(_KINDS, len(b) // len(_KINDS))]
+    start = (b**2 @ kinds) / np.maximum(M.diagonal() ** 2 @ kinds, 1e-300)
+    variances = start
+    for _ in range(_ITERATIONS):
+        sds = np.sqrt(kinds @ variances)
+        Q = np.linalg.inv(sds[:, None] * M * sds + np.eye(len(b)))
+        errors = sds * (Q @ (sds * b))
+        freedom = (1 - Q.diagonal()) @ kinds
+        new = errors**2 @ kinds / np.maximum(freedom, 1e-12)
+        new = np.clip(new, np.maximum(variances / 10, 1e-12 * start), variances * 10)
+        # one that vanishes falls for long
+        settled = np.all(np.abs(new - variances) < 1e-2 * variances + 1e-4 * start)
+        variances = new
+        if settled:
+            break
+    wider = np.minimum(freedom / np.maximum(freedom - 2, 1e-3), widest)
+    result: Array = np.sqrt(kinds @ (variances * wider))
+    return result
+
+
 def inner_constraints(
-    bundle: Bundle, found: Cofactors, free: Index, scatter: tuple[Array, Array]
+    bundle: Bundle, found: Cofactors, free: Index, shared: SharedErrors
 ) -> tuple[Array, Array, Array]:
-    """Return the cofactors of a free network with inner constraints over the targets: of the
+    """Return the covariances of a free network with inner constraints over the targets: of the
     interior orientation (10, 10), zero if held, the centres (k, 3, 3) mm² and the targets (3m, 3m)
     mm².
-
-    scatter: roots of the additional cofactors (`BundleAdjustment.scatter`).
     """
     f, k, m = len(free), len(bundle.centres), len(bundle.points)
-    more_c, more_p = scatter
-    Qp = found.follow.T @ found.mixed + more_p.T @ more_p
+    _, noise, more_c, more_p = shared
+    Qp = noise * found.follow.T @ found.mixed + more_p.T @ more_p
     blocks = np.einsum("mimj->mij", Qp.reshape(m, 3, m, 3))  # a view
-    blocks += found.own
+    blocks += noise * found.own
     null_c, null_p = null_space(bundle.centres, bundle.points, f)
     K = np.linalg.solve(null_p.T @ null_p, null_p.T)
     KQ = K @ Qp
     inner = Qp - null_p @ KQ - KQ.T @ null_p.T + null_p @ (KQ @ K.T) @ null_p.T
-    KQc = K @ (found.mixed.T + more_p.T @ more_c)
-    cameras = found.cameras + more_c.T @ more_c
+    KQc = K @ (noise * found.mixed.T + more_p.T @ more_c)
+    cameras = noise * found.cameras + more_c.T @ more_c
     cameras = cameras - null_c @ KQc - KQc.T @ null_c.T + null_c @ (KQ @ K.T) @ null_c.T
     interior = np.zeros((_N_IOP, _N_IOP))
     interior[np.ix_(free, free)] = cameras[:f, :f]

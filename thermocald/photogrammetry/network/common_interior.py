@@ -6,9 +6,7 @@ unknowns, so that the iteration ends at the minimum of the sum of squares. A pho
 an interior orientation of its own is used as well.
 
 Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
-Brown, D. C. (1976): The bundle adjustment - progress and prospects; the covariance between
-photographs as MacKinnon, J. G., White, H. (1985): Some heteroskedasticity-consistent covariance
-matrix estimators, Journal of Econometrics 29 (jackknife), by clusters.
+Brown, D. C. (1976): The bundle adjustment - progress and prospects.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
 from thermocald.photogrammetry.epoch.snooping import settle
 from thermocald.photogrammetry.field.testfield import plane_fit
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (
     BEHIND,
     Bundle,
@@ -47,11 +45,13 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-_ITERATIONS = 60
+_ITERATIONS = 200
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
+_GROSS = 20.0  # times the usual residual; an image point beyond it is left out at first
+_POOR = 4.0  # times the residuals of a typical photograph
+_FEWEST_TO_COMPARE = 4  # photographs
+_ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
-_FEWEST_TO_COMPARE = 3  # photographs
-_DISAGREE = 3.0  # standard deviations of the mean square of the moves
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
 
@@ -61,9 +61,9 @@ class CommonInterior:
 
     interior; covariance (16, 16): its EOP block is zero; exteriors, exterior_covariances (n, 6, 6);
     sigma0; redundancy; used: mask of the observations by photograph; residuals (n, 2) px: by
-    photograph; reasons: why the geometry is weak, empty if it is not; disagreement: how many times
-    farther than the image points explain the interior orientation moves if a photograph is left
-    out, 1 if that may be chance; covariances include it.
+    photograph; reasons: why the geometry is weak, empty if it is not; disagreement: of the
+    photographs (`SharedErrors`), which the covariances include; left_out: {position: reason} of
+    photographs that contradict the others, which the n do not include.
     """
 
     interior: InteriorOrientation
@@ -76,6 +76,7 @@ class CommonInterior:
     residuals: tuple[Array, ...]
     reasons: tuple[str, ...]
     disagreement: float
+    left_out: dict[int, str]
 
 
 def adjust_common_interior(
@@ -85,12 +86,11 @@ def adjust_common_interior(
     interior: InteriorOrientation,
     exteriors: Sequence[ExteriorOrientation],
     settings: AdjustmentSettings | None = None,
-    fitting: Sequence[Mask] | None = None,
 ) -> CommonInterior:
     """Adjust photographs that share an interior orientation, from start values.
 
-    fitting: masks of the observations to use at first, by photograph; others that fit the result
-    are taken back. Raises GeometryError if the adjustment does not converge or is singular.
+    A robust adjustment comes first, which photographs of another camera and gross errors do not
+    distort. Raises GeometryError if the adjustment does not converge or is singular.
     """
     s = settings or AdjustmentSettings()
     free = np.array(free_columns(s.free), dtype=np.int64)
@@ -101,21 +101,37 @@ def adjust_common_interior(
     uncertain = (sigmas > 0).any(axis=1)
     weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
     known = KnownTargets(places, weights, uncertain)
-    bundle = Bundle(
-        interior.as_array(),
-        np.array([e.rotation for e in exteriors]),
-        np.array([e.centre for e in exteriors]),
-        places,
-    )
-    used = np.ones(len(rays), dtype=bool)
-    if fitting is not None and s.snooping_alpha > 0:
-        used = np.concatenate(list(fitting))
+    rotations, centres = zip(*((e.rotation, e.centre) for e in exteriors), strict=True)
+    bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
     every = BundleAdjustment(sensor, rays, free, known)
+    in_pixels = replace(every, rays=rays.in_pixels())
+    used, left_out = np.ones(len(rays), dtype=bool), dict[int, str]()
+    with suppress(GeometryError):
+        bundle = every.approach(bundle, _ITERATIONS)
+        size = np.linalg.norm(every.residuals(bundle), axis=1)
+        left_out = _contradicting(in_pixels.residuals(bundle), size, rays.photo)
+        if s.snooping_alpha > 0:
+            used = size <= _GROSS * max(float(np.median(size)), 1.0)
+    if left_out:
+        others = [i for i in range(len(photographs)) if i not in left_out]
+        starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[others]]
+        interior = InteriorOrientation.from_array(bundle.interior)
+        chosen = [photographs[i] for i in others]
+        rest = adjust_common_interior(sensor, testfield, chosen, interior, starts, s)
+        more = {others[i]: reason for i, reason in rest.left_out.items()}
+        return replace(rest, left_out=left_out | more)
     history = np.zeros(len(rays), dtype=np.int8)
     for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
         if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
             raise GeometryError("targets came to lie behind the camera during the iteration")
         part = BundleAdjustment(sensor, rays.select(used), free, known)
+        n = len(part.rays)
+        redundancy = 2 * n - len(free) - 6 * len(photographs)
+        if redundancy < s.bounds.minimum_redundancy:
+            raise GeometryError(
+                f"{n} image points in {len(photographs)} photographs leave a redundancy of "
+                f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
+            )
         bundle = part.solve(bundle, iterations=_ITERATIONS)
         found = part.cofactors(bundle)
         v = every.residuals(bundle)
@@ -126,28 +142,14 @@ def adjust_common_interior(
         if kept is used:
             break
         used = kept
-    n = int(np.count_nonzero(used))
-    redundancy = 2 * n - len(free) - 6 * len(photographs)
-    if redundancy < s.bounds.minimum_redundancy:
-        raise GeometryError(
-            f"{n} image points in {len(photographs)} photographs leave a redundancy of "
-            f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
-        )
-    variance = every.cost(bundle, v[used], np.ones(n)) / redundancy
-    Q, f = found.cameras * variance, len(free)
+    variance = part.cost(bundle, v[used], np.ones(n)) / redundancy
+    f, eops = len(free), bundle.exteriors()
+    # how weak the geometry is, whatever the photographs disagree in
+    weak = _weaknesses(bundle, part, found.cameras[:f, :f] * variance, s)
+    shared = part.shared_errors(bundle, found, variance, redundancy)
+    Q = found.cameras * shared.noise + shared.cameras.T @ shared.cameras
     covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[:f, :f]
-    eops = bundle.exteriors()
-    # how weak the geometry is, whatever the photographs disagree in
-    weak = _weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)
-    disagreement = 1.0
-    if len(photographs) >= _FEWEST_TO_COMPARE:
-        with suppress(np.linalg.LinAlgError):  # the others may be too few without one of them
-            moves, cofactors = part.without_each(bundle, found)
-            disagreement, own = _between(moves, cofactors * variance, Q[:f, :f])
-            follow = np.linalg.solve(Q[:f, :f], Q[:f])
-            Q = Q + follow.T @ (own - Q[:f, :f]) @ follow
-            covariance[np.ix_(free, free)] = own
     ends = np.cumsum([len(o) for o in photographs])[:-1]
     return CommonInterior(
         InteriorOrientation.from_array(bundle.interior),
@@ -157,31 +159,32 @@ def adjust_common_interior(
         float(np.sqrt(variance)),
         redundancy,
         tuple(np.split(used, ends)),
-        tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
+        tuple(np.split(in_pixels.residuals(bundle), ends)),
         tuple(weak),
-        disagreement,
+        shared.disagreement,
+        {},
     )
 
 
-def _between(moves: Array, cofactors: Array, own: Array) -> tuple[float, Array]:
-    """Return how many times farther than by chance the interior orientation moves if a photograph
-    is left out, and its covariance (f, f).
-
-    moves (k, f), with covariances (k, f, f) if all image points are independent; own (f, f):
-    covariance in that case. If they move too far, the errors within a photograph are correlated
-    (another focus, a board that bends, a rolling shutter); the photographs are still independent of
-    each other, and their jackknife gives the covariance where it is larger.
+def _contradicting(residuals: Array, size: Array, photo: Index) -> dict[int, str]:
+    """Return {position: reason} of photographs with too large residuals (n, 2) px, after a robust
+    adjustment; size (n,): in standard deviations.
     """
-    k, f = moves.shape
-    root = np.linalg.cholesky(own)
-    moves = np.linalg.solve(root, moves.T).T
-    cofactors = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, cofactors), 1, 2))
-    ratio = float(np.mean(moves * np.linalg.solve(cofactors, moves[..., None])[..., 0]))
-    if not ratio > 1 + _DISAGREE * np.sqrt(2 / (k * f)):
-        return 1.0, own
-    values, vectors = np.linalg.eigh((k - 1) / k * moves.T @ moves)
-    wide = root @ vectors
-    return float(np.sqrt(ratio)), wide * np.maximum(values, 1.0) @ wide.T
+    median = {
+        i: float(np.median(size[photo == i]))
+        for i, n in enumerate(np.bincount(photo))
+        if n >= _ENOUGH_TARGETS
+    }
+    if len(median) < _FEWEST_TO_COMPARE:
+        return {}
+    usual = max(float(np.median(list(median.values()))), 1.0)
+    return {
+        i: f"residuals of {np.sqrt(np.mean(residuals[photo == i] ** 2)):.2f} px, {own / usual:.0f} "
+        "times those of the other photographs: another camera, zoom or focus, the camera moved "
+        "during the exposure, or the board was bent; left out"
+        for i, own in median.items()
+        if own > _POOR * usual
+    }
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
@@ -202,7 +205,7 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     if alpha <= 0:
         return used
     # χ² with 2 degrees of freedom
-    limit = -2.0 * np.log(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
+    limit = -2.0 * np.log(alpha) * median_variance(tests[used])
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])
     kept: Mask = (tests <= limit) | (used & (tests < worst[target]))
@@ -210,31 +213,29 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
 
 
 def _weaknesses(
-    sensor: Sensor,
-    values: Array,
-    eops: Array,
-    places: Array,
-    rays: ImageRays,
-    covariance: Array,
-    s: AdjustmentSettings,
+    bundle: Bundle, adjustment: BundleAdjustment, Q: Array, s: AdjustmentSettings
 ) -> list[str]:
-    """Return the reasons why the photographs do not determine the free parameters."""
+    """Return the reasons why the photographs do not determine the free parameters.
+
+    Q: covariance of the free parameters from the noise of the image points.
+    """
     reasons: list[str] = []
-    _, axes, flat = plane_fit(places[np.unique(rays.target)])
+    _, axes, flat = plane_fit(bundle.points[np.unique(adjustment.rays.target)])
     if flat and "c" in s.free:
-        angles = [obliqueness_deg(eop, axes[2]) for eop in eops]
+        angles = [obliqueness_deg(eop, axes[2]) for eop in bundle.exteriors()]
         if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:
             reasons.append(
-                f"one plane, in all {len(eops)} photographs within {max(angles):.0f}° of frontal "
+                f"one plane, in all {len(angles)} photographs within {max(angles):.0f}° of frontal "
                 f"(some at {_LARGEST_OBLIQUENESS_NEEDED_DEG:.0f}° and more are needed): principal "
                 "distance and distance to the field cannot be separated, however small the "
                 "residuals are"
             )
-    coverage = image_coverage(sensor, rays.points)
+    coverage = image_coverage(adjustment.sensor, adjustment.rays.points)
     if coverage < s.bounds.coverage:
         reasons.append(
             f"the targets cover {coverage:.1%} of the image in all photographs together (at least "
             f"{s.bounds.coverage:.0%} are needed)"
         )
-    sd = np.sqrt(np.diag(covariance))
-    return reasons + uncertain(sensor, values, sd, s.free, s.bounds)
+    sd = np.zeros(16)
+    sd[adjustment.free] = np.sqrt(np.diag(Q))
+    return reasons + uncertain(adjustment.sensor, bundle.interior, sd, s.free, s.bounds)

@@ -190,18 +190,6 @@ class _Start:
         self.points[:] = np.nan
         self.intersect()
 
-    def network(self, free: Index) -> tuple[Bundle, list[int], ImageRays]:
-        """Add the other photographs and adjust roughly. Raises GeometryError if that fails."""
-        self.refine()
-        self.extend()
-        bundle, photos, used = self.bundle()
-        for stage in ([0], [0, 1, 2, 3], range(len(bundle.interior))):
-            some = free[np.isin(free, stage)]
-            bundle = BundleAdjustment(self.sensor, used, some).solve(
-                bundle, robust=True, iterations=15
-            )
-        return bundle, photos, used
-
 
 def approximate(
     sensor: Sensor,
@@ -235,10 +223,14 @@ def approximate(
                     start.begin_with_pair(way)
                 else:
                     start.begin_with_nominal(np.asarray(nominal, dtype=float))
-                bundle, photos, used = start.network(free)
+                start.refine()
+                start.extend()
+                bundle, photos, used = start.bundle()
+                adjustment = BundleAdjustment(sensor, used, free)
+                bundle = adjustment.approach(bundle, 15)
             except GeometryError:
                 continue
-            off = BundleAdjustment(sensor, used.in_pixels(), free).residuals(bundle)
+            off = replace(adjustment, rays=used.in_pixels()).residuals(bundle)
             median = float(np.median(np.linalg.norm(off, axis=1)))
             # a difference of five per cent of the image points does not count
             missing = round(20 * (1 - len(used) / len(rays)))

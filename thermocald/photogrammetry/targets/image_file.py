@@ -315,7 +315,9 @@ class EncodedImage:
                 f"{self.name}: is not an image that can be decoded ({error.err})"
             ) from error
         if image is None:
-            raise ImageError(f"{self.name}: is not an image (JPEG, PNG and TIFF are read)")
+            raise ImageError(
+                f"{self.name}: is not an image (JPEG, PNG and TIFF are read; convert HEIC)"
+            )
         return image
 
     def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:

@@ -7,7 +7,6 @@ would cost the daemon 20 MB.
 from __future__ import annotations
 
 import math
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,10 +31,14 @@ def median_variance(squares: Array) -> float:
 
 
 def median_known(values: Array) -> Array:
-    """Return the median over the first axis, NaN ignored; NaN where all values are NaN."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=0))
+    """Return the median over the first axis, NaN ignored; NaN where all values are NaN.
+
+    numpy's warning of the latter is avoided: to ignore warnings is not safe between threads.
+    """
+    known = ~np.isnan(values).all(axis=0)
+    median = np.full(values.shape[1:], np.nan)
+    median[known] = np.nanmedian(values[:, known], axis=0) if known.any() else np.nan
+    return median
 
 
 def unit_diagonal(N: Array, ridge: float = 0.0) -> tuple[Array, Array]:

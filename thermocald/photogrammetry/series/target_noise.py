@@ -11,11 +11,12 @@ the covariance of least squares under correlated noise, Q (Aᵀ P C P A) Q, as K
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from thermocald.photogrammetry.linalg import median_known
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
@@ -61,13 +62,13 @@ def noise_ratios(
         left = np.maximum(n - lost, 0.0)
         squares *= np.divide(n, left, out=np.full_like(n, np.nan), where=left > 0)
         n = left
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # targets that are not in use
-        middle = np.nanmedian(squares, axis=0) / _MEDIAN_CHI2_1
-        usual = float(np.nanmedian(middle)) if np.isfinite(middle).any() else 1.0
-        worth = MEDIAN_WORTH * n
-        cut = (worth * middle + _MEDIANS_FROM * usual) / (worth + _MEDIANS_FROM)
-        mean = np.nanmean(np.minimum(squares, _CUT**2 * cut), axis=0) / _LEFT_OF_CUT
+    middle = median_known(squares) / _MEDIAN_CHI2_1
+    usual = float(np.nanmedian(middle)) if np.isfinite(middle).any() else 1.0
+    worth = MEDIAN_WORTH * n
+    cut = (worth * middle + _MEDIANS_FROM * usual) / (worth + _MEDIANS_FROM)
+    capped = np.minimum(squares, _CUT**2 * cut)
+    with np.errstate(invalid="ignore"):  # targets that are not in use
+        mean = np.nansum(capped, axis=0) / (~np.isnan(capped)).sum(axis=0) / _LEFT_OF_CUT
     few = worth < _MEDIANS_FROM
     ratio, worth = np.where(few, mean, middle), np.where(few, n, worth)
     of_usual = np.where(few, (1.0 - 2.0 / (9.0 * np.maximum(n, 1.0))) ** 3, 1.0)  # Wilson, Hilferty

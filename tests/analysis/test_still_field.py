@@ -60,3 +60,19 @@ def test_the_study_reports_a_knock(tmp_path):
     text = out.read_text()
     assert '"kind": "knock"' in text
     assert "The test field moved" in text
+
+
+def test_a_board_that_alone_is_seen_has_not_moved(tmp_path):
+    """Regression: a board moved by 0.7 m, and no epoch after the others vanished was accepted."""
+    succeed("simulate", "--preset", "rpi-v2.1-heating", "--out", tmp_path / "M1", "--seed", "1")
+    file = tmp_path / "M1" / "observations.csv"
+    head, *rows = file.read_text().splitlines()
+    left = [row for row in rows if int(row.split(",")[0]) <= 80 or row.split(",")[1][0] == "z"]
+    file.write_text("\n".join([head, *left, ""]))
+
+    found = replayed(tmp_path / "M1")
+
+    assert found["field_movements"] == []
+    assert found["ok"] == 150
+    c = found["parameters"][0]
+    assert abs(c["per_kelvin"] - 0.1995e-3) < 4 * c["sd_per_kelvin"]

@@ -434,9 +434,13 @@ def _rigid(s: FieldSeries, rows: Index) -> Array:
 
 
 def _board_equations(s: FieldSeries, rows: Index, rigid: Array) -> tuple[Array, Array]:
-    """Return normal equations (E, 6, 6), (E, 6) of a board's movement, the cameras eliminated."""
+    """Return normal equations (E, 6, 6), (E, 6) of a board's movement, the cameras eliminated.
+
+    They are 0 in epochs that show too few targets beside the board: it would move with the camera.
+    """
     assert s.cameras is not None
-    w = s.w[:, rows].reshape(len(s.times), -1)
+    others = s.used.sum(axis=1) - s.used[:, rows].sum(axis=1)
+    w = s.w[:, rows].reshape(len(s.times), -1) * (others >= _FEWEST_OTHERS)[:, None]
     C = weighted_products(w, rigid, s.A[rows].reshape(-1, s.A.shape[-1]))
     M = weighted_products(w, rigid, rigid) - C @ s.cameras @ np.swapaxes(C, 1, 2)
     v = np.nan_to_num(s.residuals[:, rows]).reshape(len(w), -1)

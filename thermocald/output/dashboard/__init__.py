@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-__all__ = ["serve"]
-
 log = logging.getLogger(__name__)
 
 _SHORTEST_TOKEN = 16

@@ -259,7 +259,8 @@ class Calibration(Result):
         """Return residuals and coverage as HTML text; title: by default the camera's name."""
         from thermocald.output.calibration import render_calibration
 
-        return render_calibration(self.photographs, self.file.sensor, title or self.file.name)
+        name = title or self.file.name
+        return render_calibration(self.photographs, self.file.sensor, name, self.doubts)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""

@@ -132,7 +132,9 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     (folder / "f_text.jpg").write_text("no image")
     board = tmp_path / "board.csv"
     run("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
-    done = finish("calibrate", folder, "--testfield", board, "--pixel-pitch", 0.003, "--json", "-")
+    report = tmp_path / "report.html"
+    paths = ("--testfield", board, "--report", report)
+    done = finish("calibrate", folder, *paths, "--pixel-pitch", 0.003, "--json", "-")
     document = json.loads(done.stdout)
     status = {p["image"].rsplit("/", 1)[1]: p["status"] for p in document["photographs"]}
     assert sum(status[n] == "ok" for n in images) >= len(opencv) == 9
@@ -141,6 +143,7 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     # random halves of the folder differ by 14 px in c; as if points were independent: 1.2 px
     assert 4 < document["interior"]["sd_c"] / 0.003 < 16
     assert document["doubts"][0].startswith("the photographs disagree")
+    assert document["doubts"][0] in report.read_text()
     words = ["wrong_size", "ok", "nothing_found", "large_residuals", "flat", "bad_image"]
     assert [status[n] for n in sorted(status) if n[1] == "_"] == words
     assert all(p["reason"] for p in document["photographs"] if p["status"] != "ok")

@@ -19,6 +19,7 @@ from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, imag
 from thermocald.numbers import UNITS, coefficient, listed, parameter_label, percent, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
+from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,8 +36,10 @@ _FIELD_DOMINATES = 2.0  # times the standard deviation from the image points alo
 _FEW_NAMES = 3  # for which a legend or a line has room
 
 
-def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
-    """Return the report as HTML text."""
+def render_calibration(
+    result: Photographs, sensor: Sensor, name: str, doubts: Sequence[str] = ()
+) -> str:
+    """Return the report as HTML text; doubts: probable mistakes in the estimated camera."""
     posed = [p for p in result.photographs if len(p.points)]
     tables = (interior_table(result, sensor), _correlations(result))
     sections = (
@@ -49,6 +52,7 @@ def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
         _answer(result, posed, sensor),
         tuple(s for s in sections if s.figures or s.tables),
         (f"{name}, {sensor}.",),
+        tuple(map(as_sentence, doubt_lines(doubts))),
     ).page()
 
 

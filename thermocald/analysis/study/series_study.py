@@ -251,12 +251,15 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     significance = _significance(series, settings, notes)
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
+    short: dict[str, list[str]] = {}
+    for c in channels:
+        if slopes := [parameter_label(n) for n, d in c.dependences.items() if d.too_short]:
+            short.setdefault(", ".join(slopes), []).append(parameter_label(c.thermometer.name))
     notes += [
-        f"Slopes of {', '.join(short)} on {c.thermometer.name}: the noise is correlated over more "
-        "than a seventh of the series, which is too short for their standard deviations; take "
-        "those as an order of magnitude."
-        for c in channels
-        if (short := [parameter_label(n) for n, d in c.dependences.items() if d.too_short])
+        f"Slopes of {of} on {' and '.join(on)}: the noise is correlated over more than a seventh "
+        "of the series, which is too short for their standard deviations; take those as an order "
+        "of magnitude."
+        for of, on in short.items()
     ]
     grid = image_grid(series.sensor)
     displacement = covariance = None

@@ -34,6 +34,7 @@ from thermocald.photogrammetry.network.bundle import (
     BEHIND,
     Bundle,
     BundleAdjustment,
+    Cofactors,
     ImageRays,
     KnownTargets,
     point_tests,
@@ -105,7 +106,7 @@ def adjust_common_interior(
     bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
     every = BundleAdjustment(sensor, rays, free, known)
     in_pixels = replace(every, rays=rays.in_pixels())
-    used, left_out = np.ones(len(rays), dtype=bool), dict[int, str]()
+    start, used, left_out = bundle, np.ones(len(rays), dtype=bool), dict[int, str]()
     with suppress(GeometryError):
         bundle = every.approach(bundle, _ITERATIONS)
         size = np.linalg.norm(every.residuals(bundle), axis=1)
@@ -120,29 +121,15 @@ def adjust_common_interior(
         rest = adjust_common_interior(sensor, testfield, chosen, interior, starts, s)
         more = {others[i]: reason for i, reason in rest.left_out.items()}
         return replace(rest, left_out=left_out | more)
-    history = np.zeros(len(rays), dtype=np.int8)
-    for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
-        if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
-            raise GeometryError("targets came to lie behind the camera during the iteration")
-        part = BundleAdjustment(sensor, rays.select(used), free, known)
-        n = len(part.rays)
-        redundancy = 2 * n - len(free) - 6 * len(photographs)
-        if redundancy < s.bounds.minimum_redundancy:
-            raise GeometryError(
-                f"{n} image points in {len(photographs)} photographs leave a redundancy of "
-                f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
-            )
-        bundle = part.solve(bundle, iterations=_ITERATIONS)
-        found = part.cofactors(bundle)
-        v = every.residuals(bundle)
-        # variance of a residual: less than the noise's if the ray was used, more if it was not
-        signs = np.where(used, -1.0, 1.0)[:, None, None]
-        tests = point_tests(v, np.eye(2) + signs * every.explained(bundle, found))
-        kept = settle(history, used, snoop_rays(tests, rays.target, used, s.snooping_alpha))
-        if kept is used:
-            break
-        used = kept
-    variance = part.cost(bundle, v[used], np.ones(n)) / redundancy
+    try:
+        bundle, part, found, used, redundancy = _snooped(every, bundle, used, s)
+    except GeometryError:
+        if bundle is start:
+            raise
+        # few image points in a weak geometry: a robust adjustment may follow the wrong ones
+        every_ray = np.ones(len(rays), dtype=bool)
+        bundle, part, found, used, redundancy = _snooped(every, start, every_ray, s)
+    variance = part.cost(bundle, part.residuals(bundle), np.ones(len(part.rays))) / redundancy
     f, eops = len(free), bundle.exteriors()
     # how weak the geometry is, whatever the photographs disagree in
     weak = _weaknesses(bundle, part, found.cameras[:f, :f] * variance, s)
@@ -164,6 +151,39 @@ def adjust_common_interior(
         shared.disagreement,
         {},
     )
+
+
+def _snooped(
+    every: BundleAdjustment, bundle: Bundle, used: Mask, s: AdjustmentSettings
+) -> tuple[Bundle, BundleAdjustment, Cofactors, Mask, int]:
+    """Adjust by turns with data snooping, first with the image points `used` (n,).
+
+    Returns the bundle, its adjustment with cofactors, the mask of image points and the redundancy.
+    """
+    rays = every.rays
+    history = np.zeros(len(rays), dtype=np.int8)
+    for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
+        if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
+            raise GeometryError("targets came to lie behind the camera during the iteration")
+        part = BundleAdjustment(every.sensor, rays.select(used), every.free, every.known)
+        n = len(part.rays)
+        redundancy = 2 * n - len(every.free) - 6 * len(bundle.rotations)
+        if redundancy < s.bounds.minimum_redundancy:
+            raise GeometryError(
+                f"{n} image points in {len(bundle.rotations)} photographs leave a redundancy of "
+                f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
+            )
+        bundle = part.solve(bundle, iterations=_ITERATIONS)
+        found = part.cofactors(bundle)
+        v = every.residuals(bundle)
+        # variance of a residual: less than the noise's if the ray was used, more if it was not
+        signs = np.where(used, -1.0, 1.0)[:, None, None]
+        tests = point_tests(v, np.eye(2) + signs * every.explained(bundle, found))
+        kept = settle(history, used, snoop_rays(tests, rays.target, used, s.snooping_alpha))
+        if kept is used:
+            break
+        used = kept
+    return bundle, part, found, used, redundancy
 
 
 def _contradicting(residuals: Array, size: Array, photo: Index) -> dict[int, str]:

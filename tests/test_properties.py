@@ -26,7 +26,8 @@ from thermocald.errors import ConfigurationError, ThermocaldError
 from thermocald.files import dump_yaml
 from thermocald.hal import option_names
 from thermocald.store.logger.clock import DeviceClock, time_zone
-from thermocald.store.logger.temperatures import LogOptions, read_log
+from thermocald.store.logger.columns import LogOptions
+from thermocald.store.logger.temperatures import read_log
 
 FEW = {"max_examples": 40, "deadline": None, "derandomize": True,
        "suppress_health_check": [HealthCheck.function_scoped_fixture]}  # fmt: skip

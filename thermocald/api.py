@@ -65,8 +65,8 @@ def import_photographs(
     6
     """
     from thermocald.store.logger.clock import device_clock
+    from thermocald.store.logger.columns import log_options
     from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
-    from thermocald.store.logger.temperatures import log_options
 
     recording, _ = read_series(
         read_photographs(_paths(photographs), times),

@@ -64,9 +64,9 @@ def superscript(exponent: int) -> str:
 def typeset_powers(text: str) -> str:
     """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
 
-    The unit degC behind a number, as files spell it, becomes °C.
+    The unit degC behind a number, as files spell it, becomes °C, and a minus behind = is one.
     """
-    text = _DEGREES.sub("°C", text)
+    text = _DEGREES.sub("°C", text).replace(" = -", f" = {_MINUS}")
     text = _COMPUTED.sub(lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text)
     return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
 

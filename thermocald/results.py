@@ -316,8 +316,7 @@ def discovery_lines(found: Discovery) -> list[str]:
     if found.verdict == "adequate":
         lines.append(say_adequate(found.examination))
     for effect in found.effects:
-        statement = typeset_powers(effect.statement).replace(" = -", " = −")
-        lines.append(f"{effect.effect}: {statement}")
+        lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
         for name, e in effect.estimates.items():
             if isinstance(e["value"], float):
                 sd = math.nan if e["sd"] is None else e["sd"]

@@ -18,7 +18,7 @@ from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry import camera_files
 from thermocald.series import COLDEST_C, Series, require_series, require_within, source_of
 from thermocald.store.logger.clock import device_clock
-from thermocald.store.logger.temperatures import LogOptions, log_options
+from thermocald.store.logger.columns import LogOptions, log_options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

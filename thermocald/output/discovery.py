@@ -95,7 +95,7 @@ def _answer(d: Discovery) -> Answer:
 def _statement(effect: EffectFound) -> str:
     """Return an effect's statement without the full stop; an amplitude a_x0 is written as x₀."""
     text = re.sub(r"\ba_(\w+)", lambda m: parameter_label(m[1]), effect.statement)
-    return text.replace(" = -", " = −").rstrip(".")
+    return text.rstrip(".")
 
 
 def _temperatures(d: Discovery) -> str:

@@ -106,7 +106,8 @@ def adjust_common_interior(
     bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
     every = BundleAdjustment(sensor, rays, free, known)
     in_pixels = replace(every, rays=rays.in_pixels())
-    start, used, left_out = bundle, np.ones(len(rays), dtype=bool), dict[int, str]()
+    start, left_out = bundle, dict[int, str]()
+    used = every_ray = np.ones(len(rays), dtype=bool)
     with suppress(GeometryError):
         bundle = every.approach(bundle, _ITERATIONS)
         size = np.linalg.norm(every.residuals(bundle), axis=1)
@@ -127,7 +128,6 @@ def adjust_common_interior(
         if bundle is start:
             raise
         # few image points in a weak geometry: a robust adjustment may follow the wrong ones
-        every_ray = np.ones(len(rays), dtype=bool)
         bundle, part, found, used, redundancy = _snooped(every, start, every_ray, s)
     variance = part.cost(bundle, part.residuals(bundle), np.ones(len(part.rays))) / redundancy
     f, eops = len(free), bundle.exteriors()

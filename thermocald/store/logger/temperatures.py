@@ -21,14 +21,13 @@ from thermocald.numbers import column_label, counted
 from thermocald.store.logger.clock import DeviceClock, parse_moment, time_zone, whole_seconds
 from thermocald.store.logger.columns import (
     OTHER_NAME,
+    LogOptions,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
     quoted,
     require_columns,
 )
-from thermocald.store.logger.columns import LogOptions as LogOptions
-from thermocald.store.logger.columns import log_options as log_options
 from thermocald.store.logger.dialect import (
     OUR_TIMES,
     UNIT_BEHIND,

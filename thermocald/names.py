@@ -43,7 +43,7 @@ OUR_COLUMNS = frozenset(
         "epoch", "number", "frame", "frame_time", "temperature_time", "time", "clock_trusted",
         "status", "reason", "sigma0", "redundancy", "n_observations", "n_rejected", "revision",
         "device", "series", "state", "stored", "lost", "online",
-        "pixel_pitch", "skew_s", "event", "innovation_chi2", "innovation_bound",
+        "pixel_pitch", "skew_s", "fingerprint", "event", "innovation_chi2", "innovation_bound",
         "drift_px_per_min", "mount_px", "series_epochs", "series_restarted",
         *(f"drift_{name}_px" for name in ("c", "x0", "y0")),
         *(f"{of}_{name}" for of in ("series", "level_sd") for name in ("c", "x0", "y0")),

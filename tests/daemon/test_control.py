@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import stat
 import threading
@@ -30,7 +31,7 @@ def ear(tmp_path):
 
     folder = tmp_path / ("deep" * 30)  # longer than the limit of a socket address
     control = ControlSocket(folder, answer)
-    control.open()
+    control.ensure_open()
     control.asked, control.folder = asked, folder
     yield control
     control.close()
@@ -67,6 +68,23 @@ def test_an_answer_is_json_and_a_refusal_is_raised(ear, tmp_path):
         ask(ear.folder, "session start", session={**SESSION, "epochs": -1})
     for nobody_listens in (tmp_path, tmp_path / "away"):
         assert ask(nobody_listens, "session status") is None
+
+
+def test_it_listens_again_after_its_folder_was_deleted(ear, caplog):
+    """Regression: after `rm -r thermocald.db.live` no session could begin until a restart."""
+    shutil.rmtree(ear.folder)
+    ear.folder.write_text("in the way")
+    for _ in range(3):
+        ear.ensure_open()
+    assert caplog.messages == [
+        f"{ear.folder}: sessions wait until the control socket can be opened: File exists"
+    ]
+    ear.folder.unlink()
+    assert ask(ear.folder, "session status") is None
+    for _ in range(3):
+        ear.ensure_open()
+    assert ask(ear.folder, "session status")["ok"]
+    assert [t.name for t in threading.enumerate()].count("control") == 1
 
 
 HOSTILE = [

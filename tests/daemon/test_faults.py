@@ -7,6 +7,7 @@ import resource
 import shutil
 import signal
 import subprocess
+import sys
 import time
 
 import numpy as np
@@ -104,6 +105,23 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     assert numbers == [r["epoch"] for r in results] == list(range(1, len(numbers) + 1))
     assert daemon.log().count("results wait in memory") == 1
     assert daemon.log().count("can be written again") == 1
+
+
+def test_a_hang_up_while_it_is_imported_does_not_end_it():
+    """Regression: so did one in the first second of `run`, before the service was built."""
+    script = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGHUP)
+sys.meta_path.insert(0, Finder())
+sys.argv = ["thermocald", "run", "--help"]
+from thermocald.cli import main
+main()
+"""
+    shown = subprocess.check_output([sys.executable, "-c", script], text=True)
+    assert "Acquire, calibrate" in shown
 
 
 def test_a_hang_up_while_it_starts_does_not_end_it(recording, tmp_path, monkeypatch):

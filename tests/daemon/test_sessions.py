@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 from functools import partial
 
@@ -57,6 +58,8 @@ def series_of(path) -> dict[str, tuple[str, list[int]]]:
 def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(live, command):
     daemon = live()
     daemon.until(lambda: "watch" in series_of(daemon.store))
+    shutil.rmtree(daemon.live, ignore_errors=True)
+    daemon.until(lambda: ask(daemon.live, "session status") is not None)
     process = command("start", "--camera", "phone-1", "--series", "M7", "--start", "cold",
                       "--epochs", "4", "--no-report")  # fmt: skip
     told = process.said()

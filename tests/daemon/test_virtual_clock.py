@@ -79,6 +79,17 @@ def test_a_camera_that_repeats_its_frame_is_reported_once(run):
     assert "its last 3 frames are identical" in frozen.text
 
 
+def test_a_camera_that_is_still_frozen_after_a_restart_gives_no_new_observation(run):
+    """On its clock, which starts again, the rendered camera delivers its first frame again."""
+    statuses = ["ok"]
+    for _ in range(3):
+        store, series, _ = run(1, statuses=statuses)
+        with store:
+            *_, last = store.epochs(series)
+        statuses.append("repeated_frame")
+    assert last.result.reason.startswith("it repeats the frame of epoch 2")
+
+
 def test_a_uniform_area_shows_no_target(small_camera, small_field):
     """As below the damage of a JPEG. Regression: a grey frame was `ok`, with sigmas of 0."""
     options = {"testfield": str(small_field), "model": str(small_camera)}

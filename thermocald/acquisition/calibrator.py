@@ -66,7 +66,7 @@ class EpochCalibrator:
     """
 
     testfield: TestField
-    _seen: tuple[int | None, int] = None, 0
+    seen: tuple[float | None, int] = None, 0
     """Fingerprint and number of the last epoch with observations."""
 
     def calibrate(
@@ -84,7 +84,7 @@ class EpochCalibrator:
 
     def reset(self) -> None:
         """Forget the last epoch."""
-        self._seen = None, 0
+        self.seen = None, 0
 
     def _look(
         self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None, fingerprint: int | None
@@ -102,16 +102,16 @@ class EpochCalibrator:
 
     def _repeated(self, epoch: Epoch, fingerprint: int | None) -> CalibratedEpoch | None:
         """Return the result of an epoch that repeats the last one, None for any other."""
-        if fingerprint is None or fingerprint != self._seen[0]:
+        if fingerprint is None or fingerprint != self.seen[0]:
             return None
-        why = f"it repeats the frame of epoch {self._seen[1]}, and is no new observation"
+        why = f"it repeats the frame of epoch {self.seen[1]}, and is no new observation"
         bad = failed("repeated_frame", why)
         return CalibratedEpoch(replace(epoch, observations=None), bad, {})
 
     def _remember(self, epoch: Epoch, fingerprint: int | None) -> None:
         """Remember an epoch with observations, unless a later one was calibrated before it."""
-        if epoch.number >= self._seen[1]:
-            self._seen = fingerprint, epoch.number
+        if epoch.number >= self.seen[1]:
+            self.seen = fingerprint, epoch.number
 
 
 class Calibrator(EpochCalibrator):
@@ -164,9 +164,9 @@ class Calibrator(EpochCalibrator):
         self.reset()
         if before is not None:
             self.calibrate(before)
-            seen = self._seen
+            seen = self.seen
             self.reset()
-            self._seen = seen
+            self.seen = seen
 
     def calibrate(
         self,

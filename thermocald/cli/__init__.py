@@ -16,6 +16,8 @@ from typing import Any
 # The matrices are small: threads of the linear algebra would only wait for one another (30 × slower
 # on two busy cores). This has to be set before NumPy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if "run" in sys.argv[1:3]:  # a reload must not end a daemon that is still being imported
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
 import typer
 

@@ -329,6 +329,8 @@ class CameraLine:
         # only now, since all series share the calibrator
         if self.plan.calibrator is not None:
             self.plan.calibrator.reset()  # nothing repeats a frame of another series
+            if run is not None:
+                self.plan.calibrator.seen = run.keeper.last_seen()
         self._checking = checking
 
     def _capture(self) -> None:

@@ -78,13 +78,19 @@ class ControlSocket:
     def __init__(self, folder: Path, answer: Callable[[Request], dict[str, Any]]) -> None:
         self._folder = folder
         self._answer = answer
-        self._stop = threading.Event()
         self._socket: socket.socket | None = None
         self._free = threading.BoundedSemaphore(_AT_ONCE)
-        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self._thread = threading.Thread()
+        self._failed = False
 
-    def open(self) -> None:
-        """Begin to listen; if that fails, log it: the daemon works without the socket."""
+    def ensure_open(self) -> None:
+        """Listen, and do so again after somebody has deleted the socket's file or its folder.
+
+        If that fails, log it once: the daemon works without the socket.
+        """
+        if self._socket is not None and os.path.exists(self._folder / _NAME):
+            return
+        self.close()
         channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -97,30 +103,36 @@ class ControlSocket:
             channel.listen(_BACKLOG)
         except OSError as error:
             channel.close()
-            log.warning("%s: the control socket cannot be opened: %s", self._folder, error)
+            if not self._failed:
+                why = error.strerror or error
+                what = "sessions wait until the control socket can be opened"
+                log.warning("%s: %s: %s", self._folder, what, why)
+            self._failed = True
             return
-        self._socket = channel
+        self._failed, self._socket = False, channel
+        self._thread = threading.Thread(
+            target=self._serve, args=(channel,), name="control", daemon=True
+        )
         self._thread.start()
 
     def close(self) -> None:
         """Stop listening and delete the socket's file."""
-        self._stop.set()
-        if self._socket is None:
+        channel, self._socket = self._socket, None
+        if channel is None:
             return
         with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
+            channel.shutdown(socket.SHUT_RDWR)  # wakes the thread
         self._thread.join(_REQUEST_S)
-        self._socket.close()
+        channel.close()
         with contextlib.suppress(OSError):
             (self._folder / _NAME).unlink()
 
-    def _serve(self) -> None:
-        assert self._socket is not None
-        while not self._stop.is_set():
+    def _serve(self, channel: socket.socket) -> None:
+        while channel is self._socket:
             try:
-                connection, _ = self._socket.accept()
+                connection, _ = channel.accept()
             except OSError as error:
-                if not self._stop.is_set():
+                if channel is self._socket:
                     log.error("the control socket failed: %s", error)
                 return
             if not self._free.acquire(timeout=_REQUEST_S):

@@ -110,6 +110,13 @@ class EpochKeeper:
             if stored.epoch.observations is not None and stored.result.status == "ok":
                 yield stored.epoch, stored.result.values, "series_restarted" in stored.extra
 
+    def last_seen(self) -> tuple[float | None, int]:
+        """Return the fingerprint of the last stored frame that was measured, and its epoch."""
+        for stored in self._read(self.first_number - 1, details=False):
+            if stored.result.n_observations or stored.result.status == "repeated_frame":
+                return stored.extra.get("fingerprint"), stored.epoch.number
+        return None, 0
+
     def latest(self) -> Iterator[StoredEpoch]:
         """Yield the last stored epochs, of which the most recent have all details."""
         last = self.first_number - 1
@@ -138,6 +145,8 @@ class EpochKeeper:
             for name, value in acquired.frame.settings.items()
             if (key := f"camera_{name}") not in epoch.temperatures  # a channel may have this name
         }
+        if (mark := acquired.frame.fingerprint) is not None:
+            extra["fingerprint"] = float(mark)
         path = None
         if self._frames.wanted(epoch.number, eventful) or deferred:
             path = self._frames.keep(self.plan.name, self.plan.series, epoch.number, acquired.frame)

@@ -183,7 +183,7 @@ class Service:
         self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
         self._runtime = Runtime(self._guard, self.clock, self.live, **self._options)
         done = False
-        control = ControlSocket(self.live.folder, self._ask)
+        self._control = ControlSocket(self.live.folder, self._ask)
         try:
             self._station = Station(self.config, self._runtime)
             self._sessions = Sessions(self._guard, self.clock, self._station)
@@ -191,7 +191,7 @@ class Service:
                 self._sessions.resume(self._station)
             self._station.start()
             if not self._until_finished:
-                control.open()
+                self._control.ensure_open()
             log.info("thermocald %s runs", __version__, extra={"event": "started"})
             self._record("started", f"thermocald {__version__} started")
             notify(f"READY=1\nSTATUS={self._line()}")
@@ -199,7 +199,7 @@ class Service:
                 self._loop()
             finally:
                 notify("STOPPING=1")
-                control.close()
+                self._control.close()
                 done = self._station.stop(_GRACE_S)
                 self._record("stopped", "thermocald stopped")
                 self._guard.flush()
@@ -252,6 +252,8 @@ class Service:
                 written = now
                 self._guard.flush()
                 self.live.write_status(self.status())
+                if not self._until_finished:
+                    self._control.ensure_open()
                 notify(f"STATUS={self._line()}")
             if self._on_turn is not None and self._on_turn(self._station):
                 break

@@ -205,35 +205,26 @@ class EpochKeeper:
         self._frames.keep_corrected(frame, jpeg)
 
     def backlog(self, below: int) -> Epoch | None:
-        """Return the oldest epoch that was stored without calibration and still has its frame."""
-        if self._series is None:
-            return None
-        try:
-            while not self._backlog and self._search(below):
-                pass
-        except StoreError as error:
-            log.warning("epochs with a deferred calibration cannot be read: %s", error)
-        return self._backlog.pop(0) if self._backlog else None
+        """Return the oldest epoch that was stored without calibration and still has its frame.
 
-    def _search(self, below: int) -> bool:
-        """Search the next epochs of the store, each once; return False if there are no more."""
-        series = self.series
-        first = self._searched_to + 1
-        if series is None or first >= below:
-            return False
-        end = min(below - 1, self._guard.last_epoch(series, waiting=False))
-        if end < first:
-            return False
-        last = min(end, first + _CATCH_UP_BATCH - 1)
-        # not tried again if they cannot be read: a damaged row stays damaged
-        self._searched_to = last
-        for stored in self._guard.epochs(series, first, last, details=False):
-            frame = stored.epoch.frame
-            if stored.result.status == NOT_CALIBRATED and frame is not None:
-                path = self._frames.root / frame
-                if path.is_file():
-                    self._backlog.append(replace(stored.epoch, frame=path))
-        return True
+        A call searches at most 200 epochs, each once: all of a year take minutes, in which new
+        epochs would wait for their calibration.
+        """
+        series, first = self.series, self._searched_to + 1
+        if series is not None and not self._backlog and first < below:
+            try:
+                end = min(below - 1, self._guard.last_epoch(series, waiting=False))
+                # not tried again if they cannot be read: a damaged row stays damaged
+                self._searched_to = max(self._searched_to, min(end, first + _CATCH_UP_BATCH - 1))
+                for stored in self._guard.epochs(series, first, self._searched_to, details=False):
+                    frame = stored.epoch.frame
+                    if stored.result.status == NOT_CALIBRATED and frame is not None:
+                        path = self._frames.root / frame
+                        if path.is_file():
+                            self._backlog.append(replace(stored.epoch, frame=path))
+            except StoreError as error:
+                log.warning("epochs with a deferred calibration cannot be read: %s", error)
+        return self._backlog.pop(0) if self._backlog else None
 
     def _begin_series(self, acquired: AcquiredEpoch) -> StoredSeries:
         """Return the series; the store creates it with its first row, when it can be written."""

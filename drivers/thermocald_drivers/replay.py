@@ -10,8 +10,9 @@ raises DeviceFinished. An epoch without a frame, or without a temperature, raise
 `after`, s UTC, leaves out the frames up to that time.
 
 Frames retain their recorded time: `utc` is the recorded time, `monotonic` the same instant on the
-clock's monotonic scale; `sequence` is the epoch's number. A JPEG is delivered as recorded, in
-`encoded`. A recording of observations delivers frames with `observations` and no image.
+clock's monotonic scale; `sequence` is the epoch's number. A JPEG, or a file that is no image, is
+delivered as recorded, in `encoded`. A recording of observations delivers frames with `observations`
+and no image.
 """
 
 from __future__ import annotations
@@ -127,8 +128,8 @@ class ReplayCamera(_Replay, Camera):
                     image, encoded = decode_grey(epoch.frame), None
             except OSError as error:
                 raise BadReading(f"{epoch.frame}: cannot be read: {error.strerror}") from error
-            except ImageError as error:
-                raise BadReading(str(error)) from error
+            except ImageError:
+                pass  # delivered as recorded, so that its epoch is a `bad_frame`
         return Frame(
             image, monotonic, utc, None, epoch.number, encoded=encoded, observations=observations
         )

@@ -20,10 +20,29 @@ from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.thermometers import Thermometers
 from thermocald.cli.run import status
 from thermocald.daemon.live_state import LiveState, status_warnings
+from thermocald.daemon.plan import recording_config
+from thermocald.daemon.service import Service
 from thermocald.errors import DataError, StoreError
 from thermocald.hal import Frame, SystemClock, open_device
 from thermocald.output.dashboard.view import View
 from thermocald.store.database.store import Store
+
+
+def test_what_a_recording_lacks_does_not_shift_the_rest(tmp_path):
+    """Regression: played fast, six missing readings left all later epochs without temperature."""
+    source = make_recording(tmp_path / "R", 60, interval=10.0)
+    rows = [line.split(",") for line in (source / "epochs.csv").read_text().splitlines()]
+    column = rows[0].index("temperature")
+    for row in rows[10:16]:
+        row[column] = ""
+    (source / "epochs.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+    config = recording_config(source, tmp_path / "t.db")
+    assert Service(config, fast=True, until_finished=True).run()
+    with Store.open(config.store.path) as store:
+        series = store.find_series()
+        found = store.series_columns(series, ["frame_time", "temperature_time"])
+    skew_s = (found["temperature_time"] - found["frame_time"]).round(3).tolist()
+    assert skew_s[:9] + skew_s[16:] == [0.001] * 53
 
 
 def refuse(path, statement: str) -> None:  # noqa: F811

@@ -122,12 +122,16 @@ def test_closed_and_opened_it_goes_on_to_its_end_which_is_permanent(write):
     assert issubclass(DeviceFinished, PermanentDeviceError)
 
 
-def test_what_is_broken_is_a_bad_reading(write, tmp_path):
-    path = write((epoch(1), IMAGE), (epoch(2), IMAGE), (epoch(3), None))
-    (tmp_path / "M1" / "frames" / "000001.png").write_bytes(b"")
-    (tmp_path / "M1" / "frames" / "000002.png").write_bytes(b"no picture")
+def test_what_is_broken_comes_as_recorded_and_what_is_missing_is_a_bad_reading(write, tmp_path):
+    """Regression: an empty file was no epoch, and a JPEG that is cut off was a `bad_frame`."""
+    path = write(*((epoch(k), IMAGE) for k in (1, 2, 3)), (epoch(4), None))
+    frames = tmp_path / "M1" / "frames"
+    for number, data in enumerate((b"", b"no picture"), 1):
+        (frames / f"00000{number}.png").write_bytes(data)
     with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
-        for message in (r"is empty \(0 bytes\)", "is not an image", "epoch 3 has no frame"):
+        assert [camera.capture().encoded for _ in range(2)] == [b"", b"no picture"]
+        (frames / "000003.png").unlink()
+        for message in ("000003.png: cannot be read: No such file", "epoch 4 has no frame"):
             with pytest.raises(BadReading, match=message):
                 camera.capture()
 

@@ -105,7 +105,7 @@ class Link:
     since: UTC s, when the device went away or ended, else NaN; faults: number of failed calls.
     on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
     back (`device_back`), fails permanently (`device_failed`), or its recording ends
-    (`device_finished`).
+    (`device_finished`). pauses: whether it waits before a retry; a recording played fast does not.
     """
 
     def __init__(
@@ -117,6 +117,7 @@ class Link:
         *,
         period_s: float = 1.0,
         on_event: OnEvent = lambda *_: None,
+        pauses: bool = True,
     ) -> None:
         self.name = name
         self.called = f"{kind} {name}"
@@ -129,6 +130,7 @@ class Link:
         self._clock = clock
         self._period_s = period_s
         self._on_event = on_event
+        self._pauses = pauses
         self._searched = DeviceNotFound if kind == "output" else (DeviceNotFound, DeviceDenied)
         self._pause_s = 0.0
         self._retry_at = 0.0
@@ -143,7 +145,8 @@ class Link:
 
     def do(self, action: Callable[[], object]) -> bool:
         """Call `action` with the device open; return whether it succeeded."""
-        if self.ended or (self.state == "out" and self._clock.monotonic() < self._retry_at):
+        waits = self._pauses and self._clock.monotonic() < self._retry_at
+        if self.ended or (self.state == "out" and waits):
             return False
         try:
             if self.state != "open":

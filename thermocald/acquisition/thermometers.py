@@ -84,11 +84,14 @@ def _column(thermometer: str, channel: str, thermometers: int) -> str:
 class Thermometers:
     """All thermometers of a configuration, and their last readings; threads may share them.
 
-    Raises ConfigurationError if options are wrong, or if the channels cannot all be columns of a
-    camera's epochs.
+    pauses: as of a `Link`. Raises ConfigurationError if options are wrong, or if the channels
+    cannot all be columns of a camera's epochs.
     """
 
-    def __init__(self, config: Config, clock: Clock, on_event: OnEvent = lambda *_: None) -> None:
+    def __init__(
+        self, config: Config, clock: Clock, on_event: OnEvent = lambda *_: None, *,
+        pauses: bool = True,
+    ) -> None:  # fmt: skip
         self.links: dict[str, Link] = {}
         self._cameras = config.cameras
         self._devices: dict[str, Thermometer] = {}
@@ -101,8 +104,9 @@ class Thermometers:
             device = open_device("thermometer", one.driver, one.options, clock)
             self._devices[one.name] = device
             self.links[one.name] = Link(
-                "thermometer", one.name, device, clock, period_s=one.period_s, on_event=on_event
-            )
+                "thermometer", one.name, device, clock, period_s=one.period_s, on_event=on_event,
+                pauses=pauses,
+            )  # fmt: skip
             self._channels[one.name] = tuple(device.named_channels())
             self._kept[one.name] = deque(maxlen=_REMEMBERED)
         self._require(self._channels, ConfigurationError)
@@ -125,10 +129,12 @@ class Thermometers:
         self.add(name, reading)
         return reading
 
-    def read_now(self, names: Sequence[str]) -> None:
-        """Read some thermometers in the caller's thread, as a recording's with its frames."""
+    def read_up_to(self, names: Sequence[str], monotonic: float) -> None:
+        """Read some thermometers in the caller's thread, as a recording's, up to a frame's time."""
         for name in names:
-            self.links[name].do(partial(self.read, name))
+            while not self._is_near(name, monotonic):
+                if not self.links[name].do(partial(self.read, name)):
+                    break
 
     def add(self, name: str, reading: Reading) -> None:
         """Store a reading; WrongDevice if one of its channels cannot be a column."""

@@ -92,6 +92,11 @@ class Runtime:
     hang_after_s: float = 60.0
     start_condition: str = ""
 
+    @property
+    def pauses(self) -> bool:
+        """Whether a device that is away is left alone for a while: time passes at its own pace."""
+        return self.virtual or not self.fast
+
 
 log = logging.getLogger(__name__)
 
@@ -279,11 +284,11 @@ class CameraLine:
         self.link = Link(
             "camera", plan.name, plan.camera, runtime.clock,
             period_s=plan.config.period_s,
-            on_event=self._event,
+            on_event=self._event, pauses=runtime.pauses,
         )  # fmt: skip
         self.loop = DeviceLoop(
             self.link, self._capture, runtime.clock, plan.config.period_s, begin,
-            free_running=runtime.fast and not runtime.virtual, idle=lambda: not self.taking,
+            free_running=not runtime.pauses, idle=lambda: not self.taking,
         )  # fmt: skip
         self.take(plan.config.series, runtime.start_condition)
 
@@ -344,7 +349,7 @@ class CameraLine:
         frame = self.plan.camera.capture()
         self._count_repeats(frame)
         if runtime.fast:
-            self.thermometers.read_now(self.plan.config.thermometers)
+            self.thermometers.read_up_to(self.plan.config.thermometers, frame.monotonic)
         if self._checking:
             found = check_frame(self.plan.name, self.plan.calibrator_of_check(), frame)
             if self._checking:

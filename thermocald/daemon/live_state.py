@@ -69,10 +69,7 @@ class LiveState:
 
     def write_frame(self, camera: str, frame: Frame) -> None:
         """Replace a camera's last frame, at most 1280 px wide."""
-        data = frame.encoded
-        if frame.image is not None or (data is not None and data[:2] == b"\xff\xd8"):
-            data = _preview(frame)
-        if data is not None:
+        if (data := _preview(frame)) is not None:
             self._write(f"{camera}.jpg", data)
 
     def remove(self) -> None:

@@ -45,7 +45,7 @@ class Station:
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
-        self.thermometers = Thermometers(config, clock, self._on_event)
+        self.thermometers = Thermometers(config, clock, self._on_event, pauses=runtime.pauses)
         self.outputs = [self._output(one, one.options) for one in config.outputs]
         self.cameras = [
             CameraLine(

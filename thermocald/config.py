@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
@@ -107,6 +107,14 @@ _RULES = {
     "bool_parsing": "must be true or false",
     "bool_type": "must be true or false",
     "path_type": "must be a path; put it in quotes",
+    **dict.fromkeys(("float_type", "float_parsing"), "must be a number, without a unit"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
+    **dict.fromkeys(("int_parsing_size", "finite_number"), "must be a finite number"),
+    "greater_than": "must be greater than {gt:g}",
+    "greater_than_equal": "must be at least {ge:g}",
+    "less_than_equal": "must be at most {le:g}",
+    "literal_error": "must be {expected}",
+    "string_too_short": "must not be empty",
     "string_type": "must be text; put it in quotes",
 }
 
@@ -129,7 +137,8 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         message = str(context["error"])
     elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
-        message = _RULES.get(context.get("pattern") or first["type"], message)
+        if rule := _RULES.get(context.get("pattern") or first["type"]):
+            message = rule.format(**context)
         message = f"is {given}; {message[0].lower()}{message[1:]}"
     return f"{place}{where + ': ' if where else ''}{message}{more}"
 
@@ -390,8 +399,8 @@ class LoggingConfig(Section):
     """Lowest level of the messages in the journal."""
 
 
-# (kind of device, driver) → names of the driver's options
-OptionNames = Callable[[Any, str], Sequence[str]]
+# (kind of device, driver) → the driver's class
+LoadDriver = Callable[[Any, str], type[Any]]
 
 
 class Config(Section):
@@ -444,18 +453,18 @@ class Config(Section):
         return camera.calibration or self.calibration
 
 
-def load_config(path: Path, option_names: OptionNames | None = None) -> Config:
+def load_config(path: Path, load_driver: LoadDriver | None = None) -> Config:
     """Read and check `config.yaml`.
 
-    option_names: returns a driver's options, so that a wrong one is found before the device is
-    opened (`thermocald.hal.option_names`). Raises ConfigurationError, which names the file, the
-    dotted key, the value and the bound.
+    load_driver: `thermocald.hal.load_driver`, to check drivers and their options before a device is
+    opened. Raises ConfigurationError, which names the file, the dotted key, the value and the
+    bound.
     """
-    return parse_config(read_yaml(path), path, option_names)
+    return parse_config(read_yaml(path), path, load_driver)
 
 
 def parse_config(
-    document: dict[str, Any], path: Path, option_names: OptionNames | None = None
+    document: dict[str, Any], path: Path, load_driver: LoadDriver | None = None
 ) -> Config:
     """Check a configuration given as a mapping; relative paths and messages refer to `path`."""
     hide_secrets(document)
@@ -465,7 +474,7 @@ def parse_config(
         raise ConfigurationError(in_words(path, cause)) from cause
     for kind in ("camera", "thermometer", "output"):
         for i, device in enumerate(getattr(config, f"{kind}s")):
-            _check_options(f"{path}: {kind}s[{i}]", kind, device, option_names)
+            _check_options(f"{path}: {kind}s[{i}]", kind, device, load_driver)
     for i, camera in enumerate(config.cameras):
         for key in ("testfield", "thermal_model", "control_points", "control_reference"):
             file = getattr(camera, key)
@@ -510,17 +519,22 @@ def _same_file(one: Path, other: Path) -> bool:
 
 
 def _check_options(
-    where: str, kind: str, device: DeviceConfig, option_names: OptionNames | None
+    where: str, kind: str, device: DeviceConfig, load_driver: LoadDriver | None
 ) -> None:
     own = keys(type(device))
-    if option_names is not None:
-        known = list(option_names(kind, device.driver))
+    if load_driver is not None:
+        try:
+            options = load_driver(kind, device.driver).Options
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}.driver: {error}") from error
+        known = keys(options)
         for key in device.options:
             if key not in known:
                 raise ConfigurationError(
                     f"{where}.{key}: unknown; neither a key of a {kind} nor an option of driver "
                     f"{device.driver!r}{nearest(key, [*own, *known])}"
                 )
+        options.read(device.options, where)
         return
     for key in device.model_extra or {}:
         if near := difflib.get_close_matches(key, own, 1, 0.85):

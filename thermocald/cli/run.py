@@ -61,7 +61,7 @@ def run(
     from thermocald.daemon.plan import mock_config, recording_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
-    from thermocald.hal import option_names
+    from thermocald.hal import load_driver
 
     if sum([config is not None, mock, recording is not None]) > 1:
         raise UsageError("give one of --config FILE, --mock, --recording FOLDER")
@@ -79,7 +79,7 @@ def run(
         )
 
     if config is not None:
-        read = load_config(config, option_names)
+        read = load_config(config, load_driver)
     elif recording is not None:
         read = recording_config(recording, store)
     else:

@@ -121,7 +121,7 @@ def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
 
 def _configuration(config: Path | None, mock: bool) -> Config:
     from thermocald.config import load_config
-    from thermocald.hal import option_names
+    from thermocald.hal import load_driver
 
     if mock:
         from thermocald.daemon.plan import mock_config
@@ -129,7 +129,7 @@ def _configuration(config: Path | None, mock: bool) -> Config:
         if config is not None:
             raise UsageError("give --config or --mock, not both")
         return mock_config()
-    return load_config(require_config(config, "--config FILE, or --mock"), option_names)
+    return load_config(require_config(config, "--config FILE, or --mock"), load_driver)
 
 
 def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.daemon.systemd import notify, watchdog_interval_s
 from thermocald.errors import DataError, ThermocaldError
-from thermocald.hal import option_names
+from thermocald.hal import load_driver
 from thermocald.names import PAGE_OF, WITH_VALUES
 from thermocald.numbers import counted
 from thermocald.store.series import Event
@@ -354,7 +354,7 @@ class Service:
         """Read the configuration again and apply it; return the result in words."""
         config = self.config
         if self._path is not None:
-            config = self._with_options(load_config(self._path, option_names))
+            config = self._with_options(load_config(self._path, load_driver))
         if config.store != self.config.store:
             log.warning("store: a change takes effect after a restart; the old store is still used")
             config = config.model_copy(update={"store": self.config.store})

@@ -15,7 +15,7 @@ import numpy as np
 
 from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
-from thermocald.hal import SystemClock, driver_names, load_driver, open_device, option_names
+from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
     from thermocald.config import load_config
     from thermocald.daemon.plan import plan_cameras
 
-    config = load_config(path, option_names)
+    config = load_config(path, load_driver)
     lines = [f"{path}: a valid configuration"]
     for key, place in (("store.path", config.store.path), ("frames.folder", config.frames.folder)):
         if _is_system(place):

@@ -187,8 +187,7 @@ def test_the_reference_keeps_its_place_when_it_is_not_read():
     pipeline = Pipeline("cam", None, thermometers, names, keeper, clock, patience_s=0.0)
     pipeline.start()
     pipeline.submit(Frame(np.zeros((4, 4), np.uint8), 0.0, clock.utc()))
-    assert pipeline.drain(10.0)
-    pipeline.stop(10.0)
+    assert pipeline.finish(10.0)
     (epoch,) = [acquired.epoch for acquired in kept]
     assert list(epoch.temperatures) == ["housing", "air"]
     assert np.isnan(epoch.temperatures["housing"])

@@ -24,7 +24,7 @@ import thermocald as tc
 from thermocald.config import Config, load_config, parse_config
 from thermocald.errors import ConfigurationError, ThermocaldError
 from thermocald.files import dump_yaml
-from thermocald.hal import option_names
+from thermocald.hal import load_driver
 from thermocald.store.logger.clock import DeviceClock, time_zone
 from thermocald.store.logger.columns import LogOptions
 from thermocald.store.logger.temperatures import read_log
@@ -80,7 +80,7 @@ def places(document, path=()):
             yield from places(value, (*path, key))
 
 
-WHOLE = load_config(SHIPPED, option_names).model_dump(mode="json", by_alias=True)
+WHOLE = load_config(SHIPPED, load_driver).model_dump(mode="json", by_alias=True)
 PLACES = list(places(WHOLE))
 
 
@@ -94,7 +94,7 @@ def test_any_value_anywhere_in_a_configuration(amount):
             with contextlib.suppress(LookupError, TypeError):  # removed by an earlier change
                 reduce(getitem, path[:-1], document)[path[-1]] = value
         try:
-            config = parse_config(document, SHIPPED, option_names=option_names)
+            config = parse_config(document, SHIPPED, load_driver=load_driver)
         except ConfigurationError as error:
             one_line(error)
             return
@@ -102,7 +102,7 @@ def test_any_value_anywhere_in_a_configuration(amount):
         # as text: an option that is no finite number, which its driver refuses, is null in JSON
         first, second = (
             re.sub(r"-?\b(nan|inf)\b", "None", repr(c))
-            for c in (config, parse_config(again, SHIPPED, option_names=option_names))
+            for c in (config, parse_config(again, SHIPPED, load_driver=load_driver))
         )
         assert first == second
         for number in numbers(config):
@@ -140,7 +140,7 @@ def test_any_key_in_a_configuration(amount, tmp_path):
         except (UnicodeError, OverflowError):
             assume(False)
         with pytest.raises(ConfigurationError) as caught:
-            load_config(file, option_names)
+            load_config(file, load_driver)
         one_line(caught.value)
 
     check()

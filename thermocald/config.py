@@ -448,10 +448,6 @@ class Config(Section):
             raise wrong("frames.corrected needs a camera with a thermal_model")
         return self
 
-    def calibration_of(self, camera: CameraConfig) -> CalibrationConfig:
-        """Return a camera's settings of the adjustment."""
-        return camera.calibration or self.calibration
-
 
 def load_config(path: Path, load_driver: LoadDriver | None = None) -> Config:
     """Read and check `config.yaml`.

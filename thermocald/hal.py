@@ -39,7 +39,7 @@ from zlib import crc32
 from pydantic import ConfigDict, Field, ValidationError
 
 from thermocald.addresses import hide_secrets
-from thermocald.config import Section, in_words, keys
+from thermocald.config import Section, in_words
 from thermocald.errors import (
     BadReading,
     ConfigurationError,
@@ -411,11 +411,6 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
     except ImportError as error:
         raise DriverMissing(f"{kind} driver {name!r} cannot be imported: {error}") from error
     return loaded
-
-
-def option_names(kind: Kind, name: str) -> list[str]:
-    """Return the names of a driver's options; raises the errors of `load_driver`."""
-    return keys(load_driver(kind, name).Options)
 
 
 def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock) -> Any:

@@ -31,6 +31,7 @@ from pydantic import Field
 
 from thermocald.errors import DeviceDenied, DeviceNotFound
 from thermocald.hal import DriverOptions, Output
+from thermocald.names import WITH_VALUES
 from thermocald_drivers import support
 from thermocald_drivers.heating import HeatingOptions, HeatingOutput
 
@@ -102,7 +103,7 @@ class LedOutput(Output):
 
     def emit(self, result: Mapping[str, Any]) -> None:
         led = self.opened()
-        good = result.get("status") == "ok"
+        good = result.get("status") in WITH_VALUES
         if good == self._good:
             return  # restarting the blinking at each epoch would hide it
         self._good = good

@@ -12,7 +12,7 @@ from tests.commands import answer, succeed
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
 from thermocald.daemon import soundness as devices
 from thermocald.errors import ConfigurationError, DeviceError
-from thermocald.hal import load_driver, option_names
+from thermocald.hal import load_driver
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
     assert [c["device"] for c in stanzas["cameras"]] == ["/dev/video0"]  # not the metadata node
     for kind, key in (("thermometer", "thermometers"), ("camera", "cameras")):
         for stanza in stanzas[key]:
-            known = option_names(kind, stanza["driver"])
+            known = load_driver(kind, stanza["driver"]).Options.model_fields
             assert set(stanza) - {"name", "driver"} <= set(known)
 
 

@@ -77,7 +77,7 @@ def test_a_refused_row_is_lost_for_everybody(guard, path, tmp_path, refusal):  #
     others = {"cameras": {}, "thermometers": {}, "outputs": {}, "clock": {"trusted": True},
               "frames": {"paused": ""}}  # fmt: skip
     assert any("1 epoch lost" in text for text in status_warnings(document | others))
-    (event,) = [e for e in guard.stored_events() if e.kind == "epoch_lost"]
+    (event,) = [e for e in guard.store.events() if e.kind == "epoch_lost"]
     assert "epoch" in event.text
     # an hour later the page is healthy again; the count stays
     status_file = live.folder / "status.json"

@@ -19,7 +19,6 @@ from tests.store.small import stored_numbers as numbers
 from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
 from thermocald.errors import StoreError
 from thermocald.output.dashboard.view import View
-from thermocald.store.series import Event
 
 
 @pytest.fixture
@@ -291,10 +290,10 @@ def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
 
 
 def test_an_event_that_quotes_the_name_of_a_file_holds_up_no_epoch(guard, path):
-    guard.event(Event(1.0, "x", "cannot write a\udcff.png"))
+    guard.event(1.0, "x", "cannot write a\udcff.png")
     guard.keep(4)
     assert numbers(path) == [1, 2, 3, 4]
-    assert [event.text for event in guard.stored_events()] == ["cannot write a\\udcff.png"]
+    assert [event.text for event in guard.store.events()] == ["cannot write a\\udcff.png"]
 
 
 @pytest.mark.parametrize("name", ["x" * 249 + ".db", "x" * 300, "loop.db"])
@@ -350,7 +349,7 @@ def test_an_unmounted_card_is_waited_for_and_nothing_is_begun_in_its_place(card)
     card("a")
     guard.keep(7)
     assert (guard.status()["state"], guard.waiting, guard.lost) == ("ok", 0, 0)
-    assert "store_out" in [event.kind for event in guard.stored_events()]
+    assert "store_out" in [event.kind for event in guard.store.events()]
     guard.close()
     assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]
 

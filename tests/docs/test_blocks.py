@@ -26,7 +26,7 @@ from tests.docs.blocks import (
 )
 from thermocald.cli import application
 from thermocald.config import Config, parse_config
-from thermocald.hal import option_names
+from thermocald.hal import load_driver
 from thermocald.store.recording.reader import read_recording
 
 COMMAND = typer.main.get_command(application())
@@ -95,7 +95,7 @@ def test_yaml_is_valid(block, tmp_path):
         for key in ("testfield", "thermal_model", "control_points", "control_reference"):
             if key in camera:
                 (tmp_path / camera[key]).touch()
-    parse_config(document, tmp_path / "config.yaml", option_names)
+    parse_config(document, tmp_path / "config.yaml", load_driver)
 
 
 @pytest.mark.parametrize("measured", [False, True])

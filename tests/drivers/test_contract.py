@@ -27,7 +27,6 @@ from thermocald.hal import (
     driver_names,
     load_driver,
     open_device,
-    option_names,
 )
 
 KINDS = {"camera": Camera, "thermometer": Thermometer, "output": Output}
@@ -75,10 +74,10 @@ def test_driver_is_what_it_is_registered_as_and_explains_its_stanza(kind, name):
     assert issubclass(driver.Options, DriverOptions)
     assert all(c.startswith("char-") for c in driver.device_classes)
     if kind == "output":  # a session replaces the programme of a heating output
-        assert driver.heats == ("programme" in option_names(kind, name))
+        assert driver.heats == ("programme" in driver.Options.model_fields)
     text = sys.modules[driver.__module__].__doc__ or ""
     assert f"driver: {name}" in text
-    for option in option_names(kind, name):
+    for option in driver.Options.model_fields:
         assert option in text, f"option {option} is not explained at the top of the file"
 
 

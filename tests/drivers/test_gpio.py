@@ -39,9 +39,10 @@ def relay(clock, **options):
 
 
 def test_the_led_tells_whether_there_are_results(pins):
+    good = iter(("ok", "resected"))  # regression: it blinked at a gauge's results
     with open_device("output", "led", {"pin": 17, "blink_s": 0.05}, VirtualClock()) as led:
         pin = pins.pin(17)
-        led.emit({"status": "ok"})
+        led.emit({"status": next(good)})
         assert pin.state
         led.emit({"status": "too few targets"})
         states = set()
@@ -49,7 +50,7 @@ def test_the_led_tells_whether_there_are_results(pins):
         while len(states) < 2 and time.monotonic() < deadline:
             states.add(pin.state)
         assert states == {True, False}
-        led.emit({"status": "ok"})
+        led.emit({"status": next(good)})
         assert pin.state
     assert not pins.pin(17).state
 

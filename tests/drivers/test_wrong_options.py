@@ -63,7 +63,7 @@ WRONG = {
           for celsius in (1e300, -300, "nan", float("inf"))),
         ({"channels": {"t": {"lag": 3}}}, "channels.t.lag: unknown; is 'lag_s' meant"),
         ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: is -1"),
-        ({"seed": 1.5}, "seed: is 1.5; must be a whole number"), ({"conversion_s": -1}, "conversion_s"),
+        ({"seed": 1.5}, "seed: is 1.5; must be a whole nu"), ({"conversion_s": -1}, "conversion_s"),
     ]),
     ("output", "mock"): ({}, [
         *(({"faults": [{"kind": "timeout", **plan}]}, message) for plan, message in [

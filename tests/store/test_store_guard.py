@@ -144,4 +144,4 @@ def test_losses_are_counted_each_and_reported_once_a_minute(guard, caplog):
         guard.lose(f"epoch {number}: too slow")
     assert guard.lost == 1000
     assert caplog.text.count("lost: epoch") == 1
-    assert len([e for e in guard.stored_events() if e.kind == "epoch_lost"]) <= 1
+    assert len([e for e in guard.store.events() if e.kind == "epoch_lost"]) <= 1

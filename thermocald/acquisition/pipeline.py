@@ -167,10 +167,11 @@ class Pipeline:
         with self._changed:
             return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
 
-    def drain(self, timeout_s: float) -> bool:
-        """Wait until all frames are calibrated and handed to the store; False after the timeout."""
+    def finish(self, grace_s: float) -> bool:
+        """Calibrate and store all waiting epochs, then stop; False if that took too long."""
         with self._changed:
-            return self._changed.wait_for(lambda: not self._items and not self._amended, timeout_s)
+            self._changed.wait_for(lambda: not self._items and not self._amended, 0.5 * grace_s)
+        return self.stop(0.5 * grace_s)
 
     def stop(self, grace_s: float) -> bool:
         """Finish the current epoch, store the others as they are; False if that took too long."""

@@ -95,8 +95,7 @@ def run(
         hang_after_s=hang_after,
     )
     released = service.run()
-    faults = [one for one in (service.lost, service.failed) if one]
-    for one in faults:
+    for one in (faults := service.faults):
         say(f"error: {one}")
     if not released:
         # a driver that hangs in the kernel would keep the interpreter from exiting

@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Any
 from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
-from thermocald.daemon.epoch_keeper import EpochKeeper
+from thermocald.daemon.epoch_keeper import EpochKeeper, result_row
 from thermocald.daemon.plan import running_series
 from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.camera.conversions import opencv_terms
-from thermocald.store.series import Event
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -106,6 +105,8 @@ _SWITCH_GRACE_S = 20.0
 _VIRTUAL_PATIENCE_S = 60.0  # real seconds that a tick of a virtual clock waits for room
 _FROZEN = 2  # repeats from which a camera counts as frozen
 _REMEMBERED = 200  # epochs, as many as a `RunningSeries` holds
+_LATEST = 4000  # epochs whose readings still act on effects with a memory
+_DETAILED = 100
 
 
 class SeriesRun:
@@ -154,12 +155,6 @@ class SeriesRun:
         """Whether all epochs up to the limit were taken."""
         return bool(self.limit) and self.taken >= self.limit
 
-    def finish(self, grace_s: float) -> bool:
-        """Calibrate and store the remaining epochs; return False if that takes too long."""
-        deadline = time.monotonic() + grace_s
-        self.pipeline.drain(0.5 * grace_s)
-        return self.pipeline.stop(max(0.1, deadline - time.monotonic()))
-
     def _make_observer(self) -> Any:
         """Return the camera's online estimate; None if the camera is not calibrated."""
         plan = self.plan
@@ -171,7 +166,10 @@ class SeriesRun:
             return OnlineObserver(plan.sensor, plan.testfield, self._record)
         from thermocald.analysis.thermal.gauge import GaugeObserver
 
-        plan.calibrator.remember(self.keeper.latest())
+        # the readings of many, since effects have a memory; the details of the most recent
+        detailed = max(0, self.keeper.first_number - 1 - _DETAILED)
+        earlier = self.keeper.read(detailed - _LATEST, detailed, details=False)
+        plan.calibrator.remember([*earlier, *self.keeper.read(detailed + 1)])
         return GaugeObserver(plan.calibrator, self._record)
 
     def _record(self, kind: str, text: str, utc: float, epoch: int) -> None:
@@ -221,14 +219,16 @@ class SeriesRun:
         self._remembered = True
         assert self.running is not None
         assert isinstance(self.plan.calibrator, Calibrator)
-        for epoch, reported, begun in self.keeper.recent(_REMEMBERED):
-            if begun:
+        for stored in self.keeper.read(max(1, self.first - _REMEMBERED)):
+            epoch = stored.epoch
+            if epoch.observations is None or stored.result.status != "ok":
+                continue
+            if "series_restarted" in stored.extra:
                 self.running.reset()
                 continue
-            assert epoch.observations is not None
             seen = self._weighed(epoch.observations)
             alone = CalibratedEpoch(epoch, self.plan.calibrator.adjust(seen), {})
-            self.running.remember(alone, seen, reported)
+            self.running.remember(alone, seen, stored.result.values)
 
     def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:
         """Pass a stored epoch on to the outputs and the live state."""
@@ -238,7 +238,8 @@ class SeriesRun:
         row["state"] = report.get("state", "unknown")
         if self.plan.sensor is not None:
             if self.drift is None:
-                earlier = self.keeper.first_rows(START_EPOCHS)
+                first = self.keeper.read(1, 20 * START_EPOCHS)
+                earlier = (result_row(self.plan, s.epoch, s.result, {}) for s in first)
                 self.drift = SeriesDrift(self.plan.sensor.pixel_pitch, earlier)
             row |= self.drift.columns(row)
             result = None if acquired.calibrated is None else acquired.calibrated.adjustment
@@ -329,7 +330,7 @@ class CameraLine:
     def _replace(self, run: SeriesRun | None, *, checking: bool) -> None:
         with self._swap:
             old, self.run, self._checking = self.run, run, False
-        if old is not None and self._started and not old.finish(_SWITCH_GRACE_S):
+        if old is not None and self._started and not old.pipeline.finish(_SWITCH_GRACE_S):
             log.error("camera %s: its last epochs take too long to be stored", self.plan.name)
         # only now, since all series share the calibrator
         if self.plan.calibrator is not None:
@@ -394,7 +395,7 @@ class CameraLine:
     def _event(self, utc: float, kind: str, text: str) -> None:
         """Store an event of the device, with the series being taken."""
         if self.run is None:
-            self.runtime.guard.event(Event(utc, kind, text))
+            self.runtime.guard.event(utc, kind, text)
         else:
             self.run.keeper.record(utc, kind, text)
 

@@ -236,14 +236,13 @@ def enforce_retention(config: Config) -> list[str]:
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.machine import machine_clock_trusted
-    from thermocald.store.series import Event
 
     guard = StoreGuard(config.store.path)
     try:
         now = time.time() if machine_clock_trusted() else None
         sentences = FrameFolder(config.frames).enforce(now)
         for sentence in sentences:
-            guard.event(Event(time.time(), "frames_deleted", sentence))
+            guard.event(time.time(), "frames_deleted", sentence)
     finally:
         guard.close()
     return sentences

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from thermocald.daemon.plan import check_series, series_head
@@ -13,16 +12,15 @@ from thermocald.daemon.store_guard import Row
 from thermocald.errors import ImageError, StoreError
 from thermocald.names import UNEVENTFUL
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event, StoredSeries
+from thermocald.store.series import NOT_CALIBRATED, EpochResult, StoredSeries
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.acquisition.pipeline import AcquiredEpoch
-    from thermocald.arrays import Array
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.epoch import Epoch
@@ -32,8 +30,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _CATCH_UP_BATCH = 200
-_LATEST = 4000  # epochs whose readings still act on effects with a memory
-_DETAILED = 100
 
 
 class EpochKeeper:
@@ -88,9 +84,9 @@ class EpochKeeper:
         """Store an event of the series."""
         series = self.series
         series_id = None if series is None else series.id or None
-        self._guard.event(Event(utc, kind, text, series_id, epoch))
+        self._guard.event(utc, kind, text, series=series_id, epoch=epoch)
 
-    def _read(self, first: int, last: int | None = None, **how: bool) -> list[StoredEpoch]:
+    def read(self, first: int, last: int | None = None, **how: bool) -> list[StoredEpoch]:
         """Read some epochs of the series; if they cannot be read, log it and return none."""
         series = self.series
         if series is None:
@@ -101,33 +97,12 @@ class EpochKeeper:
             log.warning("earlier epochs cannot be read: %s", error)
             return []
 
-    def recent(self, count: int) -> Iterator[tuple[Epoch, Array, bool]]:
-        """Yield the last epochs with a result, with their values (16,) and a restart flag.
-
-        The flag states that the running series started again after the epoch.
-        """
-        for stored in self._read(max(1, self.first_number - count)):
-            if stored.epoch.observations is not None and stored.result.status == "ok":
-                yield stored.epoch, stored.result.values, "series_restarted" in stored.extra
-
     def last_seen(self) -> tuple[float | None, int]:
         """Return the fingerprint of the last stored frame that was measured, and its epoch."""
-        for stored in self._read(self.first_number - 1, details=False):
+        for stored in self.read(self.first_number - 1, details=False):
             if stored.result.n_observations or stored.result.status == "repeated_frame":
                 return stored.extra.get("fingerprint"), stored.epoch.number
         return None, 0
-
-    def latest(self) -> Iterator[StoredEpoch]:
-        """Yield the last stored epochs, of which the most recent have all details."""
-        last = self.first_number - 1
-        detailed = max(0, last - _DETAILED)
-        yield from self._read(last - _LATEST, detailed, details=False)
-        yield from self._read(detailed + 1)
-
-    def first_rows(self, count: int) -> list[dict[str, Any]]:
-        """Return the first stored epochs with a result, as rows for the outputs."""
-        found = (s for s in self._read(1, 20 * count) if s.result.status == "ok")
-        return [result_row(self.plan, s.epoch, s.result, {}) for s in islice(found, count)]
 
     def keep(self, acquired: AcquiredEpoch) -> None:
         """Store an epoch; a deferred calibration is done later from its frame."""
@@ -182,7 +157,7 @@ class EpochKeeper:
             self._searched_to = min(self._searched_to, epoch.number - 1)
             return
         failed = calibrated.adjustment.status not in UNEVENTFUL
-        frame = next((s.epoch.frame for s in self._read(epoch.number, epoch.number)), None)
+        frame = next((s.epoch.frame for s in self.read(epoch.number, epoch.number)), None)
         if frame is not None and not self._frames.wanted(epoch.number, failed):
             self._frames.delete(frame)
             self.kept_frames -= 1

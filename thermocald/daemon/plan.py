@@ -77,7 +77,7 @@ def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
 
 def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     camera: Camera = open_device("camera", one.driver, one.options, clock)
-    calibration = config.calibration_of(one)
+    calibration = one.calibration or config.calibration
     if one.thermal_model is not None:
         return _plan_gauge(one, calibration, camera, corrected=config.frames.corrected)
     sensor, targets = _sensor(one), None

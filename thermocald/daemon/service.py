@@ -37,7 +37,6 @@ from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import load_driver
 from thermocald.names import PAGE_OF, WITH_VALUES
 from thermocald.numbers import counted
-from thermocald.store.series import Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -211,18 +210,14 @@ class Service:
         return done
 
     @property
-    def lost(self) -> str:
-        """The number of epochs that were taken but not stored and the last reason, or ""."""
+    def faults(self) -> list[str]:
+        """Sentences on epochs that were lost, and on cameras that were not read to their end."""
         store = self._guard.status()
-        return (
-            f"{counted(store['lost'], 'epoch')} lost: {store['lost_why']}" if store["lost"] else ""
-        )
-
-    @property
-    def failed(self) -> str:
-        """The cameras that failed before they were read to their end, with reasons, or ""."""
         links = [line.link for line in self._station.cameras if self._until_finished]
-        return "; ".join(f"{one.name}: {one.why}" for one in links if one.state == "failed")
+        faults = [f"{one.name}: {one.why}" for one in links if one.state == "failed"]
+        if store["lost"]:
+            faults.insert(0, f"{counted(store['lost'], 'epoch')} lost: {store['lost_why']}")
+        return faults
 
     def _loop(self) -> None:
         interval = watchdog_interval_s()
@@ -239,7 +234,7 @@ class Service:
             self._sessions.turn()
             if (step := self.clock.check()) is not None:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
-                self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
+                self._guard.event(step.utc, "clock_step", step.text, data=data)
                 if step.adopted:
                     self._station.frames.restamp(step.seconds)
             self._dashboard.ensure_running(self.config.dashboard)
@@ -385,7 +380,7 @@ class Service:
         self._stalled = stalled
 
     def _record(self, kind: str, text: str) -> None:
-        self._guard.event(Event(self.clock.utc(), kind, text))
+        self._guard.event(self.clock.utc(), kind, text)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:

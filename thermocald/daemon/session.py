@@ -18,13 +18,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
 from thermocald.hal import HeatingStep  # noqa: TC001
-from thermocald.store.series import Event
 
 if TYPE_CHECKING:
     from thermocald.daemon.camera_line import CameraLine
     from thermocald.daemon.station import Station
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Clock
+    from thermocald.store.series import Event
 
 
 log = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ class Sessions:
         self._clock = clock
         self._active: dict[str, _Progress] = {}
         self._ended: dict[str, _Progress] = {}
-        for event in guard.stored_events():
+        for event in guard.store.events():
             self._remember(event)
 
     def _remember(self, event: Event) -> None:
@@ -257,7 +257,7 @@ class Sessions:
             "session": session.model_dump(mode="json"), "state": one.state, "taken": one.taken,
             "why": one.why,
         }  # fmt: skip
-        self._guard.event(Event(self._clock.utc(), kind, about, data=data))
+        self._guard.event(self._clock.utc(), kind, about, data=data)
 
     def _line(self, camera: str) -> CameraLine:
         line = self.station.line(camera)

@@ -21,7 +21,7 @@ from thermocald.daemon.camera_line import CameraLine, Runtime
 from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError
 from thermocald.hal import load_driver, open_device
-from thermocald.store.series import Event, LoggedReading
+from thermocald.store.series import LoggedReading
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -45,7 +45,7 @@ class Station:
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
-        self.thermometers = Thermometers(config, clock, self._on_event, pauses=runtime.pauses)
+        self.thermometers = Thermometers(config, clock, runtime.guard.event, pauses=runtime.pauses)
         self.outputs = [self._output(one, one.options) for one in config.outputs]
         self.cameras = [
             CameraLine(
@@ -121,10 +121,6 @@ class Station:
             not camera.loop.alive and not camera.waiting() for camera in self.cameras
         )
 
-    def _on_event(self, utc: float, kind: str, text: str) -> None:
-        """Store an event of a thermometer or an output."""
-        self.runtime.guard.event(Event(utc, kind, text))
-
     def line(self, camera: str) -> CameraLine | None:
         """Return the camera of this name; None if the configuration has none."""
         return next((line for line in self.cameras if line.plan.name == camera), None)
@@ -158,7 +154,7 @@ class Station:
 
     def _output(self, one: OutputConfig, options: Mapping[str, Any]) -> OutputLoop:
         device = open_device("output", one.driver, options, self.runtime.clock)
-        return OutputLoop(one.name, device, self.runtime.clock, self._on_event)
+        return OutputLoop(one.name, device, self.runtime.clock, self.runtime.guard.event)
 
     def status(self) -> dict[str, Any]:
         """Return the devices' part of the status document."""
@@ -212,7 +208,7 @@ class Station:
         clock = self.runtime.clock
         deleted = self.frames.enforce(clock.utc() if clock.settled() else None)
         for text in deleted:
-            self.runtime.guard.event(Event(clock.utc(), "frames_deleted", text))
+            self.runtime.guard.event(clock.utc(), "frames_deleted", text)
         return deleted
 
     def _retain(self) -> None:

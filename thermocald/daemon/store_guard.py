@@ -329,11 +329,6 @@ class StoreGuard:
     def _waiting_of(self, camera: str, name: str) -> Iterator[Row]:
         return (r for r in self._waiting if (r.series.camera, r.series.name) == (camera, name))
 
-    def stored_events(self) -> list[Event]:
-        """Return all events in the store, oldest first."""
-        with self._lock:
-            return self.store.events()
-
     def append(self, row: Row) -> bool:
         """Store an epoch now or when the store can be written; return whether it is stored."""
         with self._lock:
@@ -363,10 +358,10 @@ class StoreGuard:
                 extra=extra,
             )
 
-    def event(self, event: Event) -> None:
-        """Store an event, now or when the store can be written again."""
+    def event(self, utc: float, kind: str, text: str, **more: Any) -> None:
+        """Store an event, now or when the store can be written again; more: as of `Event`."""
         with self._lock:
-            self._events.append(event)
+            self._events.append(Event(utc, kind, text, **more))
             self._flush_events()
 
     def lose(self, why: str, count: int = 1) -> None:
@@ -403,7 +398,9 @@ class StoreGuard:
                     self._waiting.popleft()
                     self.lose(f"epoch {row.epoch.number} of {row.series.camera}: {error}")
                 else:
-                    self._hold_back(error)
+                    self._locked = isinstance(error, StoreBusyError)
+                    self._mark_out(error, row.epoch.frame_time)
+                    self._limit_waiting()
                     # an attempt at a locked store takes long, and epochs may come faster
                     self._retry_at = 2 * time.monotonic() - begin
                     return
@@ -489,11 +486,6 @@ class StoreGuard:
             log.error("%s; results wait in memory", error, extra={"event": "store_out"})
             self._events.append(Event(utc, "store_out", str(error)))
         self.away = str(error)
-
-    def _hold_back(self, error: StoreError) -> None:
-        self._locked = isinstance(error, StoreBusyError)
-        self._mark_out(error, self._waiting[0].epoch.frame_time)
-        self._limit_waiting()
 
     def _limit_waiting(self) -> None:
         """Thin the rows beyond the latest 100, and lose the oldest of too many."""

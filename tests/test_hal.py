@@ -81,16 +81,6 @@ def test_clocks_keep_one_contract(clock):
     assert not clock.sleep_until(clock.monotonic() + 60.0, wake)
 
 
-def test_system_clock_is_woken():
-    clock, wake = SystemClock(), threading.Event()
-    timer = threading.Timer(0.05, wake.set)
-    timer.start()
-    begin = time.monotonic()
-    assert not clock.sleep_until(begin + 30.0, wake)
-    assert time.monotonic() - begin < 5.0
-    timer.join()
-
-
 @pytest.mark.parametrize("kind", ["camera", "thermometer", "output"])
 def test_look_up_names_what_there_is(kind, monkeypatch):
     assert "mock" in hal.driver_names(kind)

@@ -33,7 +33,7 @@ the first temperature, for a second channel that warms more. All three accept fa
 Kinds: `timeout` (no answer within `timeout_s`), `unplugged` (gone, also for `open`), `truncated`
 (half a frame or line, which a driver rejects as a bad reading), `wrong_size` (a frame of another
 size, an answer of another length), `stuck` (the same value or image with new times, which no driver
-can detect). A test may also call `inject` while the device is open.
+can detect).
 """
 
 from __future__ import annotations
@@ -155,17 +155,8 @@ class MockDevice(Device):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._faults: list[Fault] = list(self.options.faults)
         self._calls = 0
         self._started: float | None = None
-
-    def inject(self, kind: Kind, count: int = 1) -> None:
-        """Let the next `count` calls fail."""
-        self._faults.append(Fault(kind=kind, at=self._calls + 1, count=count))
-
-    def clear(self) -> None:
-        """Remove all faults: the device is plugged in again."""
-        self._faults.clear()
 
     def open(self) -> None:
         if self._started is None:
@@ -181,7 +172,7 @@ class MockDevice(Device):
 
     def _fault(self, call: int) -> Kind | None:
         elapsed = self._elapsed(self.clock.monotonic())
-        return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
+        return next((f.kind for f in self.options.faults if f.active(call, elapsed)), None)
 
     def _call(self, unit: str, seconds: float = 0.0) -> bool:
         """Wait as long as a capture or reading takes, in seconds; return whether it is stuck.
@@ -271,7 +262,12 @@ class MockCamera(MockDevice, Camera):
         utc = self.clock.utc() - 0.5 * exposure
         self._sequence += 1
         if not stuck or self._last is None:
-            self._last = self._picture(monotonic)
+            truth = self.truth(monotonic)
+            points = truth.points(self.field.points)[0] if truth.moves_points else None
+            seed = [self.options.seed, round(monotonic * 1e6) & 2**63 - 1]
+            self._last = self.scene.render(
+                truth.iop[0], truth.eop[0], points, seed, float(truth.blur_factor[0])
+            )
         return Frame(self._last, monotonic, utc, exposure=exposure, sequence=self._sequence)
 
     def truth(self, monotonic: float) -> Prediction:
@@ -282,14 +278,6 @@ class MockCamera(MockDevice, Camera):
         at = np.array([self._elapsed(monotonic)])
         history = History(at, times, {"temperature": values}, "temperature", 0.0)
         return self.model.predict(history, self.field)
-
-    def _picture(self, monotonic: float) -> Any:
-        truth = self.truth(monotonic)
-        points = truth.points(self.field.points)[0] if truth.moves_points else None
-        seed = [self.options.seed, round(monotonic * 1e6) & 2**63 - 1]
-        return self.scene.render(
-            truth.iop[0], truth.eop[0], points, seed, float(truth.blur_factor[0])
-        )
 
 
 class MockThermometer(MockDevice, Thermometer):

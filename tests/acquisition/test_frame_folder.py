@@ -29,15 +29,6 @@ def frame(encoded: bytes | None = None) -> Frame:
     return Frame(image, 0.0, 0.0, encoded=encoded)
 
 
-@pytest.mark.parametrize(
-    ("keep", "wanted"),
-    [("all", [1, 2, 3, 4, 5, 6]), ("every_n", [3, 6]), ("events", [4]), ("none", [])],
-)
-def test_what_is_kept(folder_of, keep, wanted):
-    folder = folder_of(keep=keep, every_n=3)
-    assert [n for n in range(1, 7) if folder.wanted(n, eventful=n == 4)] == wanted
-
-
 def test_a_jpeg_stays_as_it_came_and_grey_values_lose_nothing(folder_of):
     folder = folder_of()
     jpeg = folder.keep("cam", "M1", 1234, frame(b"\xff\xd8 as it came \xff\xd9"))

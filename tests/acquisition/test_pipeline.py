@@ -98,16 +98,6 @@ def test_too_slow_it_drops_calibration_never_acquisition_and_catches_up(pipeline
     assert (made.lost, made.dropped, made.caught_up) == (0, 17, 17)
 
 
-def test_fast_enough_everything_is_calibrated_in_order(pipeline):
-    made, keeper, calibrator = pipeline
-    calibrator.gate.set()
-    for n in range(1, 51):
-        made.submit(frame())
-        until(lambda n=n: len(keeper.kept) == n)
-    assert keeper.kept == [(n, True) for n in range(1, 51)]
-    assert made.dropped == 0
-
-
 def test_the_end_finishes_the_epoch_in_hand_and_keeps_the_others(pipeline):
     made, keeper, calibrator = pipeline
     for _ in range(3):

@@ -50,6 +50,28 @@ def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_pat
     assert columns["blur"][0] == 0.7
 
 
+def test_a_long_series_does_not_keep_its_next_epochs_waiting(tmp_path, monkeypatch):
+    """Regression: after a restart, all epochs were read before the first one was calibrated."""
+    guard, read = StoreGuard(tmp_path / "k.db", durable=False), []
+    frames = SimpleNamespace(wanted=lambda *_: False, root=tmp_path)
+    keeper = EpochKeeper(plan_of(), guard, frames, lambda *_: None)
+    frame, epoch = Frame(np.zeros((48, 64), np.uint8), 1.0, 1e9), Epoch(1, 1e9, 1e9, {"air": 20.0})
+    keeper.keep(AcquiredEpoch(1, frame, True, epoch))
+    (tmp_path / "late.jpg").touch()
+    for number in range(2, 1201):
+        late = Path("late.jpg") if number == 1100 else None
+        guard.store.append(keeper.series, replace(epoch, number=number, frame=late))
+    epochs = guard.epochs
+    monkeypatch.setattr(guard, "epochs", lambda *a, **b: read.extend(epochs(*a, **b)) or read[:])
+    found = []
+    for _ in range(7):
+        read.clear()
+        found.append(keeper.backlog(1201))
+        assert len(read) <= 200
+    guard.close()
+    assert [one.number for one in found if one is not None] == [1100]
+
+
 def test_a_setting_that_harms_is_in_the_status():
     class Focusing(Camera):
         def warnings(self):

@@ -6,7 +6,6 @@ import csv
 import os
 import shlex
 import time
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,14 +15,7 @@ import pytest
 
 from tests.commands import call
 from tests.daemon.conftest import make_photographs
-from thermocald.acquisition.frame_folder import FrameFolder
-from thermocald.config import FramesConfig
-from thermocald.daemon.epoch_keeper import EpochKeeper
-from thermocald.daemon.plan import plan_cameras, recording_config
-from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError
-from thermocald.hal import SystemClock
-from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
@@ -158,32 +150,8 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     assert daemon.events().count("frames_deleted") == 2
 
 
-def test_a_long_series_does_not_keep_its_next_epochs_waiting(recording, tmp_path, monkeypatch):
-    """Regression: after a restart, all epochs were read before the first one was calibrated."""
-    path = tmp_path / "long.db"
-    epoch, frame = read_recording(recording).epochs[0], Path("waits.jpg")
-    plan = plan_cameras(recording_config(recording, path), SystemClock())[0]
-    head = replace(read_recording(recording).head, camera=CameraSpec(plan.name, plan.sensor))
-    with Store.open(path, "append", durable=False) as store:
-        series = store.create_series(head, plan.testfield)
-        for number in range(1, 1201):
-            one = replace(epoch, number=number, observations=None)
-            store.append(series, replace(one, frame=frame) if number == 1100 else one)
-    (tmp_path / frame).touch()
-    guard, read = StoreGuard(path), []
-    epochs = guard.epochs
-    monkeypatch.setattr(guard, "epochs", lambda *a, **b: read.extend(epochs(*a, **b)) or read[:])
-    keeper = EpochKeeper(plan, guard, FrameFolder(FramesConfig(folder=tmp_path)), lambda *_: None)
-    found = []
-    for _ in range(8):
-        read.clear()
-        found.append(keeper.backlog(1201))
-        assert len(read) <= 200
-    guard.close()
-    assert [one.number for one in found if one is not None] == [1100]
-
-
 @pytest.mark.parametrize(("keep", "kept"), [
+    ({"keep": "all"}, list(range(1, 13))),
     ({"keep": "every_n", "every_n": 5}, [5, 10]), ({"keep": "events"}, list(range(1, 13))),
     ({"keep": "none"}, []),
 ])  # fmt: skip

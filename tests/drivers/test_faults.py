@@ -86,13 +86,6 @@ def test_by_time_and_open_fails_too(clock):
     device.close()
 
 
-def test_a_timeout_takes_its_time(clock):
-    options = {"faults": [{"kind": "timeout"}], "timeout_s": 2.5}
-    with open_device("thermometer", "mock", options, clock) as device:
-        assert outcomes(device, 1) == ["DeviceTimeout"]
-    assert clock.monotonic() == 2.5
-
-
 def test_stuck_repeats_the_value_with_new_instants(clock):
     options = {"faults": [{"kind": "stuck", "at": 3, "count": 3}]}
     with open_device("thermometer", "mock", options, clock) as device:
@@ -114,17 +107,6 @@ def test_a_stuck_camera_shows_the_same_picture(clock, small):
     assert np.array_equal(first, second)
     assert not np.array_equal(second, third)  # noise alone makes images differ
     assert frames[1].monotonic > frames[0].monotonic
-
-
-def test_injected_while_it_runs(clock):
-    with open_device("thermometer", "mock", {}, clock) as device:
-        assert outcomes(device, 1) == ["ok"]
-        device.inject("timeout", 2)
-        assert outcomes(device, 3) == ["DeviceTimeout", "DeviceTimeout", "ok"]
-        device.inject("unplugged", 1000)
-        assert outcomes(device, 1) == ["DeviceGone"]
-        device.clear()
-        assert outcomes(device, 1) == ["ok"]
 
 
 def test_an_output_that_fails_keeps_nothing(clock):

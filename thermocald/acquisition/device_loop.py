@@ -288,7 +288,7 @@ class DeviceLoop:
         self._stop.set()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the loop to end; False if the device has not returned in time."""
+        """Wait for the loop to end, as it does with its link; False if it has not in time."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
@@ -296,11 +296,6 @@ class DeviceLoop:
         """Return how long the current call has taken, s; 0 between calls."""
         since = self._busy_since
         return 0.0 if since is None else self._clock.monotonic() - since
-
-    @property
-    def alive(self) -> bool:
-        """Whether the loop is running; it ends by itself when its link has ended."""
-        return self._thread.is_alive()
 
     def _run(self) -> None:
         try:

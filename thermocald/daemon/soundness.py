@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from thermocald.config import Config, DeviceConfig
+    from thermocald.config import DeviceConfig
     from thermocald.hal import Kind
     from thermocald.store.recording.reader import Recording
 
@@ -68,15 +68,8 @@ def attached() -> tuple[list[dict[str, Any]], list[str]]:
     return found, notes
 
 
-def probe_devices(config: Config) -> list[Probe]:
-    """Take one frame from each camera and one reading from each thermometer; store nothing."""
-    return [
-        *(_probe("camera", device) for device in config.cameras),
-        *(_probe("thermometer", device) for device in config.thermometers),
-    ]
-
-
 def _probe(kind: Kind, device: DeviceConfig) -> Probe:
+    """Take one frame or reading; store nothing."""
     begin = time.monotonic()
     try:
         with open_device(kind, device.driver, device.options, SystemClock()) as driver:
@@ -255,7 +248,10 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
             lines.append(f"  test field of {plan.name}: {len(plan.testfield)} targets")
     document: dict[str, Any] = {"devices": devices, "lines": lines}
     if probe:
-        document["probes"] = answers = probe_devices(config)
+        document["probes"] = answers = [
+            *(_probe("camera", device) for device in config.cameras),
+            *(_probe("thermometer", device) for device in config.thermometers),
+        ]
         lines += [f"  {answer.text}" for answer in answers]
     return document
 

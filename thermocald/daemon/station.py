@@ -118,7 +118,7 @@ class Station:
     def finished(self) -> bool:
         """Whether no camera will take another epoch and all epochs are stored."""
         return bool(self.cameras) and all(
-            not camera.loop.alive and not camera.waiting() for camera in self.cameras
+            camera.loop.join(0.0) and not camera.waiting() for camera in self.cameras
         )
 
     def line(self, camera: str) -> CameraLine | None:

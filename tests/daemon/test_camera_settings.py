@@ -12,10 +12,11 @@ import pytest
 
 from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
+from thermocald.acquisition.thermometers import Thermometers
 from thermocald.config import parse_config
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.live_state import status_warnings
-from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.plan import check_series, plan_cameras
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
@@ -48,6 +49,27 @@ def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_pat
     assert columns["camera_focus"].tolist() == [30.0, 30.0]
     assert columns["camera_gain"].tolist() == [4.0, 4.0]
     assert columns["blur"][0] == 0.7
+
+
+def test_a_temperature_that_a_series_began_without_is_reported_once(tmp_path, caplog):
+    """Regression: of a thermometer that was plugged in later, no analysis had a temperature."""
+    config = {"thermometers": [{"name": "air", "driver": "hwmon", "chip": "tmp102"}]}
+    thermometers = Thermometers(parse_config(config, Path("c.yaml")), VirtualClock())
+    assert thermometers.columns(["air"]) == ["temperature"]  # what it has once it is there
+    guard = StoreGuard(tmp_path / "k.db", durable=False)
+    frames = SimpleNamespace(wanted=lambda *_: False)
+    keeper = EpochKeeper(plan_of(), guard, frames, lambda *_: None)
+    frame = Frame(np.zeros((48, 64), np.uint8), 1.0, 1e9)
+    for number, channels in enumerate(("temperature", "lens", "lens"), 1):
+        epoch = Epoch(number, 1e9 + number, 1e9, {channels: 20.0})
+        keeper.keep(AcquiredEpoch(number, replace(frame, utc=1e9 + number), True, epoch))
+    kinds = [event.kind for event in guard.store.events()]
+    with pytest.raises(ConfigurationError, match=r"temperatures \(temperature\), without lens; ch"):
+        check_series(plan_of(), keeper.series, ["temperature", "lens"])
+    check_series(plan_of(), keeper.series, ["temperature"])
+    guard.close()
+    assert kinds == ["series_begun", "channel_unknown"]
+    assert caplog.text.count("series M1 began without lens: no analysis") == 1
 
 
 def test_a_long_series_does_not_keep_its_next_epochs_waiting(tmp_path, monkeypatch):

@@ -116,8 +116,12 @@ class Thermometers:
             require_columns({name: channels[name] for name in camera.thermometers}, error)
 
     def columns(self, names: Sequence[str]) -> list[str]:
-        """Return some thermometers' temperature columns known so far, the reference first."""
-        return require_columns({name: self._channels[name] for name in names}, ConfigurationError)
+        """Return some thermometers' temperature columns known so far, the reference first.
+
+        One that was never opened and has no named channels is assumed to have `temperature`.
+        """
+        channels = {name: self._channels[name] or ("temperature",) for name in names}
+        return require_columns(channels, ConfigurationError)
 
     def identity(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Return the identities of some thermometers, by name."""

@@ -19,7 +19,7 @@ from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper, result_row
-from thermocald.daemon.plan import running_series
+from thermocald.daemon.plan import check_series, running_series
 from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 
@@ -123,6 +123,8 @@ class SeriesRun:
         self.keeper = EpochKeeper(
             plan, runtime.guard, line.frames, self._kept, line.identity, start=start
         )
+        if (stored := self.keeper.series) is not None:
+            check_series(plan, stored, line.thermometers.columns(plan.config.thermometers))
         self.observer = self._make_observer()
         self.running = running_series(plan)
         self._remembered = False

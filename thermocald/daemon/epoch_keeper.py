@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from thermocald.daemon.plan import check_series, series_head
+from thermocald.daemon.plan import series_head
 from thermocald.daemon.store_guard import Row
 from thermocald.errors import ImageError, StoreError
 from thermocald.names import UNEVENTFUL
@@ -58,11 +58,10 @@ class EpochKeeper:
         self._identity = identity
         self._start = start
         self._series = guard.find(plan.name, plan.series)
-        if self._series is not None:
-            check_series(plan, self._series.testfield)
         self._backlog: list[Epoch] = []
         self._searched_to = 0
         self._uncorrected = ""
+        self._strange: list[str] = []  # channels that are no columns of the series
 
     @property
     def series(self) -> StoredSeries | None:
@@ -132,6 +131,15 @@ class EpochKeeper:
             self._correct(path, calibrated)
         elif deferred and path is None:
             result = EpochResult("frame_not_kept", "calibration deferred, but no frame stored")
+        strange = [name for name in epoch.temperatures if name not in series.head.channels]
+        if strange and not self._strange:
+            text = (
+                f"camera {self.plan.name}: series {self.plan.series} began without "
+                f"{', '.join(strange)}: no analysis of it shows them; begin another series"
+            )
+            log.warning(text, extra={"event": "channel_unknown"})
+            self.record(epoch.frame_time, "channel_unknown", text, epoch.number)
+        self._strange = strange
         epoch = replace(epoch, frame=path)
         values = result_row(self.plan, epoch, result, extra)
         if deferred and result is None:

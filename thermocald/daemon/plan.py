@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.gauge import GaugeCalibrator
     from thermocald.config import CalibrationConfig, CameraConfig, Config
     from thermocald.hal import Camera, Clock, Frame
+    from thermocald.store.series import StoredSeries
 
 _UNKNOWN_PITCH_MM = 0.001
 
@@ -212,15 +213,21 @@ def series_head(
     return head, targets, dict(plan.calibration.model_dump(mode="json"))
 
 
-def check_series(plan: CameraPlan, field: TestField) -> None:
-    """Raise ConfigurationError if a continued series would change its test field."""
-    mine = plan.testfield
+def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]) -> None:
+    """Raise ConfigurationError if a continued series would change its test field or channels."""
+    mine, field = plan.testfield, series.testfield
+    what = ""
     if mine is not None and not (
         mine.names == field.names and np.array_equal(mine.points, field.points)
     ):
+        what = "another test field"
+    elif new := [name for name in channels if name not in series.head.channels]:
+        had = ", ".join(series.head.channels) or "none"
+        what = f"other temperatures ({had}), without {', '.join(new)}"
+    if what:
         raise ConfigurationError(
-            f"camera {plan.name!r}: series {plan.series!r} was begun with another test field; "
-            "choose another series"
+            f"camera {plan.name!r}: series {plan.series!r} was begun with {what}; choose another "
+            "series"
         )
 
 

@@ -66,7 +66,7 @@ def pipeline():
     keeper, calibrator = ListKeeper(), SlowCalibrator()
     clock = SystemClock()
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), clock)
-    made = Pipeline("cam", calibrator, none, (), keeper, clock, depth=3, patience_s=0.0)
+    made = Pipeline("cam", calibrator, none, (), keeper, clock, patience_s=0.0)
     made.start()
     yield made, keeper, calibrator
     calibrator.gate.set()
@@ -192,9 +192,9 @@ def test_a_channel_that_is_missing_is_logged_once_and_in_the_status(housing, cap
     for k in range(3):
         housing.add("housing", Reading({"lens": 20.0}, k, k, {"air": "an open wire"}))
     assert caplog.text.count("an open wire") == 1
-    assert housing.missing("housing") == ["an open wire"]
+    assert housing.last("housing")[1] == ["an open wire"]
     housing.add("housing", Reading({"lens": 20.0, "air": 5.0}, 9.0, 9.0))
-    assert housing.missing("housing") == []
+    assert housing.last("housing")[1] == []
 
 
 def test_a_reading_that_is_being_taken_is_waited_for(housing):

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_DEPTH = 3
+_DEPTH = 3  # epochs that may wait for their calibration
 _MOST_BYTES = 64_000_000  # of the frames that wait to be stored
 _MOST_WAITING = 200
 _PATIENCE_S = 2.0
@@ -87,7 +87,7 @@ class Pipeline:
     """The queue of one camera, with a thread that calibrates and one that stores.
 
     calibrator: None if epochs are only acquired; names: of the camera's thermometers, the reference
-    first; depth: number of epochs that may wait for their calibration; patience_s: how long to wait
+    first; patience_s: how long to wait
     for a reading that is being taken, by default 2 s, at most half a period; observe: (a calibrated
     epoch, whether it comes in order) → the epoch to be stored; on_lost: receives why an acquired
     epoch was not stored.
@@ -104,7 +104,6 @@ class Pipeline:
         *,
         first: int = 1,
         period_s: float = 10.0,
-        depth: int = _DEPTH,
         patience_s: float | None = None,
         trusted: Callable[[], bool] = lambda: True,
         observe: Callable[[CalibratedEpoch, bool], CalibratedEpoch] = lambda epoch, _: epoch,
@@ -121,7 +120,6 @@ class Pipeline:
         self._keeper = keeper
         self._clock = clock
         self._patience_s = min(_PATIENCE_S, 0.5 * period_s) if patience_s is None else patience_s
-        self._depth = depth
         self._trusted = trusted
         self._observe = observe
         self._on_lost = on_lost
@@ -143,7 +141,7 @@ class Pipeline:
     def submit(self, frame: Frame) -> None:
         """Queue a frame; returns at once."""
         with self._changed:
-            if len(self._items) > 2 * self._depth and self._is_full():
+            if len(self._items) > 2 * _DEPTH and self._is_full():
                 self._lose("frames cannot be stored fast enough")
                 return
             self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
@@ -165,7 +163,7 @@ class Pipeline:
     def wait_for_room(self, timeout_s: float) -> bool:
         """Wait until one more epoch defers no calibration: for replays; False after the timeout."""
         with self._changed:
-            return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
+            return self._changed.wait_for(lambda: len(self._items) < _DEPTH, timeout_s)
 
     def finish(self, grace_s: float) -> bool:
         """Calibrate and store all waiting epochs, then stop; False if that took too long."""
@@ -293,7 +291,7 @@ class Pipeline:
                     return self._amended.popleft()
                 if self._items:
                     first = self._items[0]
-                    deferred = len(self._items) > self._depth
+                    deferred = len(self._items) > _DEPTH
                     deferred |= self._stopping and first.state == "waiting"
                     if deferred and first.state != "done":
                         first.state = "dropped"

@@ -11,7 +11,6 @@ is not followed. Every step is reported.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from thermocald.hal import Clock, SystemClock, read_together
@@ -30,19 +29,6 @@ _WRONG_S = 1.0
 _CONFIRM_S = 60.0  # how long a new time must last before it is followed
 _LEAP_S = 3600.0
 _SETTLE_S = 86400.0  # after a leap, before ages are trusted
-
-
-@dataclass(frozen=True, slots=True)
-class ClockStep:
-    """A step of the machine's UTC by `seconds`; `text` describes it in a sentence.
-
-    utc: the time stamp at the step; adopted: whether time stamps follow the step.
-    """
-
-    utc: float
-    seconds: float
-    adopted: bool
-    text: str
 
 
 class SteadyClock:
@@ -74,8 +60,11 @@ class SteadyClock:
         """Sleep as `Clock.sleep_until` of the machine's clock."""
         return self._machine.sleep_until(monotonic, wake)
 
-    def check(self) -> ClockStep | None:
-        """Return a new step of the machine's clock, or an earlier one that is followed now."""
+    def check(self) -> tuple[float, bool, str] | None:
+        """Return a new step of the machine's clock, or an earlier one that is followed now.
+
+        The step in s, whether time stamps follow it, and a sentence; None without a step.
+        """
         now = self._machine.monotonic()
         offset = _offset(self._machine)
         learned = not self._was_synchronised and self._synchronised()
@@ -102,7 +91,7 @@ class SteadyClock:
         size = duration(abs(step)) if abs(step) >= _LEAP_S else f"{abs(step):.1f} s"
         text = f"the clock was set {where} by {size}; {then}"
         log.warning(text, extra={"event": "clock_step"})
-        return ClockStep(self.utc(), step, adopted, text)
+        return step, adopted, text
 
     @property
     def error_s(self) -> float:

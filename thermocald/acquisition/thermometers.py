@@ -154,15 +154,10 @@ class Thermometers:
             self._kept[name].append(reading)
             self._changed.notify_all()
 
-    def last(self, name: str) -> Mapping[str, float]:
-        """Return a thermometer's last values, {channel: °C}."""
+    def last(self, name: str) -> tuple[Mapping[str, float], list[str]]:
+        """Return the values of a thermometer's last reading, °C, and why channels are missing."""
         kept = self._kept[name]
-        return kept[-1].values if kept else {}
-
-    def missing(self, name: str) -> list[str]:
-        """Return why channels are missing in a thermometer's last reading."""
-        kept = self._kept[name]
-        return list(kept[-1].missing.values()) if kept else []
+        return (kept[-1].values, list(kept[-1].missing.values())) if kept else ({}, [])
 
     def nearest(self, name: str, monotonic: float) -> Reading | None:
         """Return a thermometer's reading nearest to a time; None if it is over 1.5 periods away."""

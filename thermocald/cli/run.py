@@ -301,7 +301,7 @@ def check(
             "backup, or use what can still be read"
         )
     probes = document.get("probes", [])
-    failed = [probe.name for probe in probes if probe.error]
+    failed = [probe["name"] for probe in probes if probe["error"]]
     if failed:
         raise DeviceError(
             f"{len(failed)} of {len(probes)} devices failed: {', '.join(failed)}; see their lines"

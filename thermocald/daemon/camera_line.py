@@ -24,7 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, 
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping, Sequence
 
     from thermocald.acquisition.device_loop import OutputLoop
     from thermocald.acquisition.frame_folder import FrameFolder
@@ -42,35 +42,26 @@ START_EPOCHS = 10
 _NAMES = PARAMETER_NAMES[PRINCIPAL]
 
 
-class SeriesDrift:
-    """The columns `drift_c_px`, `sd_drift_c_px` …, `pixel_pitch` for the rows of a series.
+def drift_columns(
+    row: Mapping[str, Any], start: Sequence[Mapping[str, Any]], pixel_pitch: float
+) -> dict[str, float]:
+    """Return the columns `drift_c_px`, `sd_drift_c_px` … for an epoch's row.
 
-    pixel_pitch: mm; earlier: rows of the first stored epochs of the series. The standard deviation
-    assumes independent epochs: an error that they share cancels in the difference, so that it is
-    too large rather than too small.
+    start: the rows of the first epochs of the series with a result, pixel_pitch: mm. NaN without a
+    result and until the start is complete. The standard deviation assumes independent epochs: an
+    error that they share cancels in the difference, so that it is too large rather than too small.
     """
-
-    def __init__(self, pixel_pitch: float, earlier: Iterable[dict[str, Any]] = ()) -> None:
-        self._pitch = pixel_pitch
-        self._start: list[dict[str, float]] = []
-        for row in earlier:
-            self.columns(row)
-
-    def columns(self, row: dict[str, Any]) -> dict[str, float]:
-        """Return the columns for an epoch; NaN without a result and until the start is complete."""
-        good = row.get("status") == "ok"
-        if good and len(self._start) < START_EPOCHS:
-            self._start.append({k: float(row[k]) for n in _NAMES for k in (n, f"sd_{n}")})
-        known = good and len(self._start) == START_EPOCHS
-        result = {"pixel_pitch": self._pitch}
-        for name in _NAMES:
-            drift = sd = math.nan
-            if known:
-                drift = (row[name] - sum(s[name] for s in self._start) / START_EPOCHS) / self._pitch
-                start = sum(s[f"sd_{name}"] ** 2 for s in self._start) / START_EPOCHS**2
-                sd = math.sqrt(row[f"sd_{name}"] ** 2 + start) / self._pitch
-            result |= {f"drift_{name}_px": drift, f"sd_drift_{name}_px": sd}
-        return result
+    known = row["status"] == "ok" and len(start) == START_EPOCHS
+    result = {"pixel_pitch": pixel_pitch}
+    for name in _NAMES:
+        drift = sd = math.nan
+        if known:
+            mean = sum(s[name] for s in start) / START_EPOCHS
+            variance = sum(s[f"sd_{name}"] ** 2 for s in start) / START_EPOCHS**2
+            drift = (row[name] - mean) / pixel_pitch
+            sd = math.sqrt(row[f"sd_{name}"] ** 2 + variance) / pixel_pitch
+        result |= {f"drift_{name}_px": drift, f"sd_drift_{name}_px": sd}
+    return result
 
 
 @dataclass(frozen=True)
@@ -143,7 +134,7 @@ class SeriesRun:
             observe=self._observe,
             on_lost=runtime.guard.lose,
         )
-        self.drift: SeriesDrift | None = None
+        self._start: list[dict[str, Any]] | None = None  # rows of the first good epochs
         self.last: dict[str, Any] = {}
         self._shown = self._previewed = float("-inf")
 
@@ -239,11 +230,13 @@ class SeriesRun:
         report |= {} if self.running is None else self.running.report()
         row["state"] = report.get("state", "unknown")
         if self.plan.sensor is not None:
-            if self.drift is None:
-                first = self.keeper.read(1, 20 * START_EPOCHS)
-                earlier = (result_row(self.plan, s.epoch, s.result, {}) for s in first)
-                self.drift = SeriesDrift(self.plan.sensor.pixel_pitch, earlier)
-            row |= self.drift.columns(row)
+            if self._start is None:
+                first = self.keeper.read(1, min(20 * START_EPOCHS, row["epoch"] - 1))
+                good = [s for s in first if s.result.status == "ok"][:START_EPOCHS]
+                self._start = [result_row(self.plan, s.epoch, s.result, {}) for s in good]
+            if row["status"] == "ok" and len(self._start) < START_EPOCHS:
+                self._start.append(dict(row))
+            row |= drift_columns(row, self._start, self.plan.sensor.pixel_pitch)
             result = None if acquired.calibrated is None else acquired.calibrated.adjustment
             if result is not None and result.interior is not None:
                 values, covariance = result.interior.as_array(), result.covariance[IOP, IOP]

@@ -233,10 +233,11 @@ class Service:
             self._answer_requests()
             self._sessions.turn()
             if (step := self.clock.check()) is not None:
-                data = {"seconds": step.seconds, "adopted": step.adopted}
-                self._guard.event(step.utc, "clock_step", step.text, data=data)
-                if step.adopted:
-                    self._station.frames.restamp(step.seconds)
+                seconds, adopted, text = step
+                data = {"seconds": seconds, "adopted": adopted}
+                self._guard.event(self.clock.utc(), "clock_step", text, data=data)
+                if adopted:
+                    self._station.frames.restamp(seconds)
             self._dashboard.ensure_running(self.config.dashboard)
             stalled = self._station.stalled()
             self._report_stalled(stalled)
@@ -320,11 +321,10 @@ class Service:
             parts.append(f"{camera.plan.name}: {text}")
         if not parts:
             thermometers = self._station.thermometers
-            read = {name: thermometers.last(name) for name in thermometers.links}
             parts = [
                 f"{name}: " + ", ".join(f"{celsius:.1f} °C" for celsius in values.values())
-                for name, values in read.items()
-                if values
+                for name in thermometers.links
+                if (values := thermometers.last(name)[0])
             ]
         if self._guard.away:
             parts.append(f"store: {self._guard.away}")

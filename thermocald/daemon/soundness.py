@@ -8,7 +8,7 @@ comment.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,25 +30,6 @@ if TYPE_CHECKING:
 KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
 
 
-@dataclass(frozen=True)
-class Probe:
-    """The result of one frame or reading of a configured device; error: why there is none."""
-
-    kind: Kind
-    name: str
-    driver: str
-    took_s: float
-    values: Mapping[str, Any]
-    error: str | None = None
-
-    @property
-    def text(self) -> str:
-        """The probe in one line."""
-        shown = ", ".join(f"{key} {v}" for key, v in self.values.items() if v is not None)
-        what = f"FAILED: {self.error}" if self.error else shown
-        return f"{self.kind} {self.name} ({self.driver}), {self.took_s * 1e3:.0f} ms: {what}"
-
-
 def attached() -> tuple[list[dict[str, Any]], list[str]]:
     """Return the attached devices, and notes on drivers that could not search.
 
@@ -68,8 +49,9 @@ def attached() -> tuple[list[dict[str, Any]], list[str]]:
     return found, notes
 
 
-def _probe(kind: Kind, device: DeviceConfig) -> Probe:
-    """Take one frame or reading; store nothing."""
+def _probe(kind: Kind, device: DeviceConfig) -> dict[str, Any]:
+    """Take one frame or reading of a configured device; `error`: why there is none."""
+    found: dict[str, Any] = {"kind": kind, "name": device.name, "driver": device.driver}
     begin = time.monotonic()
     try:
         with open_device(kind, device.driver, device.options, SystemClock()) as driver:
@@ -81,7 +63,7 @@ def _probe(kind: Kind, device: DeviceConfig) -> Probe:
         took_s = time.monotonic() - begin
         known = isinstance(error, ThermocaldError)
         why = str(error) if known else f"its driver failed: {type(error).__name__}: {error}"
-        return Probe(kind, device.name, device.driver, took_s, {}, why)
+        return {**found, "took_s": took_s, "values": {}, "error": why}
     if kind == "camera":
         values = {"age_s": round(time.time() - result.utc, 3)}
         if (image := result.image) is not None:
@@ -92,7 +74,7 @@ def _probe(kind: Kind, device: DeviceConfig) -> Probe:
     else:
         values = {f"{channel}_c": round(celsius, 4) for channel, celsius in result.values.items()}
         values |= {f"{channel}_missing": why for channel, why in result.missing.items()}
-    return Probe(kind, device.name, device.driver, took_s, values)
+    return {**found, "took_s": took_s, "values": values, "error": None}
 
 
 def stanzas(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -252,7 +234,13 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
             *(_probe("camera", device) for device in config.cameras),
             *(_probe("thermometer", device) for device in config.thermometers),
         ]
-        lines += [f"  {answer.text}" for answer in answers]
+        for one in answers:
+            shown = ", ".join(f"{key} {v}" for key, v in one["values"].items() if v is not None)
+            what = f"FAILED: {one['error']}" if one["error"] else shown
+            lines.append(
+                f"  {one['kind']} {one['name']} ({one['driver']}), {one['took_s'] * 1e3:.0f} ms: "
+                f"{what}"
+            )
     return document
 
 

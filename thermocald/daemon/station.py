@@ -183,11 +183,8 @@ class Station:
     def _thermometer_status(self, name: str) -> dict[str, Any]:
         busy_s = self._readers[name].busy_s() if name in self._readers else 0.0
         link = self.thermometers.links[name].status(busy_s, self.runtime.hang_after_s)
-        return {
-            **link,
-            "warnings": link["warnings"] + self.thermometers.missing(name),
-            "last": dict(self.thermometers.last(name)),
-        }
+        values, missing = self.thermometers.last(name)
+        return {**link, "warnings": link["warnings"] + missing, "last": dict(values)}
 
     def _read(self, name: str) -> None:
         """Read a thermometer; store the reading if no epoch will contain it."""

@@ -245,7 +245,14 @@ class SerialThermometer(support.CheckedThermometer):
                 raise DeviceTimeout(f"{self.where}: cannot send, flow control blocks it") from error
             # pyserial reports an unplug without an errno, or with EIO
             raise DeviceGone(f"{self.where}: unplugged ({error})") from error
-        reading = self._reading(match, start)
+        there = [channel for channel in self.channels if match[channel] is not None]
+        if not there:
+            raise BadReading(f"{self.where}: {match.string!r} has no value")
+        measures = {
+            channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match[channel]))
+            for channel in there
+        }
+        reading = self.checked.reading(measures, start)
         if self.command:
             return reading
         monotonic, utc = support.on_clock(self.clock, ended)
@@ -333,17 +340,6 @@ class SerialThermometer(support.CheckedThermometer):
         if int(given, 16) == computed:
             return ""
         return f"checksum {given} in {match.string!r}, computed {computed:02X}"
-
-    def _reading(self, match: re.Match[str], start: float) -> Reading:
-        """Return the reading of a line; a channel without a usable number is missing."""
-        there = [channel for channel in self.channels if match[channel] is not None]
-        if not there:
-            raise BadReading(f"{self.where}: {match.string!r} has no value")
-        measures = {
-            channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match[channel]))
-            for channel in there
-        }
-        return self.checked.reading(measures, start)
 
     def _celsius(self, channel: str, text: str) -> float:
         """Convert a printed number to °C; BadReading if it means that nothing was measured."""

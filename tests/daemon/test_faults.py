@@ -282,3 +282,5 @@ def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, co
     assert numbers == list(range(1, count + 1))
     assert "ok" not in statuses
     assert "Traceback" not in daemon.log()
+    assert daemon.log().count("its last 20 epochs have no result; ") == 1
+    assert daemon.events().count("no_result") == 1

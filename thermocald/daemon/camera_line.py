@@ -20,6 +20,7 @@ from thermocald.acquisition.device_loop import DeviceLoop, Link
 from thermocald.acquisition.pipeline import Pipeline, check_frame
 from thermocald.daemon.epoch_keeper import EpochKeeper, result_row
 from thermocald.daemon.plan import check_series, running_series
+from thermocald.names import UNEVENTFUL
 from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
-    from thermocald.hal import Frame
     from thermocald.photogrammetry.field.testfield import Observations
 
 START_EPOCHS = 10
@@ -94,6 +94,7 @@ _PREVIEW_EVERY_S = 5.0
 _SHOW_EVERY_S = 0.5
 _SWITCH_GRACE_S = 20.0
 _VIRTUAL_PATIENCE_S = 60.0  # real seconds that a tick of a virtual clock waits for room
+_FAILED = 20  # epochs in a row without a result, which are reported
 _FROZEN = 2  # repeats from which a camera counts as frozen
 _REMEMBERED = 200  # epochs, as many as a `RunningSeries` holds
 _LATEST = 4000  # epochs whose readings still act on effects with a memory
@@ -136,6 +137,7 @@ class SeriesRun:
         )
         self._start: list[dict[str, Any]] | None = None  # rows of the first good epochs
         self.last: dict[str, Any] = {}
+        self._failed = 0  # latest epochs in a row without a result
         self._shown = self._previewed = float("-inf")
 
     @property
@@ -229,6 +231,10 @@ class SeriesRun:
         report = {} if self.observer is None else self.observer.report()
         report |= {} if self.running is None else self.running.report()
         row["state"] = report.get("state", "unknown")
+        self._failed = 0 if row["status"] in UNEVENTFUL else self._failed + 1
+        if self._failed == _FAILED and self.plan.calibrator is not None:
+            why = f"its last {_FAILED} epochs have no result; {row['status']}: {row['reason']}"
+            self._record("no_result", why, row["frame_time"], row["epoch"])
         if self.plan.sensor is not None:
             if self._start is None:
                 first = self.keeper.read(1, min(20 * START_EPOCHS, row["epoch"] - 1))
@@ -343,7 +349,13 @@ class CameraLine:
         ):
             return
         frame = self.plan.camera.capture()
-        self._count_repeats(frame)
+        mark, last = frame.fingerprint, self._fingerprint
+        self._fingerprint = mark
+        self._repeats = self._repeats + 1 if mark is not None and mark == last else 0
+        if self._repeats == _FROZEN:  # noise makes identical frames impossible
+            text = f"camera {self.plan.name}: {self._frozen()[0]}"
+            log.warning(text, extra={"event": "frozen"})
+            self._event(frame.utc, "frozen", text)
         if runtime.fast:
             self.thermometers.read_up_to(self.plan.config.thermometers, frame.monotonic)
         if self._checking:
@@ -358,16 +370,6 @@ class CameraLine:
             run.pipeline.submit(frame)
         if runtime.epochs and run.taken - run.first + 1 >= runtime.epochs:
             self.loop.stop()
-
-    def _count_repeats(self, frame: Frame) -> None:
-        """Count frames that are identical to the one before, as noise makes impossible."""
-        mark, last = frame.fingerprint, self._fingerprint
-        self._fingerprint = mark
-        self._repeats = self._repeats + 1 if mark is not None and mark == last else 0
-        if self._repeats == _FROZEN:
-            text = f"camera {self.plan.name}: {self._frozen()[0]}"
-            log.warning(text, extra={"event": "frozen"})
-            self._event(frame.utc, "frozen", text)
 
     def _frozen(self) -> list[str]:
         """Return the warning of a camera that delivers one frame again and again, else none."""

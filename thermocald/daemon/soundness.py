@@ -143,8 +143,13 @@ def _examine_recording(path: Path) -> dict[str, Any]:
     readings = {
         name: int(np.isfinite(values).sum()) for name, values in columns.temperatures.items()
     }
-    doubts = [
-        *_name_doubts(recording),
+    doubts = []
+    for what, name in (("camera", recording.camera.name), ("series", recording.series)):
+        try:
+            file_name(name, what, DataError)
+        except DataError as error:
+            doubts.append(f"{error}; no store accepts it")
+    doubts += [
         *recording.doubts(),
         *strange_photographs([e.frame for e in recording.epochs if e.frame is not None]),
         *calibration_doubts(recording),
@@ -168,15 +173,6 @@ def _examine_recording(path: Path) -> dict[str, Any]:
         "doubts": doubts,
         "lines": lines,
     }
-
-
-def _name_doubts(recording: Recording) -> Iterator[str]:
-    """Yield a doubt for each name of a recording that a store does not accept."""
-    for what, name in (("camera", recording.camera.name), ("series", recording.series)):
-        try:
-            file_name(name, what, DataError)
-        except DataError as error:
-            yield f"{error}; no store accepts it"
 
 
 def calibration_doubts(recording: Recording) -> list[str]:

@@ -188,6 +188,15 @@ def test_the_nearest_reading_is_taken_and_a_stale_one_is_not(housing):
     assert housing.nearest("housing", 35.1) is None
 
 
+def test_a_frame_that_waited_has_the_temperature_of_its_time():
+    """Regression: with readings every second, one that waited for 20 s had none."""
+    document = {"thermometers": [{"name": "air", "driver": "mock", "period_s": 1.0}]}
+    air = Thermometers(parse_config(document, Path("config.yaml")), VirtualClock())
+    for at in range(300):
+        air.add("air", reading(float(at)))
+    assert air.nearest("air", 30.2) == reading(30.0)
+
+
 def test_a_channel_that_is_missing_is_logged_once_and_in_the_status(housing, caplog):
     for k in range(3):
         housing.add("housing", Reading({"lens": 20.0}, k, k, {"air": "an open wire"}))

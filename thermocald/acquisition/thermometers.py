@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_REMEMBERED = 16
+_REMEMBERED = 16  # readings at least
+_REMEMBERED_S = 600.0  # a frame may wait for its calibration, and a phone's comes late
 _FARTHEST_IN_PERIODS = 1.5
 
 
@@ -108,7 +109,8 @@ class Thermometers:
                 pauses=pauses,
             )  # fmt: skip
             self._channels[one.name] = tuple(device.named_channels())
-            self._kept[one.name] = deque(maxlen=_REMEMBERED)
+            count = max(_REMEMBERED, round(_REMEMBERED_S / one.period_s))
+            self._kept[one.name] = deque(maxlen=count)
         self._require(self._channels, ConfigurationError)
 
     def _require(self, channels: Mapping[str, Sequence[str]], error: type[Exception]) -> None:

@@ -131,6 +131,8 @@ class EpochKeeper:
             self._correct(path, calibrated)
         elif deferred and path is None:
             result = EpochResult("frame_not_kept", "calibration deferred, but no frame stored")
+        elif deferred:
+            result = EpochResult(NOT_CALIBRATED, "calibrated later, when there is time")
         strange = [name for name in epoch.temperatures if name not in series.head.channels]
         if strange and not self._strange:
             text = (
@@ -142,8 +144,6 @@ class EpochKeeper:
         self._strange = strange
         epoch = replace(epoch, frame=path)
         values = result_row(self.plan, epoch, result, extra)
-        if deferred and result is None:
-            values["reason"] = "calibrated later, when there is time"
         stored = self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted))
         self.stored += stored
         self._on_kept(acquired, {**values, "stored": stored, "lost": self._guard.lost})

@@ -154,11 +154,11 @@ def test_an_epoch_that_is_not_handed_over_is_lost(how):
     keeper = SimpleNamespace(keep=keep, amend=None, backlog=lambda below: None)
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), SystemClock())
     pipeline = Pipeline(
-        "cam", None, none, (), keeper, SystemClock(), depth=1, patience_s=0.0,
+        "cam", None, none, (), keeper, SystemClock(), patience_s=0.0,
         on_lost=told.append,
     )  # fmt: skip
     pipeline.start()
-    count = 2 if how == "the keeper breaks" else 8 if how in ("too slow", "too many wait") else 3
+    count = 2 if how == "the keeper breaks" else 10 if how.startswith("too") else 3
     for _ in range(count):
         pipeline.submit(Frame(np.zeros((5000, 5000), np.uint8), 0.0, 0.0))
     if how == "the keeper breaks":

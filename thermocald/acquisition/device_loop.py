@@ -105,7 +105,7 @@ class Link:
     since: UTC s, when the device went away or ended, else NaN; faults: number of failed calls.
     on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
     back (`device_back`), fails permanently (`device_failed`), or its recording ends
-    (`device_finished`). pauses: whether it waits before a retry; a recording played fast does not.
+    (`device_finished`). free_running: retries at once, as a recording played fast.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Link:
         *,
         period_s: float = 1.0,
         on_event: OnEvent = lambda *_: None,
-        pauses: bool = True,
+        free_running: bool = False,
     ) -> None:
         self.name = name
         self.called = f"{kind} {name}"
@@ -130,7 +130,7 @@ class Link:
         self._clock = clock
         self._period_s = period_s
         self._on_event = on_event
-        self._pauses = pauses
+        self._free_running = free_running
         self._searched = DeviceNotFound if kind == "output" else (DeviceNotFound, DeviceDenied)
         self._pause_s = 0.0
         self._retry_at = 0.0
@@ -145,7 +145,7 @@ class Link:
 
     def do(self, action: Callable[[], object]) -> bool:
         """Call `action` with the device open; return whether it succeeded."""
-        waits = self._pauses and self._clock.monotonic() < self._retry_at
+        waits = not self._free_running and self._clock.monotonic() < self._retry_at
         if self.ended or (self.state == "out" and waits):
             return False
         try:

@@ -85,13 +85,13 @@ def _column(thermometer: str, channel: str, thermometers: int) -> str:
 class Thermometers:
     """All thermometers of a configuration, and their last readings; threads may share them.
 
-    pauses: as of a `Link`. Raises ConfigurationError if options are wrong, or if the channels
+    free_running: as of a `Link`. Raises ConfigurationError if options are wrong, or if the channels
     cannot all be columns of a camera's epochs.
     """
 
     def __init__(
         self, config: Config, clock: Clock, on_event: OnEvent = lambda *_: None, *,
-        pauses: bool = True,
+        free_running: bool = False,
     ) -> None:  # fmt: skip
         self.links: dict[str, Link] = {}
         self._cameras = config.cameras
@@ -106,7 +106,7 @@ class Thermometers:
             self._devices[one.name] = device
             self.links[one.name] = Link(
                 "thermometer", one.name, device, clock, period_s=one.period_s, on_event=on_event,
-                pauses=pauses,
+                free_running=free_running,
             )  # fmt: skip
             self._channels[one.name] = tuple(device.named_channels())
             count = max(_REMEMBERED, round(_REMEMBERED_S / one.period_s))

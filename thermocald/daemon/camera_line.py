@@ -68,8 +68,8 @@ def drift_columns(
 class Runtime:
     """The store, clock and run options, which stay the same when the configuration is reloaded.
 
-    fast: play recordings as fast as they can be calibrated; virtual: take the ticks of a virtual
-    clock as fast, too; epochs: the number of new epochs after which a camera stops, 0 for never;
+    fast: take epochs as fast as they can be calibrated, at the ticks of a virtual clock, or
+    free_running: of a recording, without ticks and pauses; epochs: the number of new epochs after which a camera stops, 0 for never;
     start_condition: stored with a new series.
     """
 
@@ -77,15 +77,10 @@ class Runtime:
     clock: SteadyClock
     live: LiveState
     fast: bool = False
-    virtual: bool = False
+    free_running: bool = False
     epochs: int = 0
     hang_after_s: float = 60.0
     start_condition: str = ""
-
-    @property
-    def pauses(self) -> bool:
-        """Whether a device that is away is left alone for a while: time passes at its own pace."""
-        return self.virtual or not self.fast
 
 
 log = logging.getLogger(__name__)
@@ -286,11 +281,11 @@ class CameraLine:
         self.link = Link(
             "camera", plan.name, plan.camera, runtime.clock,
             period_s=plan.config.period_s,
-            on_event=self._event, pauses=runtime.pauses,
+            on_event=self._event, free_running=runtime.free_running,
         )  # fmt: skip
         self.loop = DeviceLoop(
             self.link, self._capture, runtime.clock, plan.config.period_s, begin,
-            free_running=not runtime.pauses, idle=lambda: not self.taking,
+            free_running=runtime.free_running, idle=lambda: not self.taking,
         )  # fmt: skip
         self.take(plan.config.series, runtime.start_condition)
 
@@ -343,7 +338,7 @@ class CameraLine:
     def _capture(self) -> None:
         runtime, run = self.runtime, self.run
         # each tick of a virtual clock is an epoch, however long the earlier ones take
-        patience_s = _VIRTUAL_PATIENCE_S if runtime.virtual else 1.0
+        patience_s = 1.0 if runtime.free_running else _VIRTUAL_PATIENCE_S
         if run is not None and (
             run.full or (runtime.fast and not run.pipeline.wait_for_room(patience_s))
         ):

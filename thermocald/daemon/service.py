@@ -152,7 +152,7 @@ class Service:
         self._with_options = with_options
         self._options: dict[str, Any] = {
             "fast": fast or clock is not None,
-            "virtual": clock is not None,
+            "free_running": fast and clock is None,
             "epochs": epochs,
             "hang_after_s": hang_after_s,
             "start_condition": start_condition,

@@ -45,7 +45,9 @@ class Station:
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
-        self.thermometers = Thermometers(config, clock, runtime.guard.event, pauses=runtime.pauses)
+        self.thermometers = Thermometers(
+            config, clock, runtime.guard.event, free_running=runtime.free_running
+        )
         self.outputs = [self._output(one, one.options) for one in config.outputs]
         self.cameras = [
             CameraLine(

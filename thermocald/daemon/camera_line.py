@@ -69,8 +69,8 @@ class Runtime:
     """The store, clock and run options, which stay the same when the configuration is reloaded.
 
     fast: take epochs as fast as they can be calibrated, at the ticks of a virtual clock, or
-    free_running: of a recording, without ticks and pauses; epochs: the number of new epochs after which a camera stops, 0 for never;
-    start_condition: stored with a new series.
+    free_running: of a recording, without ticks and pauses; epochs: the number of new epochs after
+    which a camera stops, 0 for never; start_condition: stored with a new series.
     """
 
     guard: StoreGuard

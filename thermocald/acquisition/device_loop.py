@@ -157,7 +157,7 @@ class Link:
         except self._searched as error:
             self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
         except PermanentDeviceError as error:
-            self._close()
+            self._ask("close", self.device.close, None)
             self.since = self._clock.utc()
             self.why = without_secrets(str(error))
             # the end of a recording is not a failure
@@ -177,7 +177,7 @@ class Link:
 
     def close(self) -> None:
         """Release the device."""
-        self._close()
+        self._ask("close", self.device.close, None)
         if not self.ended:
             self.state = "closed"
 
@@ -186,9 +186,6 @@ class Link:
         return self._ask(
             "identity", lambda: {str(k): str(v) for k, v in self.device.identity().items()}, {}
         )
-
-    def _close(self) -> None:
-        self._ask("close", self.device.close, None)
 
     def _ask(self, method: str, call: Callable[[], _T], default: _T) -> _T:
         """Call a method of the driver that should not fail; log once that it did."""
@@ -210,7 +207,7 @@ class Link:
         self._pause_s = 0.0
 
     def _out(self, why: str, longest_s: float) -> None:
-        self._close()
+        self._ask("close", self.device.close, None)
         why = without_secrets(why)  # a library may quote an address
         self.faults += 1
         self.why = why

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
-    from thermocald.photogrammetry.field.testfield import Observations
 
 START_EPOCHS = 10
 """The start of a series is the mean of this many first epochs with a result."""
@@ -112,6 +111,8 @@ class SeriesRun:
         )
         if (stored := self.keeper.series) is not None:
             check_series(plan, stored, line.thermometers.columns(plan.config.thermometers))
+        calibrator = plan.calibrator
+        self._calibrator = calibrator if isinstance(calibrator, Calibrator) else None
         self.observer = self._make_observer()
         self.running = running_series(plan)
         self._remembered = False
@@ -171,13 +172,13 @@ class SeriesRun:
         seen = calibrated.epoch.observations
         adjusted = calibrated.adjustment
         columns: dict[str, float] = {}
-        if self.running is not None and seen is not None:
+        if self.running is not None and self._calibrator is not None and seen is not None:
             if in_order and self.first > 1 and not self.running.epochs:
                 self._remember()
             hurried = self.pipeline.waiting() > 1 and not self._line.runtime.fast
             try:
                 adjusted, columns = self.running.refine(
-                    calibrated, self._weighed(seen), hurried=hurried
+                    calibrated, self._calibrator.weighed(seen), hurried=hurried
                 )
             except Exception:
                 # an error in the series must not lose an epoch that has a result of its own
@@ -198,17 +199,13 @@ class SeriesRun:
             columns |= self.observer.observe(calibrated, adjusted, *noise)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})
 
-    def _weighed(self, seen: Observations) -> Observations:
-        assert isinstance(self.plan.calibrator, Calibrator)
-        return self.plan.calibrator.weighed(seen)
-
     def _remember(self) -> None:
         """Fill the running series with the last stored epochs, after a restart."""
         if self._remembered:
             return
         self._remembered = True
         assert self.running is not None
-        assert isinstance(self.plan.calibrator, Calibrator)
+        assert self._calibrator is not None
         for stored in self.keeper.read(max(1, self.first - _REMEMBERED)):
             epoch = stored.epoch
             if epoch.observations is None or stored.result.status != "ok":
@@ -216,8 +213,8 @@ class SeriesRun:
             if "series_restarted" in stored.extra:
                 self.running.reset()
                 continue
-            seen = self._weighed(epoch.observations)
-            alone = CalibratedEpoch(epoch, self.plan.calibrator.adjust(seen), {})
+            seen = self._calibrator.weighed(epoch.observations)
+            alone = CalibratedEpoch(epoch, self._calibrator.adjust(seen), {})
             self.running.remember(alone, seen, stored.result.values)
 
     def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:

@@ -133,7 +133,8 @@ class FollowedStore:
         self._require_mount()
         file, copy = self._file, None
         covered = mount_point(self.path) != self._mount
-        swapped = not covered and not file.deleted and _device(self.path) != file.identity[0]
+        place = next(folder for folder in self.path.resolve().parents if folder.exists())
+        swapped = not covered and not file.deleted and place.stat().st_dev != file.identity[0]
         # a -wal file without a name would be lost with the connection: a checkpoint, or else a
         # copy, saves its content. A store that another disk covers has no path, and is copied. A
         # store on a disk that was exchanged stays there: a disk that was pulled out is unreadable
@@ -206,11 +207,6 @@ class FollowedStore:
 def _aside(path: Path) -> Path:
     wal = helper(path, "wal")
     return wal.with_name(f".{wal.name[:60]}.aside")
-
-
-def _device(path: Path) -> int:
-    """Return the number of the disk of a path, which need not exist."""
-    return next(folder for folder in path.resolve().parents if folder.exists()).stat().st_dev
 
 
 # results alone take about 1.2 kB an epoch: enough for more than a day at one every 10 s

@@ -308,6 +308,9 @@ class Camera(Device):
 class Thermometer(Device):
     """The base class of thermometers."""
 
+    recorded: ClassVar[bool] = False
+    """Whether it plays a recording: it is read up to the time of each frame, not at a rhythm."""
+
     def read(self) -> Reading:
         """Read all channels as they are now; raises a DeviceError if none could be read."""
         raise NotImplementedError

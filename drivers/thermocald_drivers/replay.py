@@ -138,6 +138,8 @@ class ReplayCamera(_Replay, Camera):
 class ReplayThermometer(_Replay, Thermometer):
     """A thermometer that delivers the readings of all channels of a recording."""
 
+    recorded = True
+
     def read(self) -> Reading:
         epoch = self._next()
         values = {name: t for name, t in epoch.temperatures.items() if t == t}  # not NaN

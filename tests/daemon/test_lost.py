@@ -28,16 +28,17 @@ from thermocald.output.dashboard.view import View
 from thermocald.store.database.store import Store
 
 
-def test_what_a_recording_lacks_does_not_shift_the_rest(tmp_path):
-    """Regression: played fast, six missing readings left all later epochs without temperature."""
-    source = make_recording(tmp_path / "R", 60, interval=10.0)
+@pytest.mark.parametrize("fast", [True, False])
+def test_what_a_recording_lacks_does_not_shift_the_rest(tmp_path, fast):
+    """Regression: six missing readings left all later epochs without temperature."""
+    source = make_recording(tmp_path / "R", 60, interval=0.1)
     rows = [line.split(",") for line in (source / "epochs.csv").read_text().splitlines()]
     column = rows[0].index("temperature")
     for row in rows[10:16]:
         row[column] = ""
     (source / "epochs.csv").write_text("".join(",".join(row) + "\n" for row in rows))
     config = recording_config(source, tmp_path / "t.db")
-    assert Service(config, fast=True, until_finished=True).run()
+    assert Service(config, fast=fast, until_finished=True).run()
     with Store.open(config.store.path) as store:
         series = store.find_series()
         found = store.series_columns(series, ["frame_time", "temperature_time"])

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 _REMEMBERED = 16  # readings at least
 _REMEMBERED_S = 600.0  # a frame may wait for its calibration, and a phone's comes late
+_MOST_AT_ONCE = 1000  # readings; the times of a recording may be those of another day
 _FARTHEST_IN_PERIODS = 1.5
 
 
@@ -85,13 +86,14 @@ def _column(thermometer: str, channel: str, thermometers: int) -> str:
 class Thermometers:
     """All thermometers of a configuration, and their last readings; threads may share them.
 
-    free_running: as of a `Link`. Raises ConfigurationError if options are wrong, or if the channels
-    cannot all be columns of a camera's epochs.
+    with_frames: those that are read with a camera's frames: recorded ones, with `fast` all. Raises
+    ConfigurationError if options are wrong, or if the channels cannot all be columns of a camera's
+    epochs.
     """
 
     def __init__(
         self, config: Config, clock: Clock, on_event: OnEvent = lambda *_: None, *,
-        free_running: bool = False,
+        fast: bool = False,
     ) -> None:  # fmt: skip
         self.links: dict[str, Link] = {}
         self._cameras = config.cameras
@@ -101,12 +103,17 @@ class Thermometers:
         self._kept: dict[str, deque[Reading]] = {}
         self._missed: set[tuple[str, str]] = set()  # channels that were reported as missing
         self._changed = threading.Condition()
+        self._reading = threading.Lock()  # of `read_up_to`, which several cameras may call
+        self.with_frames: set[str] = set()
+        used = {name for camera in config.cameras for name in camera.thermometers}
         for one in config.thermometers:
             device = open_device("thermometer", one.driver, one.options, clock)
             self._devices[one.name] = device
+            if fast or (device.recorded and one.name in used):
+                self.with_frames.add(one.name)
             self.links[one.name] = Link(
                 "thermometer", one.name, device, clock, period_s=one.period_s, on_event=on_event,
-                free_running=free_running,
+                free_running=device.recorded,
             )  # fmt: skip
             self._channels[one.name] = tuple(device.named_channels())
             count = max(_REMEMBERED, round(_REMEMBERED_S / one.period_s))
@@ -136,11 +143,14 @@ class Thermometers:
         return reading
 
     def read_up_to(self, names: Sequence[str], monotonic: float) -> None:
-        """Read some thermometers in the caller's thread, as a recording's, up to a frame's time."""
-        for name in names:
-            while not self._is_near(name, monotonic):
-                if not self.links[name].do(partial(self.read, name)):
-                    break
+        """Read those of some thermometers that are read with frames up to a frame's time, s."""
+        with self._reading:
+            for name in self.with_frames.intersection(names):
+                for _ in range(_MOST_AT_ONCE):
+                    if self._is_near(name, monotonic):
+                        break
+                    if not self.links[name].do(partial(self.read, name)):
+                        break
 
     def add(self, name: str, reading: Reading) -> None:
         """Store a reading; WrongDevice if one of its channels cannot be a column."""

@@ -348,8 +348,7 @@ class CameraLine:
             text = f"camera {self.plan.name}: {self._frozen()[0]}"
             log.warning(text, extra={"event": "frozen"})
             self._event(frame.utc, "frozen", text)
-        if runtime.fast:
-            self.thermometers.read_up_to(self.plan.config.thermometers, frame.monotonic)
+        self.thermometers.read_up_to(self.plan.config.thermometers, frame.monotonic)
         if self._checking:
             found = check_frame(self.plan.name, self.plan.calibrator_of_check(), frame)
             if self._checking:

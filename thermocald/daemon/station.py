@@ -45,9 +45,7 @@ class Station:
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
-        self.thermometers = Thermometers(
-            config, clock, runtime.guard.event, free_running=runtime.free_running
-        )
+        self.thermometers = Thermometers(config, clock, runtime.guard.event, fast=runtime.fast)
         self.outputs = [self._output(one, one.options) for one in config.outputs]
         self.cameras = [
             CameraLine(
@@ -62,7 +60,7 @@ class Station:
                 one.period_s, begin,
             )
             for one in config.thermometers
-            if not runtime.fast
+            if one.name not in self.thermometers.with_frames
         }  # fmt: skip
         self._loops = [*self._readers.values(), *(camera.loop for camera in self.cameras)]
         self._retention = threading.Thread(target=self._retain, name="retention", daemon=True)
@@ -92,9 +90,8 @@ class Station:
                 done &= camera.run.pipeline.stop(max(0.1, deadline - time.monotonic()))
         for output in self.outputs:
             done &= output.stop(max(0.1, min(2.0, deadline - time.monotonic())))
-        if self.runtime.fast:
-            for link in self.thermometers.links.values():
-                link.close()
+        for name in self.thermometers.with_frames:
+            self.thermometers.links[name].close()
         self._retention.join(1.0)
         return done
 

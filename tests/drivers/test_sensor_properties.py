@@ -7,6 +7,7 @@ corrections. Few examples here, thousands in the slow suite.
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -55,10 +56,15 @@ def printed(celsius, unit, decimals, comma):
 
 def line_read(text, **options):
     """Return the driver's °C of a line, without the tty; None if it is rejected."""
-    device = SerialThermometer(clock=VirtualClock(), port="none", pattern=r"(?P<t>\S+)", **options)
-    match = device.pattern.fullmatch(text)
+    stanza = {"port": "none", "pattern": r"(?P<t>\S+)", "command": "?", **options}
+    device, answers = SerialThermometer(clock=VirtualClock(), **stanza), []
+    device.handle = SimpleNamespace(
+        in_waiting=0,
+        write=lambda _: answers.append(f"{text}\n".encode()),
+        read=lambda _: answers.pop() if answers else b"",
+    )
     try:
-        return device._reading(match, 0.0).values["t"]
+        return device.read().values["t"]
     except BadReading as error:
         one_line(error)
         return None

@@ -71,13 +71,6 @@ def test_below_the_least_free_space_no_frame_is_written(folder_of, caplog):
     assert caplog.text.count("no frames are kept") == 1
 
 
-def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    folder = FrameFolder(FramesConfig(folder=tmp_path / "file" / "frames", min_free_gb=0))
-    assert folder.keep("cam", "M1", 1, frame()) is None
-    assert folder.paused
-
-
 def test_without_a_trusted_clock_nothing_is_deleted_for_its_age(folder_of):
     """Nor ever a frame of 1970, which has none."""
     folder = folder_of(max_age_days=1)

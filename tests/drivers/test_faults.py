@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import get_args
 
-import numpy as np
 import pytest
 from thermocald_drivers.mock import Kind
 
@@ -97,16 +96,6 @@ def test_stuck_repeats_the_value_with_new_instants(clock):
     assert values[1:5] == [values[1]] * 4
     assert len({values[0], values[1], values[5], values[6]}) == 4
     assert len({reading.monotonic for reading in readings}) == 7
-
-
-def test_a_stuck_camera_shows_the_same_picture(clock, small):
-    options = {"faults": [{"kind": "stuck", "at": 2, "count": 1}], **small}
-    with open_device("camera", "mock", options, clock) as device:
-        frames = [device.capture() for _ in range(3)]
-    first, second, third = (frame.image for frame in frames)
-    assert np.array_equal(first, second)
-    assert not np.array_equal(second, third)  # noise alone makes images differ
-    assert frames[1].monotonic > frames[0].monotonic
 
 
 def test_an_output_that_fails_keeps_nothing(clock):

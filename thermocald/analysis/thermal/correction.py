@@ -277,8 +277,10 @@ def row_blocks(
             lines, line = lines[1:], 1
             for name in ("time", *columns):
                 if name not in header:
+                    hint = "; separate the columns with commas and write decimals with a point"
                     raise DataError(
                         f"{path}: there is no column {name!r}; there are {', '.join(header)}"
+                        + (hint if len(header) == 1 else "")
                     )
         if lines:
             yield _block(path, header, columns, lines, line, clock or DeviceClock())

@@ -210,10 +210,7 @@ class GaugeCalibrator(EpochCalibrator):
             "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": beyond,
         }  # fmt: skip
         limits = self.thermal.validity
-        outside = "" if limits is None or not beyond else (
-            f"{now.camera.temperature:.1f} °C is {beyond:.1f} K outside the {limits.low:g} to "
-            f"{limits.high:g} °C that the model was fitted on"
-        )  # fmt: skip
+        outside = limits.place(now.camera.temperature) if limits is not None and beyond else ""
         if now.far:
             bad = failed("outside_range", f"{outside}: nothing is predicted there", measured)
             return CalibratedEpoch(epoch, bad, extra)

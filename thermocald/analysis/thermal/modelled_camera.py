@@ -58,35 +58,43 @@ class Validity:
         """Return whether a temperature is too far outside to be used."""
         return self.beyond(T) > _REFUSED_FRACTION * max(self.high - self.low, 1.0)
 
+    def worst(self, temperatures: Array) -> float:
+        """Return the temperature that is furthest outside; the median if that is far outside."""
+        # half of a log in Fahrenheit may be inside the range by chance: its median shows it
+        median = float(np.median(temperatures))
+        away = np.abs(temperatures - 0.5 * (self.low + self.high))
+        return median if self.is_far(median) else float(temperatures[int(np.argmax(away))])
+
+    def place(self, T: float) -> str:
+        """Return by how much a temperature is outside, as the beginning of a sentence."""
+        whose = f" of {self.of}" if self.of else ""
+        text = (
+            f"{T:.5g} °C{whose} is {self.beyond(T):.1f} K outside the {self.low:g} to "
+            f"{self.high:g} °C that the model was fitted on"
+        )
+        for unit, celsius in (("fahrenheit", (T - 32.0) / 1.8), ("kelvin", T - 273.15)):
+            if self.low <= celsius <= self.high:
+                text += f"; if it is in {unit}, convert it: {celsius:.1f} °C"
+        return text
+
     def check(self, temperatures: Array, extrapolate: bool) -> Array:
         """Return by how many kelvin each temperature (E,) is outside, and warn.
 
         Raises UsageError if one is far outside, unless `extrapolate`.
         """
-        low, high = self.low, self.high
-        outside: Array = np.maximum(np.maximum(low - temperatures, temperatures - high), 0.0)
-        outside[outside <= _MARGIN_K] = 0.0
-        if not outside.any():
-            return outside
-        # half of a log in Fahrenheit may be inside the range by chance: its median shows it
-        T = float(np.median(temperatures))
-        if not self.is_far(T):
-            T = float(temperatures[int(np.argmax(outside))])
-        whose = f" of {self.of}" if self.of else ""
-        place = (
-            f"{T:g} °C{whose} is {self.beyond(T):.1f} K outside the {low:g} to {high:g} °C that "
-            "the model was fitted on"
-        )
-        if self.is_far(T) and not extrapolate:
-            if low <= (T - 32.0) / 1.8 <= high:
+        beyond = np.maximum(self.low - temperatures, temperatures - self.high)
+        outside: Array = np.where(beyond > _MARGIN_K, beyond, 0.0)
+        if outside.any():
+            T = self.worst(temperatures)
+            if self.is_far(T) and not extrapolate:
                 raise UsageError(
-                    f"{T:g} looks like fahrenheit: the model was fitted between {low:g} and "
-                    f"{high:g} °C; convert it"
+                    f"{self.place(T)}; set `extrapolate` to predict there nevertheless"
                 )
-            raise UsageError(f"{place}; set `extrapolate` to predict there nevertheless")
-        warnings.warn(
-            f"{place}; standard deviations are widened", ExtrapolationWarning, stacklevel=3
-        )
+            warnings.warn(
+                f"{self.place(T)}; standard deviations are widened",
+                ExtrapolationWarning,
+                stacklevel=3,
+            )
         return outside
 
 

@@ -47,9 +47,10 @@ if TYPE_CHECKING:
 
 _FARTHEST = 100.0  # largest distance of the surface, in extents of the control points
 _MISSED = 19.7  # noncentral χ² of a gross error that the test (0.1 %) misses one time in five
-_UNCHECKED = 10.0  # standard deviations by which such an error may move a place
+_UNCHECKED = 6.0  # standard deviations by which such an error may move a place
 _SOME = 50  # places for which this is computed
 _NONE = 1e-6  # share of a variance, or mm, that is rounding
+_TOO_GOOD = 0.1  # sigma0 below which standard deviations are not those of these points
 _CONTRADICTED = 1e-3  # heights whose differences are less probable contradict each other
 
 
@@ -232,6 +233,11 @@ class Places(Result):
             single = len(self.rejected) == 1
             words = "contradicts the others and is" if single else "contradict the others and are"
             pose += f", {', '.join(self.rejected)} {words} left out"
+        if self.pose.redundancy > 4 and self.pose.sigma0 < _TOO_GOOD:
+            pose += (
+                "; they fit far better than their standard deviations say: are sX, sY, sZ in "
+                f"{self.unit}, and sx, sy in px?"
+            )
         if self.unchecked:
             pose += (
                 f"; the others hardly check {', '.join(self.unchecked)}: a gross error there could "

@@ -87,13 +87,17 @@ def resect(
             suspects = ~fits
         except GeometryError:
             # of four points it draws three, whose pose may miss the fourth
-            rms, pose = resection(sensor, interior, points, observations.points)[0]
-            if n > _FEWEST or rms > _START * sensor.width:
+            found = resection(sensor, interior, points, observations.points)[:1]
+            pose = next((p for rms, p in found if rms <= _START * sensor.width), None)
+            if n > _FEWEST or pose is None:
                 why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
                 return failed("no_orientation", why, observations)
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
     if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
-        why = "too many control points contradict the others; check that x, y belong to X, Y, Z"
+        why = (
+            "too many control points contradict the others; check that x, y belong to X, Y, Z, and "
+            "that the camera is this one, with this lens and image size"
+        )
         return failed("too_many_rejected", why, observations)
     if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
         why = (

@@ -25,7 +25,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
 from thermocald.analysis.thermal.control_points import ControlPoints
-from thermocald.analysis.thermal.predictor import GAP_S, Predictor
+from thermocald.analysis.thermal.live_camera import GAP_S, Predictor
 from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.thermal.predictor import PredictedCamera
+    from thermocald.analysis.thermal.live_camera import PredictedCamera
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch

@@ -19,22 +19,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.camera.undistortion import Maps
+from thermocald.analysis.thermal.live_camera import LiveCamera
 from thermocald.analysis.thermal.model_text import model_lines
-from thermocald.analysis.thermal.modelled_camera import (
-    NUMBER,
-    ModelledCamera,
-    require_sd,
-    steady_camera,
-    widened,
-)
-from thermocald.arrays import seconds
+from thermocald.analysis.thermal.modelled_camera import Along, Validity, steady_camera, widened
+from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
@@ -46,21 +41,23 @@ from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike
 
+    from thermocald.analysis.thermal.modelled_camera import SteadyCamera
     from thermocald.arrays import Array
     from thermocald.physics.model import ThermalModel
 
 
+NUMBER = (int, float, np.number)
 USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
-_LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
-_REMEMBERED = 6  # readings that the present effects follow from, besides two of each channel
+_CHUNK = 20_000  # times predicted at once
+_STEP = 1e-3  # relative step of a parameter for its derivative
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
 
 @dataclass(frozen=True, repr=False)
-class ThermalCamera(ModelledCamera, Result):
+class ThermalCamera(Result):
     """A camera whose interior orientation is given for any temperature and history.
 
     model: the thermal model; fitted: what `fit` reports besides, None for a camera from a file.
@@ -210,6 +207,44 @@ class ThermalCamera(ModelledCamera, Result):
         sd = self.thermometer_sd
         return USUAL_THERMOMETER_SD if sd is None else sd
 
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """The parameters with a standard deviation, as the model file names them."""
+        if self.model.covariance is not None:
+            return self.model.covariance_names
+        return (*self.model.sds, *(f"{e.name}.{k}" for e in self.model.effects for k in e.sds))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """The covariance of the parameters: the file's matrix, or its sds uncorrelated.
+
+        That of a type is widened so that 95 % of further cameras are within 1.96 sds: the scatter
+        of few specimens is itself uncertain (Student's t).
+        """
+        covariance: Array = self.model.covariance_of(self.parameters)
+        specimens = sum("camera" in fit for fit in self.model.fitted_on)
+        if specimens > 1:
+            from scipy.special import stdtrit
+
+            covariance = covariance * (float(stdtrit(specimens - 1, 0.975)) / BAND) ** 2
+        return covariance
+
+    @cached_property
+    def validity(self) -> Validity | None:
+        """The temperatures that the model was fitted on; None if it does not state them."""
+        limits = next(iter(self.model.validity.values()), None)
+        return None if limits is None else Validity(*limits)
+
+    @cached_property
+    def _steady(self) -> SteadyCamera:
+        return steady_camera(self.model, self.parameters, None)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The other thermometers that the model's effects follow."""
+        named = (e.values.get("channel") for e in self.model.effects)
+        return tuple(dict.fromkeys(str(c) for c in named if c))
+
     def at(
         self,
         temperature: float,
@@ -229,7 +264,7 @@ class ThermalCamera(ModelledCamera, Result):
             T = math.nan
         if math.isnan(T):
             raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
-        require_sd(temperature_sd)
+        _require_sd(temperature_sd)
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
@@ -249,6 +284,147 @@ class ThermalCamera(ModelledCamera, Result):
             covariance = widened(covariance[None], drift)[0]
             beyond = max(beyond, float(np.max(outside)))
         return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
+
+    def along(
+        self,
+        times: ArrayLike,
+        temperatures: ArrayLike | Mapping[str, ArrayLike],
+        at: ArrayLike | None = None,
+        extrapolate: bool = False,
+        relative_to: float | None = None,
+        temperature_sd: float = 0.0,
+    ) -> Along:
+        """Return the camera along a temperature log, including effects with a memory.
+
+        times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
+        the reference first; at (E,): the times to predict for, by default `times`. The history
+        begins with the first time. relative_to °C: the covariance is that of the difference from
+        the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
+        the covariance (as if no effect had a memory, which would average it). Raises UsageError far
+        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
+        that run backwards, DataError for times `at` that the log does not cover.
+
+        >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
+        >>> along.values.shape, along.sd.shape
+        ((3, 10), (3, 10))
+        """
+        _require_sd(temperature_sd)
+        if not isinstance(relative_to, (*NUMBER, type(None))):
+            raise UsageError(f"relative_to is {relative_to!r}: give one number, °C")
+        t = seconds(times)
+        columns = (
+            temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
+        )
+        try:
+            readings = {str(n): floats(c) for n, c in columns.items()}
+        except (TypeError, ValueError):
+            raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
+        instants = t if at is None else np.atleast_1d(seconds(at))
+        sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
+        shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
+        if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
+            raise UsageError(
+                f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
+                "each of its times, and at least one time"
+            )
+        if (np.diff(t) < 0).any():
+            raise UsageError("the times run backwards: give a log in the order of time")
+        reference = next(iter(readings))
+        if at is not None:
+            _require_known(t, readings[reference], instants)
+        begin = float(min(t[0], instants.min()))
+        history = History(instants - begin, t - begin, readings, reference, self.model.T0)
+        outside = np.zeros(len(instants))
+        if self.validity is not None:
+            outside = self.validity.check(history.temperature(), extrapolate)
+        others = {name: history.temperature(name) for name in self.channels if name in readings}
+        further, drift = self._beyond(others, extrapolate)
+        values, covariance = [], []
+        steady = None if relative_to is None else self._steady.at(relative_to)[2]
+        for first in range(0, len(instants), _CHUNK):
+            part = history.at(history.times[first : first + _CHUNK])
+            noise = temperature_sd**2 * _noise_share(t - begin, part.times)
+            beyond = outside[first : first + _CHUNK]
+            found = self._orientation(part, self.model.drive(part), beyond, noise, steady)
+            values.append(found[0])
+            covariance.append(found[1])
+        return Along(
+            self.model.sensor,
+            instants,
+            history.temperature(),
+            np.concatenate(values),
+            widened(np.concatenate(covariance), drift),
+            np.maximum(outside, further),
+            self.model.camera,
+        )
+
+    def _beyond(
+        self, readings: Mapping[str, Array], extrapolate: bool
+    ) -> tuple[Array | float, Array | float]:
+        """Return by how many kelvin (E,) other thermometers are outside, and the drift (E, 10)."""
+        outside: Array | float = 0.0
+        drift: Array | float = 0.0
+        for effect in self.model.effects:
+            name = str(effect.values.get("channel", ""))
+            if name in readings and name in self.model.validity:
+                of_fit = Validity(*self.model.validity[name], name)
+                beyond = of_fit.check(readings[name], extrapolate)
+                rates = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
+                outside = np.maximum(outside, beyond)
+                drift = drift + np.abs(beyond[:, None] * rates)
+        return outside, drift
+
+    def _orientation(
+        self,
+        history: History,
+        drive: Array,
+        outside: Array,
+        noise: Array | float = 0.0,
+        steady: Array | None = None,
+        driven: Mapping[tuple[str, float], Array] | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the interior orientation (E, 10) and its covariance (E, 10, 10).
+
+        drive (E,) °C: what the rates follow; outside (E,) K; noise (E,) K²: variance of a reading;
+        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
+        """
+        model = self.model
+        linear = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
+        for effect in model.effects:
+            if not catalogue.get(effect.name).is_drive:
+                linear = linear + model.influence(effect.name, history)
+        J = np.zeros((*linear.shape, len(self.parameters) + 1))
+        J[:, :, -1] = model.rate_vector
+        for i, name in enumerate(self.parameters):
+            group, key = name.rsplit(".", 1)  # a formula may contain dots
+            if group == "interior":
+                J[:, IOP_NAMES.index(key), i] = 1.0
+            elif group == "rates":
+                J[:, IOP_NAMES.index(key), i] = drive - model.T0
+            elif not catalogue.get(group).is_drive:
+                up, down = (self._moved(name, s).influence(group, history) for s in (1.0, -1.0))
+                J[:, :, i] = (up - down) / (2.0 * self._step(name))
+            else:
+                if driven is None:
+                    up, down = (self._moved(name, s).drive(history) for s in (1.0, -1.0))
+                else:
+                    up, down = driven[name, 1.0], driven[name, -1.0]
+                slope = (up - down) / (2.0 * self._step(name))
+                J[:, :, i] = slope[:, None] * model.rate_vector
+        J = model.carried_derivatives(linear, J, self.parameters)
+        J, slope = J[:, :, :-1] - (0.0 if steady is None else steady), J[:, :, -1]
+        covariance = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
+        covariance += np.einsum("e,ep,eq->epq", np.broadcast_to(noise, len(J)), slope, slope)
+        drift = np.abs(model.rate_vector) * outside[:, None]
+        return model.carried(linear), widened(covariance, drift)
+
+    def _step(self, name: str) -> float:
+        """Return the step of a parameter for its difference quotient."""
+        return _STEP * max(abs(self.model.value(name)), 1e-9)
+
+    def _moved(self, name: str, sign: float) -> ThermalModel:
+        """Return the model with one parameter moved by a step."""
+        return self.model.with_values({name: self.model.value(name) + sign * self._step(name)})
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
@@ -289,174 +465,31 @@ def load_camera(path: Path | str) -> ThermalCamera:
     return ThermalCamera.load(Path(path).expanduser())
 
 
-def _push(followers: list[Any], time: float, value: float) -> Array:
-    """Pass a reading °C through the followers; return the temperature that drives now, (1,) °C."""
-    for one in followers:
-        value = one(time, value)
-    return np.array([value])
+def _require_known(log: Array, readings: Array, times: Array) -> None:
+    """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
+    from thermocald.store.recording.reader import TemperatureLog
+
+    outside = ~TemperatureLog(log, {"": readings}).known_at(times)
+    if outside.any():
+        from thermocald.store.logger.clock import iso
+
+        raise DataError(
+            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
+            f"({iso(log[0])} to {iso(log[-1])}) or in a gap of over ten of its intervals, the "
+            f"first is {iso(times[outside][0])}"
+        )
 
 
-class LiveCamera:
-    """A camera that follows its thermometer; made by `ThermalCamera.live`.
+def _require_sd(temperature_sd: float) -> None:
+    if not isinstance(temperature_sd, NUMBER) or not 0.0 <= temperature_sd < math.inf:
+        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
 
-    `update` takes a reading and returns the camera; `correct` returns a frame as the steady camera
-    would have seen it. The state belongs to one run: make a new object for another. `along` uses
-    the whole history for every time; here effects with a memory store their state, and a further
-    reading costs the same after an hour as after a minute. Formulas and plug-in effects may depend
-    on the whole history: for them it is stored and used (`keeps_all`).
 
-    >>> live = tc.load_camera("camera.yaml").live(size=(1640, 1232))
-    >>> for k in range(3):
-    ...     now = live.update(10.0 * k, 25.0 + k)
-    >>> now.sensor.width, now.temperature
-    (1640, 27.0)
-    """
-
-    def __init__(self, thermal: ThermalCamera) -> None:
-        self.thermal = thermal
-        model = thermal.model
-        self._drive = model.followers()
-        self.keeps_all = None in self._drive or not model.is_of_now
-        self._times: list[float] = []
-        self._rows: list[tuple[float, ...]] = []
-        self._channels: tuple[str, ...] = ()
-        self._seen: tuple[float, ...] = ()  # when each channel was last measured, s
-        self._updates = 0
-        self._now: Camera | None = None
-        self._maps: Maps | None = None
-        drives = {name for name, _ in model.drives}
-        self._moved = {
-            (name, sign): thermal._moved(name, sign).followers()
-            for name in thermal.parameters
-            for sign in (1.0, -1.0)
-            if name.split(".")[0] in drives
-        }
-
-    def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
-        """Take a reading and return the camera now, equal to `along` over the history so far.
-
-        time: s or datetime64, later than the last; temperature: °C, or {channel: °C} with the
-        reference first; for NaN (a failed reading) the channel's last reading is used, for at most
-        ten intervals between readings, then DataError is raised. Raises UsageError if the time is
-        not later, and far outside the temperatures of the fit.
-
-        >>> live = tc.load_camera("camera.yaml").live()
-        >>> live.update(0.0, 25.0).sd["c"] > 0
-        True
-        """
-        thermal, (t, row) = self.thermal, self._checked(time, temperature)
-        if self.keeps_all:  # the state changes only if `along` raises nothing
-            rows = np.array([*self._rows, row]).T
-            history_of = dict(zip(self._channels, rows, strict=True))
-            self._now = thermal.along([*self._times, t], history_of, [t])[0]
-            self._remember(t, row)
-            return self._now
-        outside = np.zeros(1)
-        if thermal.validity is not None:  # first, so that an error leaves the state unchanged
-            outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
-        others = {name: np.array([T]) for name, T in zip(self._channels[1:], row[1:], strict=True)}
-        further, drift = thermal._beyond(others, extrapolate=False)
-        self._remember(t, row)
-        times = np.array(self._times)
-        readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
-        drive = _push(self._drive, t, row[0])
-        driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
-        begin, model = times[0], thermal.model
-        history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
-        linear = thermal._linear(history, drive)
-        covariance = thermal._propagate(history, drive, linear, outside, driven=driven)
-        values = model.carried(linear)[0]
-        beyond = float(np.max(np.maximum(outside, further)))
-        covariance = widened(covariance, drift)
-        self._now = Camera(model.sensor, row[0], values, covariance[0], beyond, model.camera)
-        return self._now
-
-    def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:
-        """Return a frame (H, W) or (H, W, 3) as the steady camera would have seen it.
-
-        to: °C of that camera, by default the model's T0. The maps for `cv2.remap` are reused until
-        an image point has moved by more than 0.05 px. Raises UsageError before the first reading,
-        and for a frame whose size is not that given to `live(size=…)`.
-
-        >>> import numpy as np
-        >>> live = tc.load_camera("camera.yaml").live(size=(1640, 1232))
-        >>> _ = live.update(0.0, 40.0)
-        >>> live.correct(np.zeros((1232, 1640), np.uint8)).shape
-        (1232, 1640)
-        """
-        import cv2
-
-        sensor = self.thermal.model.sensor
-        if not isinstance(frame, np.ndarray) or frame.ndim < 2:
-            raise UsageError(f"the frame is a {type(frame).__name__}: give an array (H, W)")
-        if frame.shape[:2] != (sensor.height, sensor.width):
-            raise UsageError(
-                f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "
-                f"{sensor.width}×{sensor.height}; use live(size=({frame.shape[1]}, "
-                f"{frame.shape[0]}))"
-            )
-        maps = self.maps(to)
-        try:
-            return cv2.remap(frame, *maps, cv2.INTER_LINEAR)
-        except cv2.error:
-            raise UsageError(f"a frame of {frame.dtype} cannot be resampled; give uint8") from None
-
-    def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.
-
-        They are the same objects until an image point has moved by more than 0.05 px.
-        """
-        if self._now is None:
-            raise UsageError("there is no reading yet: call update(time, temperature) first")
-        target = self.thermal.model.T0 if to is None else to
-        if self._maps is None or self._maps.to != target:
-            steady = self.thermal.at(target, extrapolate=True)
-            self._maps = Maps(steady.sensor, steady.values, target)
-        return self._maps.of(self._now.values)
-
-    def _checked(
-        self, time: Any, temperature: float | Mapping[str, float]
-    ) -> tuple[float, tuple[float, ...]]:
-        """Return the time s and the readings °C; a failed one is the last of its channel."""
-        t = float(seconds(time))
-        given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
-        try:
-            names, row = tuple(given), tuple(float(v) for v in given.values())
-        except (TypeError, ValueError):
-            raise UsageError(f"{temperature!r}: give °C, NaN for a failed reading") from None
-        if not row:
-            raise UsageError("there is no reading: give a temperature, or {channel: °C}")
-        if self._times:
-            if t <= self._times[-1]:
-                raise UsageError(f"time {t} is not later than the last reading, {self._times[-1]}")
-            if names != self._channels:
-                raise UsageError(f"channels {names}: the first reading had {self._channels}")
-            last = self._rows[-1]
-            row = tuple(b if math.isnan(n) else n for b, n in zip(last, row, strict=True))
-        elif any(math.isnan(v) for v in row):
-            raise UsageError("the first reading is NaN: begin with one that was measured")
-        measured = [not math.isnan(float(v)) for v in given.values()]
-        seen = tuple(t if m else s for m, s in zip(measured, self._seen or row, strict=True))
-        if self._updates > 1:
-            usual = (self._times[-1] - self._times[0]) / (self._updates - 1)
-            oldest = min(zip(seen, names, strict=True))
-            if t - oldest[0] > _LARGEST_GAP * usual:
-                raise DataError(
-                    f"{oldest[1]} gave no reading for {t - oldest[0]:.0f} s, over ten of its "
-                    f"intervals of {usual:.0f} s: the camera's temperature is not known"
-                )
-        self._channels, self._seen = names, seen
-        return t, row
-
-    def _remember(self, time: float, row: tuple[float, ...]) -> None:
-        """Store a reading; unless all are needed, drop all but first, extremes and last three."""
-        self._updates += 1
-        self._times.append(time)
-        self._rows.append(row)
-        last = len(self._times) - 1
-        if not self.keeps_all and last >= _REMEMBERED + 2 * len(row):
-            T = np.array(self._rows)
-            extremes = {*T.argmax(axis=0).tolist(), *T.argmin(axis=0).tolist()}
-            needed = sorted({0, *extremes, last - 2, last - 1, last})
-            self._times = [self._times[i] for i in needed]
-            self._rows = [self._rows[i] for i in needed]
+def _noise_share(times: Array, at: Array) -> Array:
+    """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
+    if len(times) < 2:
+        return np.ones(len(at))
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    step = np.maximum(times[after] - times[after - 1], 1e-9)
+    share = np.clip((at - times[after - 1]) / step, 0.0, 1.0)
+    return share**2 + (1.0 - share) ** 2

@@ -12,9 +12,8 @@ from benchmarks import audit_thermal
 from benchmarks.audit_camera import Scene
 from benchmarks.audit_thermal import rate_errors
 from tests.commands import answer as run
-from thermocald.analysis.thermal.camera_fit import type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model, type_model
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics.model import ModelEffect

@@ -10,9 +10,8 @@ import pytest
 
 from tests.analysis.test_thermal_model import for_fit, reduced
 from tests.commands import answer, succeed
-from thermocald.analysis.thermal.camera_fit import fit_with_type, type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model, fit_with_type, type_model
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect, ThermalModel

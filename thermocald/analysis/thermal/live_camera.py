@@ -104,11 +104,10 @@ class LiveCamera:
             self._now = thermal.along([*self._times, t], history_of, [t])[0]
             self._remember(t, row)
             return self._now
-        outside = np.zeros(1)
-        if thermal.validity is not None:  # first, so that an error leaves the state unchanged
-            outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
         others = {name: np.array([T]) for name, T in zip(self._channels[1:], row[1:], strict=True)}
-        further, drift = thermal._beyond(others, extrapolate=False)
+        (beyond,), drift = thermal._beyond(  # an error leaves the state unchanged
+            np.array(row[:1]), others, thermal.model.rate_vector, extrapolate=False
+        )
         self._remember(t, row)
         times = np.array(self._times)
         readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
@@ -116,10 +115,9 @@ class LiveCamera:
         driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
         history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
-        values, covariance = thermal._orientation(history, drive, outside, driven=driven)
-        beyond = float(np.max(np.maximum(outside, further)))
-        covariance = widened(covariance, drift)
-        self._now = Camera(model.sensor, row[0], values[0], covariance[0], beyond, model.camera)
+        values, covariance = thermal._orientation(history, drive, driven=driven)
+        C = widened(covariance, drift)[0]
+        self._now = Camera(model.sensor, row[0], values[0], C, float(beyond), model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:

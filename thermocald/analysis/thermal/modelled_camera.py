@@ -165,10 +165,10 @@ def steady_camera(
     return SteadyCamera(model, names, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
 
 
-def widened(covariance: Array, drift: Array | float) -> Array:
-    """Return covariances (E, 10, 10) with a drift (E, 10) beyond a thermometer's range added."""
+def widened(covariance: Array, variance: Array) -> Array:
+    """Return covariances (E, 10, 10) with the variances (E, 10) of a drift added."""
     rows = np.arange(10)
-    covariance[:, rows, rows] += np.square(drift)
+    covariance[:, rows, rows] += variance
     return covariance
 
 

@@ -23,9 +23,9 @@ from thermocald.analysis.thermal.level import (
     average_residuals,
     estimate_level,
     estimate_step,
+    event_threshold,
     project_targets,
 )
-from thermocald.analysis.thermal.thermal_model import event_threshold
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
@@ -47,43 +47,18 @@ from thermocald.thermal.scan import Scanner
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.history import History
     from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
 _COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
-
-
-def derivatives(
-    history: History, field: TestField, model: ThermalModel, names: Sequence[str]
-) -> Array:
-    """Return ∂ epoch's parameters / ∂ model's parameters (E, 22, q), by central differences."""
-    found = []
-    for name in names:
-        group, key = name.rsplit(".", 1)
-        value = model.value(name)
-        step = 1e-3 * max(abs(value), 1e-6)
-        if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
-            step = searched.difference_step(value)
-        sides = (model.with_values({name: moved}) for moved in (value + step, value - step))
-        columns = []
-        for side in sides:
-            d, p = np.zeros((len(history.times), 22)), side.predict(history, field)
-            d[:, :10], d[:, 10:16], d[:, 16:19] = p.iop, p.eop, p.scale
-            for _, vector, active in p.displacements:
-                d[:, 19:22] += active[:, None] * vector
-            columns.append(d)
-        found.append((columns[0] - columns[1]) / (2.0 * step))
-    return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))
 
 
 def _weights(
@@ -341,7 +316,10 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
 
 
 def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
-    """Return the covariance (E, 22, 22) from the model's drift; the level is the series' own."""
+    """Return the covariance (E, 22, 22) from the model's drift; the level is the series' own.
+
+    The derivatives by the model's parameters are central differences.
+    """
     history = series.readings_history
     if model.covariance is None:
         return np.zeros((len(history.times), 22, 22))
@@ -355,7 +333,18 @@ def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
     ]  # fmt: skip
     rows = [model.covariance_names.index(n) for n in names]
     Q = np.array(model.covariance)[np.ix_(rows, rows)]
-    J = derivatives(history, series.source.field, model, names)
-    drift = J - J.mean(axis=0)
+    J = np.zeros((len(history.times), 22, len(names)))
+    for i, name in enumerate(names):
+        group, key = name.rsplit(".", 1)
+        value = model.value(name)
+        step = 1e-3 * max(abs(value), 1e-6)
+        if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
+            step = searched.difference_step(value)
+        for side in (step, -step):
+            p = model.with_values({name: value + side}).predict(history, series.source.field)
+            J[:, :, i] += np.concatenate([p.iop, p.eop, p.scale, np.zeros((len(J), 3))], 1) / side
+            for _, vector, active in p.displacements:
+                J[:, 19:22, i] += active[:, None] * vector / side
+    drift = 0.5 * (J - J.mean(axis=0))
     found: Array = np.einsum("epi,ij,eqj->epq", drift, Q, drift, optimize=True)
     return found

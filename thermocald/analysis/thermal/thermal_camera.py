@@ -265,9 +265,6 @@ class ThermalCamera(Result):
         if math.isnan(T):
             raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
         _require_sd(temperature_sd)
-        beyond = 0.0
-        if self.validity is not None and self.validity.beyond(T):
-            beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
         if channels is None:
             values, slope, J = self._steady.at(T)
         else:
@@ -276,14 +273,10 @@ class ThermalCamera(Result):
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
-        if beyond:
-            covariance += np.diag((slope * beyond) ** 2)
-        if channels is not None:
-            others = {name: np.array([float(value)]) for name, value in channels.items()}
-            outside, drift = self._beyond(others, extrapolate)
-            covariance = widened(covariance[None], drift)[0]
-            beyond = max(beyond, float(np.max(outside)))
-        return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
+        others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
+        (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+        covariance += np.diag(drift)
+        return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
 
     def along(
         self,
@@ -334,18 +327,16 @@ class ThermalCamera(Result):
             _require_known(t, readings[reference], instants)
         begin = float(min(t[0], instants.min()))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
-        outside = np.zeros(len(instants))
-        if self.validity is not None:
-            outside = self.validity.check(history.temperature(), extrapolate)
         others = {name: history.temperature(name) for name in self.channels if name in readings}
-        further, drift = self._beyond(others, extrapolate)
+        outside, drift = self._beyond(
+            history.temperature(), others, self.model.rate_vector, extrapolate
+        )
         values, covariance = [], []
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
             noise = temperature_sd**2 * _noise_share(t - begin, part.times)
-            beyond = outside[first : first + _CHUNK]
-            found = self._orientation(part, self.model.drive(part), beyond, noise, steady)
+            found = self._orientation(part, self.model.drive(part), noise, steady)
             values.append(found[0])
             covariance.append(found[1])
         return Along(
@@ -354,39 +345,44 @@ class ThermalCamera(Result):
             history.temperature(),
             np.concatenate(values),
             widened(np.concatenate(covariance), drift),
-            np.maximum(outside, further),
+            outside,
             self.model.camera,
         )
 
     def _beyond(
-        self, readings: Mapping[str, Array], extrapolate: bool
-    ) -> tuple[Array | float, Array | float]:
-        """Return by how many kelvin (E,) other thermometers are outside, and the drift (E, 10)."""
-        outside: Array | float = 0.0
+        self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
+    ) -> tuple[Array, Array]:
+        """Return how far outside (E,) K thermometers are, and the variance (E, 10) of the drift there.
+
+        T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
+        """
+        outside = np.zeros(T.shape)
+        if self.validity is not None:
+            outside = self.validity.check(T, extrapolate)
+        variance = (rates * outside[:, None]) ** 2
         drift: Array | float = 0.0
         for effect in self.model.effects:
             name = str(effect.values.get("channel", ""))
-            if name in readings and name in self.model.validity:
+            if name in others and name in self.model.validity:
                 of_fit = Validity(*self.model.validity[name], name)
-                beyond = of_fit.check(readings[name], extrapolate)
-                rates = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
+                beyond = of_fit.check(others[name], extrapolate)
+                own = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
                 outside = np.maximum(outside, beyond)
-                drift = drift + np.abs(beyond[:, None] * rates)
-        return outside, drift
+                drift = drift + np.abs(beyond[:, None] * own)
+        return outside, variance + drift**2
 
     def _orientation(
         self,
         history: History,
         drive: Array,
-        outside: Array,
         noise: Array | float = 0.0,
         steady: Array | None = None,
         driven: Mapping[tuple[str, float], Array] | None = None,
     ) -> tuple[Array, Array]:
         """Return the interior orientation (E, 10) and its covariance (E, 10, 10).
 
-        drive (E,) °C: what the rates follow; outside (E,) K; noise (E,) K²: variance of a reading;
-        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
+        drive (E,) °C: what the rates follow; noise (E,) K²: variance of a reading; driven:
+        {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
         """
         model = self.model
         linear = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
@@ -415,8 +411,7 @@ class ThermalCamera(Result):
         J, slope = J[:, :, :-1] - (0.0 if steady is None else steady), J[:, :, -1]
         covariance = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
         covariance += np.einsum("e,ep,eq->epq", np.broadcast_to(noise, len(J)), slope, slope)
-        drift = np.abs(model.rate_vector) * outside[:, None]
-        return model.carried(linear), widened(covariance, drift)
+        return model.carried(linear), covariance
 
     def _step(self, name: str) -> float:
         """Return the step of a parameter for its difference quotient."""

@@ -352,7 +352,7 @@ class ThermalCamera(Result):
     def _beyond(
         self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
     ) -> tuple[Array, Array]:
-        """Return how far outside (E,) K thermometers are, and the variance (E, 10) of the drift there.
+        """Return how far outside (E,) K thermometers are, and the drift's variance (E, 10) there.
 
         T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
         """

@@ -256,6 +256,22 @@ def test_rates_are_doubtful_with_a_field_that_hardly_shows_c(depth, doubtful):
     assert ("rates depend on it" in " ".join(found.lines())) is doubtful
 
 
+@pytest.mark.parametrize(
+    ("effect", "start", "power"),
+    [(LAG, START, 9.0),
+     (ModelEffect("thermal_gradient", {"c": 8e-3, "x0": 0.024, "y0": -0.016}),
+      ModelEffect("thermal_gradient", dict.fromkeys(("c", "x0", "y0"), 0.0)), 1.2)],
+)  # fmt: skip
+def test_the_stated_noise_is_what_a_true_model_leaves_over(effect, start, power):
+    """The thermometer's noise through the effect: a gradient left 1.7 to 2 times it, a lag 0.93."""
+    left = [
+        fit_thermal_model([reduced(simulated(seed, listed=(effect,), power=power))], [start])
+        .model.evidence["fit"]["left_over_in_noise"]
+        for seed in range(3)
+    ]  # fmt: skip
+    assert np.mean(left) == pytest.approx(1.0, abs=0.03 if effect is LAG else 0.1)
+
+
 def test_correlated_constants_are_reported_by_slope_and_curvature():
     """Width and size of an exponential at room temperature correlate by 0.999."""
     true = ModelEffect("exponential(temperature, w)", {"w": 15.0, "c": 3e-4, "x0": 9e-4})

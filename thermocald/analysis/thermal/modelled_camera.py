@@ -59,14 +59,17 @@ class Validity:
     def place(self, T: float) -> str:
         """Return by how much a temperature is outside, as the beginning of a sentence."""
         whose = f" of {self.of}" if self.of else ""
-        text = (
+        unit = self.other_unit(T)
+        return (
             f"{T:.5g} °C{whose} is {self.beyond(T):.1f} K outside the {self.low:g} to "
             f"{self.high:g} °C that the model was fitted on"
+            + (f"; if it is in {unit}, convert it" if unit else "")
         )
-        for unit, celsius in (("fahrenheit", (T - 32.0) / 1.8), ("kelvin", T - 273.15)):
-            if self.low <= celsius <= self.high:
-                text += f"; if it is in {unit}, convert it: {celsius:.1f} °C"
-        return text
+
+    def other_unit(self, T: float) -> str:
+        """Return the unit in which a temperature would be inside; "" if there is none."""
+        units = {"fahrenheit": (T - 32.0) / 1.8, "kelvin": T - 273.15}
+        return next((name for name, C in units.items() if self.low <= C <= self.high), "")
 
     def check(self, temperatures: Array, extrapolate: bool) -> Array:
         """Return by how many kelvin each temperature (E,) is outside, and warn.
@@ -78,6 +81,11 @@ class Validity:
         if outside.any():
             T = self.worst(temperatures)
             if self.is_far(T) and not extrapolate:
+                if unit := self.other_unit(T):
+                    raise UsageError(
+                        f"{T:g} looks like {unit}: the model was fitted between {self.low:g} and "
+                        f"{self.high:g} °C; convert it"
+                    )
                 raise UsageError(
                     f"{self.place(T)}; set `extrapolate` to predict there nevertheless"
                 )

@@ -15,6 +15,7 @@ keeps its size, an event its own height and time.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
     from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
@@ -221,17 +222,15 @@ def predicted_error(
         used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & near
     residuals = np.where(used, residuals, 0.0)
     residuals = residuals - residuals.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
-    # ∂ image points / ∂ parameters (T, 2, 22): camera, scales of the field, a displacement
-    at = series.at
-    moving = np.zeros((len(at.B), 2, 3))
-    moving[rows] = at.B[rows]
-    A = np.concatenate([at.A, at.B * source.field.points[:, None, :], moving], axis=2)
-    noise = (model.image_sigma * prediction.noise_factor[:, None, None]) ** 2
-    floor = noise + _variance(A, _thermometers(series, model, thermometer_sd))
+    A = image_partials(series, rows)
+    floor = (model.image_sigma * prediction.noise_factor[:, None, None]) ** 2
+    for share, variance in chain(*thermometer_noise(series, model, A, thermometer_sd)):
+        floor = floor + share[:, None, None] * variance
     rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
     coverage = float("nan")
     if not model.misses_an_effect:
-        bands = floor + _variance(A, _parameters(series, model))
+        own = _parameters(series, model)
+        bands = floor + np.einsum("tcp,epq,tcq->etc", A, own, A, optimize=True)
         coverage = float(np.mean(np.abs(residuals[used]) <= NORMAL_95 * np.sqrt(bands[used])))
     scale = source.sensor.pixel_pitch / model.interior.c * 10_000.0
     floor_px = float(np.sqrt(np.mean(floor[used])))
@@ -267,16 +266,23 @@ def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int6
     return placed
 
 
-def _variance(A: Array, covariance: Array) -> Array:
-    """Propagate parameters' covariances (E, 22, 22) to variances (E, T, 2) px² of image points."""
-    return np.asarray(np.einsum("tcp,epq,tcq->etc", A, covariance, A, optimize=True))
+def image_partials(series: ReducedSeries, rows: Index) -> Array:
+    """Return ∂ image points / ∂ parameters (T, 2, 22) px; rows: targets that a step displaces."""
+    at, moving = series.at, np.zeros((len(series.at.B), 2, 3))
+    moving[rows] = at.B[rows]
+    scales = at.B * series.source.field.points[:, None, :]
+    return np.concatenate([at.A, scales, moving], axis=2)
 
 
-def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: float) -> Array:
-    """Return the covariance (E, 22, 22) from the thermometers, relative to the series' mean.
+def thermometer_noise(
+    series: ReducedSeries, model: ThermalModel, A: Array, thermometer_sd: float
+) -> tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]:
+    """Return the image points' variances from the thermometers, relative to the series' mean.
 
-    Contains the readings' errors, propagated through each effect's operator, and what their times
-    leave unresolved.
+    First from the readings' errors, propagated through each effect's operator, then what the times
+    of the readings leave unresolved at most. Both are terms of a sum: a factor (E,) for each epoch
+    and a variance (T, 2) px² for each target. A (T, 2, 22): from `image_partials`; thermometer_sd
+    K: of a reading.
     """
     history = series.readings_history
     jump = series.thermometers[history.reference].slope_jump(history.times)
@@ -301,7 +307,7 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
             left = kind.unresolved(history, jump, **nonlinear)
             if np.any(left) and np.any(weights):
                 unresolved.append((weights, left))
-    covariance = np.zeros((len(history.times), 22, 22))
+    terms = []
     means = [np.asarray(S.mean(axis=0)).ravel() for _, _, S in operators]
     for (c, a, S), mean_s in zip(operators, means, strict=True):
         for (d, b, R), mean_r in zip(operators, means, strict=True):
@@ -309,10 +315,8 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
                 continue  # independent thermometers
             shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
             shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
-            covariance += thermometer_sd**2 * shared[:, None, None] * np.outer(c, d)
-    for c, left in unresolved:
-        covariance += left[:, None, None] ** 2 * np.outer(c, c)
-    return covariance
+            terms.append((thermometer_sd**2 * shared, (A @ c) * (A @ d)))
+    return terms, [(left**2, (A @ c) ** 2) for c, left in unresolved]
 
 
 def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:

@@ -22,6 +22,7 @@ from thermocald.analysis.thermal.level import (
     estimate_level,
     project_targets,
 )
+from thermocald.analysis.thermal.prediction_test import image_partials, thermometer_noise
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -232,18 +233,17 @@ def _assess(
     image noise relative to that at T₀, None if it does not grow.
     """
     averaged = float(np.sqrt(np.median(s.source.per_row)))
-    # only a constant per target is removed from the residuals: the thermometer's noise remains
-    drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
-    left = np.hypot(sigma / averaged, reading_sd * np.sqrt(np.mean(drift**2)))
-    if noise is not None:
-        left *= float(np.sqrt(np.mean(noise**2)))
+    variance = (sigma / averaged) ** 2 * (1.0 if noise is None else float(np.mean(noise**2)))
+    A = image_partials(s, np.zeros(0, dtype=np.int64))
+    for share, of_targets in thermometer_noise(s, model, A, reading_sd)[0]:
+        variance += float(share.mean() * of_targets.mean())
     return SeriesFit(
         s.source.series or s.source.name,
         s.source.epochs(s.n > 0),
         _rms(s, model),
         reading_sd * averaged,
         None if s.source.counts is None else int((s.n > 0).sum()),
-        float(left),
+        float(np.sqrt(variance)),
     )
 
 

@@ -269,7 +269,7 @@ def test_the_stated_noise_is_what_a_true_model_leaves_over(effect, start, power)
         .model.evidence["fit"]["left_over_in_noise"]
         for seed in range(3)
     ]  # fmt: skip
-    assert np.mean(left) == pytest.approx(1.0, abs=0.03 if effect is LAG else 0.1)
+    assert np.mean(left) == pytest.approx(1.0, abs=0.03 if effect is LAG else 0.2)
 
 
 def test_correlated_constants_are_reported_by_slope_and_curvature():

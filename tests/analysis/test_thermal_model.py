@@ -272,6 +272,18 @@ def test_the_stated_noise_is_what_a_true_model_leaves_over(effect, start, power)
     assert np.mean(left) == pytest.approx(1.0, abs=0.03 if effect is LAG else 0.2)
 
 
+def test_a_gradient_that_leaves_more_than_the_noise_is_doubted():
+    """4 K of heat: all its coefficients are 45 % (5 standard deviations) too large."""
+    names = ("c", "x0", "y0")
+    true = dict(zip(names, (6e-3, 0.018, -0.012), strict=True))
+    s = simulated(93002, epochs=90, listed=[ModelEffect("thermal_gradient", true)], power=1.2)
+    start = ModelEffect("thermal_gradient", dict.fromkeys(names, 0.0))
+    assert (
+        "thermal_gradient"
+        in fit_thermal_model([reduced(s)], [start]).fitted["read_poorly"]["effects"]
+    )
+
+
 def test_correlated_constants_are_reported_by_slope_and_curvature():
     """Width and size of an exponential at room temperature correlate by 0.999."""
     true = ModelEffect("exponential(temperature, w)", {"w": 15.0, "c": 3e-4, "x0": 9e-4})

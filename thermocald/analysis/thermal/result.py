@@ -133,6 +133,7 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
+_ROUGH = 1.25  # times the noise left over, from which a rate of change was not what readings show
 _SELDOM = 0.05  # bias of a delay by curvature between readings, over their interval
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
@@ -335,7 +336,11 @@ def build_camera(
     bulge = max(s.thermometers[s.history.reference].bulge for s in fitter.series)
     if delays and bulge > _SELDOM:
         fitted["read_seldom"] = {"effects": delays, "bulge": bulge}
-    if poorly := find_poorly_read(fitter, fit):
+    poorly = find_poorly_read(fitter, fit)
+    if verdict["left_over_in_noise"] > _ROUGH:
+        rated = [e.name for e in model.effects if catalogue.get(e.name).follows_rate]
+        poorly += [name for name in rated if name not in poorly]
+    if poorly:
         fitted["read_poorly"] = {"effects": poorly}
     share = sd["interior.c"] / model.interior.c
     rates = {p: (r, sd[f"rates.{p}"]) for p, r in model.rates.items() if r}

@@ -176,12 +176,14 @@ def test_the_level_is_printed(tmp_path):
 
 
 def test_what_is_printed(tmp_path):
+    """Well checked control points are not doubted."""
     write_model(tmp_path / "model.yaml")
     world(tmp_path, 1)
-    text = measured(tmp_path).stdout
-    assert "3 places; pose from 12 control points" in text
-    assert "stone 1" in text
-    assert "313020" in text
+    done = measured(tmp_path, "--json", tmp_path / "places.json")
+    assert re.search(r"3 places; pose from 12 control points, sigma0 \d\.\d\d\n", done.stdout)
+    assert re.search(r"\nstone 1 .*313020", done.stdout)
+    document = json.loads((tmp_path / "places.json").read_text())
+    assert (document["pose"]["unchecked"], document["refused"]) == ([], [])
 
 
 @pytest.mark.parametrize(
@@ -393,14 +395,6 @@ def test_what_an_error_may_do_unnoticed_is_what_it_does():
     assert still.unnoticed_mm == pytest.approx(max(largest.values()), rel=0.03)
     assert f"g{max(largest, key=largest.get)}" in still.unchecked
     assert f"by {still.unnoticed_mm:.0f} mm unnoticed" in still.lines()[0]
-
-
-def test_well_checked_control_points_are_not_doubted(tmp_path):
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    document = json.loads(measured(tmp_path, "--json", "-").stdout)
-    assert document["pose"]["unchecked"] == []
-    assert document["refused"] == []
 
 
 def test_a_row_without_a_temperature_is_left_out_and_the_others_are_measured(tmp_path):

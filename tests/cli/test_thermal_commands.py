@@ -288,10 +288,20 @@ def test_binned_points_are_scaled(folder, tmp_path):
     assert moved["1640x1232"] * 2 == pytest.approx(moved["3280x2464"], rel=1e-3, abs=1e-4)
 
 
-def test_far_outside_by_name_is_done_and_said(folder):
-    outside = ("--temperature", -40, "--extrapolate")
-    told = succeed("predict", "--model", folder / "cam.yaml", *outside).stderr
-    assert "standard deviations are widened" in told
+def test_what_is_outside_is_said(folder, tmp_path):
+    """Far outside by name, and a recording in fahrenheit, with which the model is tested."""
+    other_sensor(folder / "M2", tmp_path / "warm", 3280, 2464, 0.00112, lambda *numbers: numbers)
+    path = tmp_path / "warm" / "epochs.csv"
+    head, *rows = (row.split(",") for row in path.read_text().splitlines())
+    place = head.index("temperature")
+    for row in rows:
+        row[place] = f"{1.8 * float(row[place]) + 32:.3f}"
+    path.write_text("\n".join(map(",".join, (head, *rows))) + "\n")
+    for given, words in (
+        (("--temperature", -40, "--extrapolate"), "standard deviations are widened"),
+        (("--test", tmp_path / "warm"), "if it is in fahrenheit, convert it"),
+    ):
+        assert words in succeed("predict", "--model", folder / "cam.yaml", *given).stderr
 
 
 # --- images ------------------------------------------------------------------------------------

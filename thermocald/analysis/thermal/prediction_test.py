@@ -27,6 +27,7 @@ from thermocald.analysis.thermal.level import (
     event_threshold,
     project_targets,
 )
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
@@ -324,19 +325,15 @@ def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
 
     The derivatives by the model's parameters are central differences.
     """
-    history = series.readings_history
-    if model.covariance is None:
-        return np.zeros((len(history.times), 22, 22))
+    history, camera = series.readings_history, ThermalCamera(model)
     own = set()  # parameters that every series has of its own
     for e in model.effects:
         kind = catalogue.get(e.name)
         own |= {f"{e.name}.{n}" for n in (*kind.fresh, *(kind.linear if kind.is_event else ()))}
-    names = [
-        n for n in model.covariance_names
-        if not n.startswith(("exterior.", "interior.")) and n not in own
-    ]  # fmt: skip
-    rows = [model.covariance_names.index(n) for n in names]
-    Q = np.array(model.covariance)[np.ix_(rows, rows)]
+    levels = ("exterior.", "interior.")
+    names = [n for n in camera.parameters if not n.startswith(levels) and n not in own]
+    rows = [camera.parameters.index(n) for n in names]
+    Q = camera.covariance[np.ix_(rows, rows)]
     J = np.zeros((len(history.times), 22, len(names)))
     for i, name in enumerate(names):
         group, key = name.rsplit(".", 1)

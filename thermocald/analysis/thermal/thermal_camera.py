@@ -433,18 +433,15 @@ class ThermalCamera(Result):
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
-    def steady_polynomials(self) -> tuple[Array, Array, Array]:
-        """Return the steady camera's linear parameters as polynomials in T - T0: arrays (10,).
+    def steady_tables(self) -> tuple[tuple[Array, Array, Array], list[tuple[float, ...]]]:
+        """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
 
-        Raises UsageError for a model that needs more than one thermometer.
+        Three arrays (10,); of each knee the temperature °C and the ten parameters' change per
+        kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        return self._steady.p
-
-    def steady_knees(self) -> tuple[tuple[float, ...], ...]:
-        """Return each knee's temperature °C and the ten parameters' change per kelvin beyond it."""
-        return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
+        return self._steady.p, [(T, *rate.tolist()) for T, rate, _, _ in self._steady.knees]
 
 
 def load_camera(path: Path | str) -> ThermalCamera:

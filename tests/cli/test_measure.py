@@ -192,7 +192,7 @@ def test_what_is_printed(tmp_path):
      ("water.yaml", "profile: [[1, 2, 3]]\n", "at least two points"),
      ("water.yaml", "profile: [[1, 2, 3], [1, 2, 3]]\n", "twice in a row"),
      ("water.yaml", "profile: [[192000, 313012, 138], [192000.1, 313012, 138]]\n", "beyond the p"),
-     ("water.yaml", "level: deep\n", "level must be a number"),
+     ("water.yaml", "level: deep\n", "level: 'deep' is not a finite"),
      ("water.yaml", "line: {point: [2, 13, 138], direction: [0, 0, 1]}", "same coordinates"),
      ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
      ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),

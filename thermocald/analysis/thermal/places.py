@@ -24,7 +24,7 @@ from thermocald.analysis.thermal.control_points import UNITS
 from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
-from thermocald.files import read_yaml
+from thermocald.files import QuantityReader, read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 from thermocald.result import Result, jsonable, new_figure, with_sds
@@ -79,64 +79,47 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
 
 
 def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
-    document = read_yaml(path)
-    kinds = [k for k in ("level", "plane", "line", "profile") if k in document]
-    if len(kinds) != 1 or set(document) - {*kinds, "sd", "sd_tilt_deg"}:
+    top = QuantityReader(path, read_yaml(path))
+    kinds = [k for k in ("level", "plane", "line", "profile") if k in top.mapping]
+    if len(kinds) != 1 or set(top.mapping) - {*kinds, "sd", "sd_tilt_deg"}:
         raise ConfigurationError(
             f"{path}: one of level, plane, line, profile is needed, optionally with sd and "
-            f"sd_tilt_deg; found: {', '.join(document)}"
+            f"sd_tilt_deg; found: {', '.join(map(str, top.mapping))}"
         )
-    scale = UNITS[control.unit]
-    sd = scale * _number(path, document, "sd")
-    tilt = np.radians(_number(path, document, "sd_tilt_deg"))
-    if "level" in document:
-        height = scale * _number(path, document, "level") - control.origin[2]
+    (kind,), scale = kinds, UNITS[control.unit]
+    sd = scale * top.number("sd", control.unit, 0.0, low=0.0)
+    tilt = np.radians(top.number("sd_tilt_deg", "deg", 0.0, low=0.0))
+    if kind == "level":
+        level, own_sd = top.quantity("level", control.unit)
         middle = control.field.points[:, :2].mean(axis=0)
-        return Plane(np.array([*middle, height]), np.array([0.0, 0.0, 1.0]), sd, tilt)
-    if "profile" in document:
-        points = _profile(path, document["profile"])
+        point = np.array([*middle, scale * level - control.origin[2]])
+        sd = sd if own_sd is None else scale * own_sd
+        return Plane(point, np.array([0.0, 0.0, 1.0]), sd, tilt)
+    if kind == "profile":
+        given = top.mapping["profile"]
+        if not isinstance(given, list) or len(given) < 2:
+            raise top.fail("profile", "needs at least two points [X, Y, Z], in order")
+        points = np.array([_vector(top, "profile", point) for point in given])
+        if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
+            raise top.fail("profile", "the same point is given twice in a row")
         return Profile(scale * points - control.origin, sd)
-    kind, way = ("plane", "normal") if "plane" in document else ("line", "direction")
-    parts = document[kind]
-    if not isinstance(parts, dict) or set(parts) != {"point", way}:
-        raise ConfigurationError(f"{path}, {kind}: needs point: [X, Y, Z] and {way}: [a, b, c]")
-    point = scale * _vector(path, parts, "point") - control.origin
-    along = _vector(path, parts, way)
+    way = "normal" if kind == "plane" else "direction"
+    parts = top.inner(kind)
+    parts.only(("point", way))
+    point = scale * _vector(parts, "point", parts.mapping.get("point")) - control.origin
+    along = _vector(parts, way, parts.mapping.get(way))
     size = float(np.linalg.norm(along))
     if not size > 0:
-        raise ConfigurationError(f"{path}, {kind}: {way} must not be zero")
+        raise parts.fail(way, "must not be zero")
     if kind == "line":
         return Line(point, along / size, sd)
     return Plane(point, along / size, sd, tilt)
 
 
-def _profile(path: Path, given: Any) -> Array:
-    if not isinstance(given, list) or len(given) < 2:
-        raise ConfigurationError(f"{path}, profile: needs at least two points [X, Y, Z], in order")
-    points = np.array([_vector(path, {"profile": point}, "profile") for point in given])
-    if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
-        raise ConfigurationError(f"{path}, profile: the same point is given twice in a row")
-    return points
-
-
-def _number(path: Path, document: dict[str, Any], key: str) -> float:
-    value = document.get(key, 0.0)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise ConfigurationError(f"{path}: {key} must be a number, not {value!r}")
-    if key != "level" and value < 0:
-        raise ConfigurationError(f"{path}: {key} must not be below 0")
-    return float(value)
-
-
-def _vector(path: Path, document: dict[str, Any], key: str) -> Array:
-    value = document[key]
-    try:
-        vector = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ConfigurationError(f"{path}: {key} must be three numbers, not {value!r}")
-    return vector
+def _vector(reader: QuantityReader, key: str, value: Any) -> Array:
+    if not isinstance(value, list) or len(value) != 3:
+        raise reader.fail(key, f"must be three numbers, not {value!r}")
+    return np.array([reader.finite(key, v) for v in value])
 
 
 @dataclass(frozen=True)

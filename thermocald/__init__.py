@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from thermocald.analysis.camera.camera import Camera as Camera
     from thermocald.analysis.series.epochs import Epochs as Epochs
-    from thermocald.analysis.thermal.live_camera import LiveCamera as LiveCamera
     from thermocald.analysis.thermal.modelled_camera import Along as Along
+    from thermocald.analysis.thermal.thermal_camera import LiveCamera as LiveCamera
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera as ThermalCamera
     from thermocald.analysis.thermal.thermal_camera import load_camera as load_camera
     from thermocald.api import calibrate as calibrate
@@ -55,9 +55,8 @@ __version__ = "0.1.0"
 _PLACES = {
     "analysis.camera.camera": "Camera",
     "analysis.series.epochs": "Epochs",
-    "analysis.thermal.live_camera": "LiveCamera",
     "analysis.thermal.modelled_camera": "Along",
-    "analysis.thermal.thermal_camera": "ThermalCamera load_camera",
+    "analysis.thermal.thermal_camera": "LiveCamera ThermalCamera load_camera",
     "api": (
         "calibrate catalogue discover fit import_photographs plan read_testfield reference_study "
         "simulate study"

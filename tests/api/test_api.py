@@ -24,7 +24,7 @@ from thermocald.errors import ConfigurationError, DataError, RecordingError, Sto
 
 DOCUMENTED = (
     "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
-    "analysis.thermal.live_camera", "analysis.thermal.thermal_camera", "toolbox",
+    "analysis.thermal.thermal_camera", "toolbox",
 )  # fmt: skip
 
 

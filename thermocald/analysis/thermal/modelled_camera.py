@@ -6,6 +6,7 @@ is in its middle, nothing creeps, slips or cycles. Along a history, effects act 
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.errors import UsageError
+from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
+NUMBER = (int, float, np.number)
 _REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
 _MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 
@@ -212,3 +214,33 @@ class Along:
     def sd(self) -> Array:
         """Standard deviations (E, 10); 0 for a parameter that was held."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+def require_known(log: Array, readings: Array, times: Array) -> None:
+    """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
+    from thermocald.store.recording.reader import TemperatureLog
+
+    outside = ~TemperatureLog(log, {"": readings}).known_at(times)
+    if outside.any():
+        from thermocald.store.logger.clock import iso
+
+        raise DataError(
+            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
+            f"({iso(log[0])} to {iso(log[-1])}) or in a gap of over ten of its intervals, the "
+            f"first is {iso(times[outside][0])}"
+        )
+
+
+def require_sd(temperature_sd: float) -> None:
+    if not isinstance(temperature_sd, NUMBER) or not 0.0 <= temperature_sd < math.inf:
+        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
+
+
+def noise_share(times: Array, at: Array) -> Array:
+    """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
+    if len(times) < 2:
+        return np.ones(len(at))
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    step = np.maximum(times[after] - times[after - 1], 1e-9)
+    share = np.clip((at - times[after - 1]) / step, 0.0, 1.0)
+    return share**2 + (1.0 - share) ** 2

@@ -13,83 +13,66 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.analysis.test_gauge import World, thermal_camera
+from tests.analysis.test_gauge import NAMES, POSE, SURVEY_MM, World, thermal_camera
 from tests.commands import call
-from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from tests.main_paths.crooked import CAMERA, project
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.correction import RowBlock
 from thermocald.analysis.thermal.places import measure_places
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.measuring import Plane
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics import model_file
-from thermocald.physics.model import ThermalModel
 from thermocald.store.logger.temperatures import TemperatureLog
 
-POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 ORIGIN_M = np.array([192_000.0, 313_000.0, 138.0])  # a national grid
-RATES = {"c": 0.4e-3, "x0": 0.35e-3, "y0": -0.2e-3}
-SD = {"c": 0.5e-3, "x0": 0.6e-3, "y0": 0.6e-3}
-SD_RATE = 4e-6
-NAMES = ("c", "x0", "y0")
-NOISE_PX, NOISE_K, SURVEY_MM = 0.2, 0.05, 8.0
+NOISE_PX, NOISE_K = 0.2, 0.05
 MORNING, AFTERNOON = 1.7e9, 1.7e9 + 6 * 3600
 PLACES = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 20_000.0, 0.0], [2_500.0, 14_000.0, 0.0]])
 
 
 def write_model(path) -> None:
     """A thermal model of the crooked camera about 20 °C, with covariance."""
-    parameters = [f"interior.{n}" for n in NAMES] + [f"rates.{n}" for n in NAMES]
-    C = np.diag([SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3)
-    model_file.write_model(path, ThermalModel(
-        "gauge", Sensor(*SIZE, PITCH), 20.0, InteriorOrientation(**CAMERA), RATES,
-        covariance_names=tuple(parameters), covariance=tuple(map(tuple, C.tolist())),
-        validity={"temperature": (-5.0, 45.0)},
-    ))  # fmt: skip
+    model = replace(thermal_camera().model, validity={"temperature": (-5.0, 45.0)})
+    model_file.write_model(path, model)
 
 
 def world(folder, seed: int, places: np.ndarray = PLACES) -> np.ndarray:
     """Write one simulated gauge beside the model; return the true places, m."""
-    rng = np.random.default_rng(seed)
-    off = {n: rng.normal(0, SD[n]) for n in NAMES}
-    rate = {n: RATES[n] + rng.normal(0, SD_RATE) for n in NAMES}
+    gauge = World(seed)
+    rng = gauge.rng
 
     def image(points, temperature):
-        c, x0, y0 = (CAMERA[n] + off[n] + rate[n] * (temperature - 20.0) for n in NAMES)
-        return project(points, POSE, c, x0, y0) + rng.normal(0, NOISE_PX, (len(points), 2))
+        seen = project(points, POSE, **gauge.interior(temperature))
+        return seen + rng.normal(0, NOISE_PX, seen.shape)
 
     warmth = {MORNING: 4.0, AFTERNOON: 36.0}
-    with (folder / "log.csv").open("w", newline="") as out:
-        rows = csv.writer(out)
-        rows.writerow(["time", "temperature"])
-        for k in range(-60, 6 * 360 + 61):
-            share = min(max(k * 10.0 / (6 * 3600), 0.0), 1.0)
-            rows.writerow(
-                [f"{MORNING + 10.0 * k:.0f}", f"{4 + 32 * share + rng.normal(0, NOISE_K):.3f}"]
-            )
-    n = 12
-    y = rng.uniform(8_000, 28_000, n)
-    control = np.column_stack(
-        [np.where(np.arange(n) % 2, 0.3, -0.3) * y, y, rng.uniform(-200, 2_500, n)]
-    )
-    seen = image(control, warmth[MORNING])
-    surveyed = (control + rng.normal(0, SURVEY_MM, control.shape)) / 1000 + ORIGIN_M
-    with (folder / "gcp.csv").open("w", newline="") as out:
-        rows = csv.writer(out)
-        rows.writerow(["target", "X", "Y", "Z", "sX", "sY", "sZ", "x", "y", "sx", "sy"])
-        for i in range(n):
-            rows.writerow([f"g{i}", *(f"{v:.5f}" for v in surveyed[i]), *[SURVEY_MM / 1000] * 3,
-                           *seen[i], NOISE_PX, NOISE_PX])  # fmt: skip
+    times = MORNING + np.arange(-600.0, 6 * 3600 + 601, 10.0)
+    shown = np.interp(times, list(warmth), list(warmth.values()))
+    shown += rng.normal(0, NOISE_K, len(times))
+    readings = [f"{time:.0f},{T:.3f}" for time, T in zip(times, shown, strict=True)]
+    write_rows(folder / "log.csv", "time,temperature", readings)
+    surveyed, sds = gauge.field.points / 1000 + ORIGIN_M, [SURVEY_MM / 1000] * 3
+    control = [
+        ",".join(map(str, (f"g{i}", *(f"{v:.5f}" for v in at), *sds, *uv, NOISE_PX, NOISE_PX)))
+        for i, (at, uv) in enumerate(
+            zip(surveyed, image(gauge.points, warmth[MORNING]), strict=True)
+        )
+    ]
+    write_rows(folder / "gcp.csv", "target,X,Y,Z,sX,sY,sZ,x,y,sx,sy", control)
     lifted = rng.normal(0, 5.0)
     (folder / "water.yaml").write_text(f"level: {ORIGIN_M[2] + lifted / 1000:.6f}\nsd: 0.005\n")
-    with (folder / "points.csv").open("w", newline="") as out:
-        rows = csv.writer(out)
-        rows.writerow(["time", "name", "x", "y", "sx", "sy"])
-        for k, uv in enumerate(image(places, warmth[AFTERNOON])):
-            rows.writerow([f"{AFTERNOON:.0f}", f"stone {k}", *uv, NOISE_PX, NOISE_PX])
+    stones = [
+        f"{AFTERNOON:.0f},stone {k},{x},{y},{NOISE_PX},{NOISE_PX}"
+        for k, (x, y) in enumerate(image(places, warmth[AFTERNOON]))
+    ]
+    write_rows(folder / "points.csv", "time,name,x,y,sx,sy", stones)
     return places / 1000 + ORIGIN_M
+
+
+def write_rows(path, head: str, rows: list[str]) -> None:
+    path.write_text("\n".join([head, *rows]) + "\n")
 
 
 def called(folder, *more: object):

@@ -1,6 +1,6 @@
 """A thermal camera: its interior orientation, with covariance, for any temperature and history.
 
-    camera = ThermalCamera.load("camera.thermal.yaml")
+    camera = load_camera("camera.thermal.yaml")
     now = camera.at(35.0)                     # steady at 35 °C
     series = camera.along(times, temperatures)
     now.interior.c, now.sd["x0"], now.undistort(points), now.object_error(10_000.0)
@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -79,11 +79,6 @@ class ThermalCamera(Result):
 
     model: ThermalModel
     fitted: Mapping[str, Any] | None = field(default=None, compare=False)
-
-    @classmethod
-    def load(cls, path: Path | str) -> Self:
-        """Read a model file. Raises ConfigurationError naming the file and key."""
-        return cls(read_model(Path(path)))
 
     def save(self, path: Path | str) -> Path:
         """Write the model file (YAML), whole or not at all, and return its path.
@@ -284,8 +279,10 @@ class ThermalCamera(Result):
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
-        covariance += np.diag(drift)
+        beyond = 0.0
+        if others or (self.validity is not None and self.validity.beyond(T)):
+            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+            covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
 
     def along(
@@ -346,7 +343,8 @@ class ThermalCamera(Result):
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
             noise = temperature_sd**2 * noise_share(t - begin, part.times)
-            found = self._orientation(part, self.model.drive(part), noise, steady)
+            drive = self.model.drive(part)
+            found = self._orientation(part, drive, noise if temperature_sd else None, steady)
             values.append(found[0])
             covariance.append(found[1])
         return Along(
@@ -385,7 +383,7 @@ class ThermalCamera(Result):
         self,
         history: History,
         drive: Array,
-        noise: Array | float = 0.0,
+        noise: Array | None = None,
         steady: Array | None = None,
         driven: Mapping[tuple[str, float], Array] | None = None,
     ) -> tuple[Array, Array]:
@@ -399,8 +397,7 @@ class ThermalCamera(Result):
         for effect in model.effects:
             if not catalogue.get(effect.name).is_drive:
                 linear = linear + model.influence(effect.name, history)
-        J = np.zeros((*linear.shape, len(self.parameters) + 1))
-        J[:, :, -1] = model.rate_vector
+        J = np.zeros((*linear.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
             group, key = name.rsplit(".", 1)  # a formula may contain dots
             if group == "interior":
@@ -418,9 +415,13 @@ class ThermalCamera(Result):
                 slope = (up - down) / (2.0 * self._step(name))
                 J[:, :, i] = slope[:, None] * model.rate_vector
         J = model.carried_derivatives(linear, J, self.parameters)
-        J, slope = J[:, :, :-1] - (0.0 if steady is None else steady), J[:, :, -1]
-        covariance = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
-        covariance += np.einsum("e,ep,eq->epq", np.broadcast_to(noise, len(J)), slope, slope)
+        if steady is not None:
+            J -= steady
+        covariance: Array = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
+        if noise is not None:
+            rates = np.broadcast_to(model.rate_vector[:, None], (len(J), 10, 1))
+            slope = model.carried_derivatives(linear, rates)
+            covariance += noise[:, None, None] * slope * np.swapaxes(slope, 1, 2)
         return model.carried(linear), covariance
 
     def _step(self, name: str) -> float:
@@ -464,7 +465,7 @@ def load_camera(path: Path | str) -> ThermalCamera:
     """
     if not isinstance(path, (str, Path)):
         raise UsageError(f"the path of a model is {path!r}: give a text or a Path")
-    return ThermalCamera.load(Path(path).expanduser())
+    return ThermalCamera(read_model(Path(path).expanduser()))
 
 
 def _push(followers: list[Any], time: float, value: float) -> Array:

@@ -21,7 +21,7 @@ from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.correction import RowBlock
 from thermocald.analysis.thermal.places import measure_places
 from thermocald.errors import DataError
-from thermocald.photogrammetry.epoch.measuring import Plane
+from thermocald.photogrammetry.epoch.measuring import Plane, Profile, place_on
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics import model_file
 from thermocald.store.logger.temperatures import TemperatureLog
@@ -150,6 +150,23 @@ def test_the_level_of_the_water_has_a_true_sd(tmp_path_factory):
     assert {f["places"] for f in found} == {2}
     # the difference of both banks over its standard deviation
     assert np.sqrt(np.mean([f["sigma0"] ** 2 for f in found])) == pytest.approx(1.0, abs=0.25)
+
+
+def test_places_on_a_profile_scatter_as_its_survey():
+    """Profiles surveyed wrong by 20 mm in each direction: 0.7 mm was stated for heights."""
+    at_T0, rng = [CAMERA[n] for n in NAMES], np.random.default_rng(3)
+    state = np.concatenate([thermal_camera().at(20.0).values, POSE])
+    image = project(TOUCHED, POSE, *at_T0)
+
+    def on(section):
+        surface = Profile(section, 20.0)
+        sensor = thermal_camera().model.sensor
+        return place_on(sensor, state, np.zeros((16, 16)), image, 1e-6, surface)
+
+    off = np.array([on(SECTION + rng.normal(0, 20.0, 3))[0] - TOUCHED for _ in range(300)])
+    stated = np.sqrt(on(SECTION)[1].diagonal().reshape(-1, 3))
+    assert off.std(axis=0) == pytest.approx(stated, rel=0.12)
+    assert stated[:, 2].min() > 15.0
 
 
 def test_the_level_is_printed(tmp_path):

@@ -297,7 +297,12 @@ def measure_places(
     unchecked, unnoticed = _reliability(sensor, control, pose, image, surface, covariance)
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
-    levels = () if isinstance(surface, Plane) else _levels(points, covariance, moments, member)
+    levels: tuple[Level, ...] = ()
+    if not isinstance(surface, Plane):
+        on = replace(surface, sd_mm=0.0)
+        _, seen = place_on(sensor, states[member], pose.covariance, image, sigmas, on)
+        steep = seen.diagonal()[2::3] > 0  # a place on a horizontal line determines no height
+        levels = _levels(points, covariance, moments, np.where(steep, member, -1))
     return Places(
         names, points, covariance, (without + control.origin) / scale, control.unit, pose,
         tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
@@ -352,9 +357,9 @@ def _levels(
     found = []
     for k, time in enumerate(moments.tolist()):
         rows = np.flatnonzero(member == k)
-        Z, C = points[rows, 2], covariance[np.ix_(3 * rows + 2, 3 * rows + 2)]
-        if not (C.diagonal() > 0).all():  # places on a horizontal line determine no height
+        if not len(rows):
             continue
+        Z, C = points[rows, 2], covariance[np.ix_(3 * rows + 2, 3 * rows + 2)]
         weights = np.linalg.pinv(C, hermitian=True)
         variance = 1.0 / float(weights.sum())
         level = variance * float((weights @ Z).sum())

@@ -132,19 +132,14 @@ def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
         ("second_heat_source:channel=bord_temperature", "did you mean 'board_temperature'?"),
         ("target_displacement:targets=x33+y521", "has no target 'y521'; did you mean 'y52'?"),
         ("radial_distortion_drift:A4", "has no parameter 'A4'"),
+        ("creep --effect creep:x0", "given twice"),
     ],
 )
 def test_a_wrong_effect_is_named(folder, effect, says):
-    result = run("fit", folder / "M1", "-o", folder / "no.yaml", "--effect", effect)
+    result = run("fit", folder / "M1", "-o", folder / "no.yaml", "--effect", *effect.split())
     assert isinstance(result.exception, ThermocaldError), result.exception
     assert says in str(result.exception)
     assert not (folder / "no.yaml").exists()
-
-
-def test_an_effect_twice_is_refused(folder):
-    both = ("--effect", "creep", "--effect", "creep:x0")
-    result = run("fit", folder / "M1", "-o", folder / "no.yaml", *both)
-    assert "given twice" in str(result.exception)
 
 
 # --- testing a model on another series ---------------------------------------------------------

@@ -94,7 +94,7 @@ class Validity:
             warnings.warn(
                 f"{self.place(T)}; standard deviations are widened",
                 ExtrapolationWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         return outside
 

@@ -241,7 +241,7 @@ def fit(
     >>> camera.model.camera
     'rpi-v2.1'
     """
-    from thermocald.analysis.thermal.camera_fit import (
+    from thermocald.analysis.thermal.thermal_model import (
         fit_camera,
         fit_type,
         fit_with_type,

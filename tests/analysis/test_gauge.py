@@ -15,8 +15,7 @@ import pytest
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.gauge import GaugeCalibrator, GaugeObserver
-from thermocald.analysis.thermal.predictor import Predictor
+from thermocald.analysis.thermal.gauge import GaugeCalibrator, GaugeObserver, Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
@@ -145,29 +144,25 @@ def test_the_covariance_grows_while_a_thermometer_is_lost():
     assert [kind for kind, _ in events] == ["no_temperature", "predicted"]
 
 
-def test_the_effect_of_the_unknown_past_fades():
+def unknown(predictor: Predictor, begin: float, T: float) -> list[float]:
+    """Return the effects of the unknown past, px, at 1000 readings of a temperature."""
+    found = []
+    for time in begin + 10.0 * np.arange(1000):
+        predictor.take(time, {"h": T})
+        found.append(predictor.at(time).unknown_px)
+    return found
+
+
+def test_the_effects_of_the_unknown_past_and_of_a_gap_fade():
     """With a lag of 600 s it is more than a pixel at first, and nothing after two hours."""
     predictor = Predictor(thermal_camera(TAU))
-    unknown = []
-    for k in range(720):
-        predictor.take(START + 10.0 * k, {"h": 20.0})
-        unknown.append(predictor.at(START + 10.0 * k).unknown_px)
-    assert unknown[0] > 1.0
-    assert unknown[60] / unknown[0] == pytest.approx(np.exp(-600.0 / TAU), rel=0.05)
-    assert unknown[-1] < 1e-3
-
-
-def test_the_uncertainty_after_a_gap_fades():
-    predictor = Predictor(thermal_camera(TAU))
-    for k in range(1000):
-        predictor.take(START + 10.0 * k, {"h": 20.0})
-    begin = START + 10.0 * 999 + 3 * 3600.0
-    after = []
-    for k in range(500):
-        predictor.take(begin + 10.0 * k, {"h": 24.0})
-        after.append(predictor.at(begin + 10.0 * k).unknown_px)
+    first = unknown(predictor, START, 20.0)
+    assert first[0] > 1.0
+    assert first[60] / first[0] == pytest.approx(np.exp(-600.0 / TAU), rel=0.05)
+    assert first[720] < 1e-3
+    after = unknown(predictor, START + 9990.0 + 3 * 3600.0, 24.0)
     assert after[0] > 0.2
-    assert after[-1] < 1e-3 * after[0]
+    assert after[500] < 1e-3 * after[0]
 
 
 @pytest.mark.slow

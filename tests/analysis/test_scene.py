@@ -20,8 +20,8 @@ from thermocald.analysis.thermal.scene import (
     estimate_movement,
     follow_scene,
     track_features,
+    write_scene,
 )
-from thermocald.analysis.thermal.scene_recording import write_scene
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import project, rotation
 from thermocald.physics.model import ModelEffect

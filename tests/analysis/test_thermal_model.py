@@ -12,9 +12,8 @@ from benchmarks import audit_thermal
 from benchmarks.audit_camera import Scene
 from benchmarks.audit_thermal import rate_errors
 from tests.commands import answer as run
-from thermocald.analysis.thermal.camera_fit import type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model, type_model
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics.model import ModelEffect
@@ -255,6 +254,34 @@ def test_rates_are_doubtful_with_a_field_that_hardly_shows_c(depth, doubtful):
     assert doubtful or np.abs(rate_errors(found, s)).max() < 3.0
     assert ("rates_hang_on_c" in found.as_dict()) is doubtful
     assert ("rates depend on it" in " ".join(found.lines())) is doubtful
+
+
+@pytest.mark.parametrize(
+    ("effect", "start", "power"),
+    [(LAG, START, 9.0),
+     (ModelEffect("thermal_gradient", {"c": 8e-3, "x0": 0.024, "y0": -0.016}),
+      ModelEffect("thermal_gradient", dict.fromkeys(("c", "x0", "y0"), 0.0)), 1.2)],
+)  # fmt: skip
+def test_the_stated_noise_is_what_a_true_model_leaves_over(effect, start, power):
+    """The thermometer's noise through the effect: a gradient left 1.7 to 2 times it, a lag 0.93."""
+    left = [
+        fit_thermal_model([reduced(simulated(seed, listed=(effect,), power=power))], [start])
+        .model.evidence["fit"]["left_over_in_noise"]
+        for seed in range(3)
+    ]  # fmt: skip
+    assert np.mean(left) == pytest.approx(1.0, abs=0.03 if effect is LAG else 0.2)
+
+
+def test_a_gradient_that_leaves_more_than_the_noise_is_doubted():
+    """4 K of heat: all its coefficients are 45 % (5 standard deviations) too large."""
+    names = ("c", "x0", "y0")
+    true = dict(zip(names, (6e-3, 0.018, -0.012), strict=True))
+    s = simulated(93002, epochs=90, listed=[ModelEffect("thermal_gradient", true)], power=1.2)
+    start = ModelEffect("thermal_gradient", dict.fromkeys(names, 0.0))
+    assert (
+        "thermal_gradient"
+        in fit_thermal_model([reduced(s)], [start]).fitted["read_poorly"]["effects"]
+    )
 
 
 def test_correlated_constants_are_reported_by_slope_and_curvature():

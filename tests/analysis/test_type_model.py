@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal.camera_fit import shrink_to_type, type_model
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.analysis.thermal.thermal_model import shrink_to_type, type_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics.model import ModelEffect, ThermalModel

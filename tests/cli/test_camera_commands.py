@@ -191,6 +191,18 @@ def test_calibrations_at_three_temperatures_give_the_model(tmp_path):
     finish("predict", "--model", tmp_path / "cam.yaml", "--temperature", 30)
 
 
+@pytest.mark.parametrize(
+    ("unit", "shown"), [("fahrenheit", lambda T: 1.8 * T + 32), ("kelvin", lambda T: T + 273.15)]
+)
+def test_calibrations_whose_temperatures_are_no_celsius_are_doubted(tmp_path, unit, shown):
+    rng = np.random.default_rng(5)
+    for T in (20, 45):
+        write_document(tmp_path / f"{T}.json", T, rng)
+    given = [f"{shown(T)}={tmp_path / f'{T}.json'}" for T in (20, 45)]
+    done = finish("fit", *given, "-o", tmp_path / "cam.yaml")
+    assert f"are their temperatures in {unit}?" in done.stdout
+
+
 def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
     """Cold in the morning, warm at noon; the times are EXIF's, in the given time zone."""
     rng = np.random.default_rng(6)

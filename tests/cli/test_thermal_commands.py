@@ -132,19 +132,14 @@ def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
         ("second_heat_source:channel=bord_temperature", "did you mean 'board_temperature'?"),
         ("target_displacement:targets=x33+y521", "has no target 'y521'; did you mean 'y52'?"),
         ("radial_distortion_drift:A4", "has no parameter 'A4'"),
+        ("creep --effect creep:x0", "given twice"),
     ],
 )
 def test_a_wrong_effect_is_named(folder, effect, says):
-    result = run("fit", folder / "M1", "-o", folder / "no.yaml", "--effect", effect)
+    result = run("fit", folder / "M1", "-o", folder / "no.yaml", "--effect", *effect.split())
     assert isinstance(result.exception, ThermocaldError), result.exception
     assert says in str(result.exception)
     assert not (folder / "no.yaml").exists()
-
-
-def test_an_effect_twice_is_refused(folder):
-    both = ("--effect", "creep", "--effect", "creep:x0")
-    result = run("fit", folder / "M1", "-o", folder / "no.yaml", *both)
-    assert "given twice" in str(result.exception)
 
 
 # --- testing a model on another series ---------------------------------------------------------
@@ -205,6 +200,7 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         (("predict",), "give one of"),
         (("predict", "--temperature", "30", "--channel", "board"), "write NAME=°C"),
         (("predict", "--temperature", "88"), "looks like fahrenheit"),
+        (("predict", "--temperature", "305"), "looks like kelvin"),
         (("predict", "--temperature", "-40"), "set `extrapolate`"),
         (("predict", "--log", "{fahrenheit}"), "looks like fahrenheit"),
         (("predict", "--test", "{nothing}"), "does not exist"),
@@ -287,10 +283,20 @@ def test_binned_points_are_scaled(folder, tmp_path):
     assert moved["1640x1232"] * 2 == pytest.approx(moved["3280x2464"], rel=1e-3, abs=1e-4)
 
 
-def test_far_outside_by_name_is_done_and_said(folder):
-    outside = ("--temperature", -40, "--extrapolate")
-    told = succeed("predict", "--model", folder / "cam.yaml", *outside).stderr
-    assert "standard deviations are widened" in told
+def test_what_is_outside_is_said(folder, tmp_path):
+    """Far outside by name, and a recording in fahrenheit, with which the model is tested."""
+    other_sensor(folder / "M2", tmp_path / "warm", 3280, 2464, 0.00112, lambda *numbers: numbers)
+    path = tmp_path / "warm" / "epochs.csv"
+    head, *rows = (row.split(",") for row in path.read_text().splitlines())
+    place = head.index("temperature")
+    for row in rows:
+        row[place] = f"{1.8 * float(row[place]) + 32:.3f}"
+    path.write_text("\n".join(map(",".join, (head, *rows))) + "\n")
+    for given, words in (
+        (("--temperature", -40, "--extrapolate"), "standard deviations are widened"),
+        (("--test", tmp_path / "warm"), "if it is in fahrenheit, convert it"),
+    ):
+        assert words in succeed("predict", "--model", folder / "cam.yaml", *given).stderr
 
 
 # --- images ------------------------------------------------------------------------------------

@@ -111,10 +111,10 @@ def _plan_gauge(
     """Plan a camera whose thermal model predicts its calibration and control points its pose."""
     from thermocald.analysis.thermal.correction import FrameCorrector
     from thermocald.analysis.thermal.gauge import plan_gauge
-    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.analysis.thermal.thermal_camera import load_camera
 
     assert one.thermal_model is not None
-    thermal = ThermalCamera.load(one.thermal_model)
+    thermal = load_camera(one.thermal_model)
     sensor = _sensor(one) or thermal.model.sensor
     _check_size(one, camera, sensor)
     thermal = thermal.for_images(sensor.width, sensor.height)

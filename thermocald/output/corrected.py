@@ -12,7 +12,6 @@ import numpy as np
 
 from thermocald.analysis.thermal.correction import (
     STANDARD_INPUT,
-    ImageCorrection,
     RowBlock,
     correct_points,
     image_corrections,
@@ -21,13 +20,14 @@ from thermocald.analysis.thermal.correction import (
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
-from thermocald.result import document_of
 from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from thermocald.analysis.camera.undistortion import Maps
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.temperatures import TemperatureLog
 
@@ -128,20 +128,22 @@ class Correction:
             possible = self._possible(block)
             if not possible.lines:
                 continue
-            corrections = image_corrections(
+            maps, cameras, summaries = image_corrections(
                 self.thermal, self.log, possible.times, self.to, self.temperature_sd,
                 self.extrapolate,
             )  # fmt: skip
-            for line, row, c in zip(possible.lines, possible.rows, corrections, strict=True):
+            for line, row, values, summary in zip(
+                possible.lines, possible.rows, cameras, summaries, strict=True
+            ):
                 source = self.path.parent / row["image"]
                 written = out / row["image"].rsplit("/", 1)[-1]
                 try:
-                    _write_corrected(source, written, c)
+                    _write_corrected(source, written, maps, values)
                 except ImageError as cause:
                     self._refuse(line, str(cause))
                 else:
                     where = {"image": str(source), "corrected": str(written)}
-                    self.images.append(where | document_of(c))
+                    self.images.append(where | summary)
                 advance(1)
         self._require_any(len(self.images))
 
@@ -225,19 +227,19 @@ class Correction:
         return float((squares / (2 * self.points)) ** 0.5)
 
 
-def _write_corrected(source: Path, written: Path, c: ImageCorrection) -> None:
+def _write_corrected(source: Path, written: Path, maps: Maps, values: Array) -> None:
     import cv2
 
     image = EncodedImage(source).as_it_is()
     if written.exists() and written.samefile(source):
         raise UsageError(f"{written}: would be overwritten; give another --out")
-    width, height = c.maps.sensor.width, c.maps.sensor.height
+    width, height = maps.sensor.width, maps.sensor.height
     if image.shape[:2] != (height, width):
         raise ImageError(
             f"{source}: has {image.shape[1]}×{image.shape[0]} px, the model's camera "
             f"{width}×{height}; give --size if it is binned"
         )
-    corrected = c.maps.resample(image, c.values)
+    corrected = maps.resample(image, values)
     encoded, data = cv2.imencode(written.suffix, corrected)
     if not encoded:
         raise ImageError(f"{written}: its format cannot be written")

@@ -217,8 +217,8 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
     """
     model = camera.model
     sensor = model.sensor
-    p = camera.steady_polynomials()
-    rows = [_row(k) for k in camera.steady_knees()]
+    p, bends = camera.steady_tables()
+    rows = [_row(k) for k in bends]
     if kind == "h":
         follow, knees = _FOLLOW_C, ", ".join([*(f"{{{row}}}" for row in rows), "{0}"])
     else:
@@ -226,7 +226,7 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
     identifier = re.sub(r"\W", "_", name, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"camera_{identifier}"
     reference, limits = next(iter(model.validity.items()), ("the thermometer", (-273.0, 1000.0)))
-    affine = any(any(row[8:]) for row in p) or any(any(k[9:]) for k in camera.steady_knees())
+    affine = any(any(row[8:]) for row in p) or any(any(k[9:]) for k in bends)
     c0 = repr(float(model.interior.c))
     exact = "C1 or C2 are not zero: the projection is exact, OpenCV's parameters are not."
     fields = {

@@ -131,11 +131,11 @@ def _robust_resection(
     residuals = np.linalg.norm(_residuals(sensor, interior, exterior, X, uv), axis=1)
     if len(rows) <= _CLEAR * len(X):
         # For a board seen obliquely SQPnP of few pairs may fail; the resection of a plane does not.
-        whole = resection(sensor, interior, X, uv)[0][1]
-        other = np.linalg.norm(_residuals(sensor, interior, whole, X, uv), axis=1)
         tolerance = _TOLERANCE * sensor.width
-        if (other < tolerance).sum() > (residuals < tolerance).sum():
-            return whole, other
+        for _, whole in resection(sensor, interior, X, uv)[:1]:
+            other = np.linalg.norm(_residuals(sensor, interior, whole, X, uv), axis=1)
+            if (other < tolerance).sum() > (residuals < tolerance).sum():
+                return whole, other
     return exterior, residuals
 
 
@@ -211,7 +211,8 @@ def resection(
     """Return the possible exterior orientations, best first, each after its RMS residual in px.
 
     Points in one plane have two: if the second fits as well as the first, the pose is ambiguous.
-    Other points have one. Source: Collins and Bartoli (2014), IPPE.
+    Other points have one, or none if they contradict each other. Source: Collins and Bartoli
+    (2014), IPPE.
     """
     X = np.ascontiguousarray(field_points, dtype=float)
     uv = np.asarray(image_points, dtype=float)
@@ -220,7 +221,9 @@ def resection(
     if flat:
         poses = [_exterior(R, t) for R, t in _plane_poses(X, ideal, centre, axes)]
     else:
-        _, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+        found, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+        if not found:
+            return []
         rvec, tvec = cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec)
         poses = [_exterior(cv2.Rodrigues(rvec)[0], tvec.ravel())]
     rms = [float(np.sqrt(np.mean(_residuals(sensor, interior, p, X, uv) ** 2))) for p in poses]

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 FORMAT = "thermocald-calibration/1"
 _LEVEL = 1e-3
 _LEAST_SPAN_K = 1.0
+_HOT_C = 45.0  # if all are hotter, they may be in another unit, which gives them at most _WARM_C
+_WARM_C = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +190,15 @@ def fit_calibrations(
         "effect_missing": missing, "misfit_px": round(max(rms), 5),
         "significance_sigmas": round(sigma0, 1), "distortion_sigmas": round(sure, 1),
     }}  # fmt: skip
-    fitted = {"sigma0": sigma0, "series": [], "calibrations": fitted_on, "prediction_test": []}
+    doubts = [
+        f"every calibration is at {T.min():.0f} °C or more: are their temperatures in {unit}?"
+        for unit, C in (("fahrenheit", (T - 32.0) / 1.8), ("kelvin", T - 273.15))
+        if T.min() > _HOT_C and C.min() > -_WARM_C and C.max() < _WARM_C
+    ]
+    fitted = {
+        "sigma0": sigma0, "series": [], "calibrations": fitted_on, "prediction_test": [],
+        "doubts": doubts,
+    }  # fmt: skip
     return ThermalCamera(replace(model, fitted_on=fitted_on, evidence=evidence), fitted)
 
 

@@ -34,6 +34,8 @@ _LEAST_EXTENT_MM = 50.0  # of a gauge's points; it is smaller for metres read as
 _LEAST_OF_A_GRID_MM = 1000.0  # of points more than a hundred times as far from the origin
 _LARGEST_EXTENT_MM = 2e6  # it is larger for mm read as metres
 _FITS = 3.0  # largest sigma0 of a pose that fits after mirroring
+_BETTER = 0.5  # largest fraction of sigma0 that a change has to leave
+_OTHER_LENSES = (1.0, 1.3, 0.77, 1.7, 0.6)  # principal distances to try, over the model's
 _EXCHANGED = 20  # points of which each two are exchanged, in search of a mistake
 _ROUND_MM = 1e6  # the origin is rounded to this
 _SURVEYED_MM = 20.0  # a GNSS receiver with corrections, if no standard deviation is given
@@ -150,20 +152,30 @@ class ControlPoints:
         names = [field.names[row] for row in seen.targets]
         mirrored = "mirrored they fit: X and Y, or x and y, are exchanged, or a sign is wrong"
         changes = [
-            (mirrored, replace(field, points=field.points[:, [1, 0, 2]]), seen),
-            (mirrored, field, replace(seen, points=seen.points[:, ::-1])),
+            (mirrored, camera, replace(field, points=field.points[:, [1, 0, 2]]), seen),
+            (mirrored, camera, field, replace(seen, points=seen.points[:, ::-1])),
         ]
         for i, j in combinations(range(min(n, _EXCHANGED)), 2):
             order = np.arange(n)
             order[[i, j]] = j, i
             text = f"with {names[i]} and {names[j]} exchanged they fit: is a name or a click wrong?"
-            changes.append((text, field, replace(seen, points=seen.points[order])))
+            changes.append((text, camera, field, replace(seen, points=seen.points[order])))
         for i in range(n):
             text = f"without {names[i]} they fit: has it moved, or is its unit another?"
-            changes.append((text, field, seen.select(np.arange(n) != i)))
-        for text, points, image in changes:
-            pose = camera.resect(points, image, 0.0)
-            if pose.ok and pose.sigma0 < _FITS:
+            changes.append((text, camera, field, seen.select(np.arange(n) != i)))
+        text = "with another principal distance they fit: is the model of this camera and lens?"
+        for factor in _OTHER_LENSES:
+            values, covariance = camera.values.copy(), camera.covariance.copy()
+            values[0] *= factor
+            covariance[0, 0] = (0.2 * values[0]) ** 2
+            other = replace(camera, values=values, covariance=covariance)
+            changes.append((text, other, field, seen))
+        now = camera.resect(field, seen, 0.0)
+        least = min(_FITS, _BETTER * now.sigma0) if now.ok else _FITS
+        for text, trial, points, image in changes:
+            pose = trial.resect(points, image, 0.0)
+            spare = 0 if trial is camera else n // 4  # a wrong start misses some points
+            if pose.ok and len(pose.rejected) <= spare and pose.sigma0 < least:
                 return f"; {text}"
         return ""
 

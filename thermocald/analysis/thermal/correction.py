@@ -21,7 +21,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
@@ -99,29 +99,6 @@ def correct_points(
     return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageCorrection:
-    """The correction of one image: maps, and the values (10,) of its camera to resample it with.
-
-    temperature °C; rms_px, largest_px: shift of a sample of points; left_over_px: its RMS sd;
-    extrapolated K.
-    """
-
-    JSON: ClassVar = {
-        "maps": "", "values": "", "rms_px": "rms_correction_px",
-        "largest_px": "largest_correction_px", "left_over_px": "rms_left_over_px",
-        "extrapolated": "extrapolated_K",
-    }  # fmt: skip
-
-    maps: Maps
-    values: Array
-    temperature: float
-    rms_px: float
-    largest_px: float
-    left_over_px: float
-    extrapolated: float
-
-
 def image_corrections(
     camera: ThermalCamera,
     log: TemperatureLog,
@@ -129,11 +106,14 @@ def image_corrections(
     to: float | None = None,
     temperature_sd: float = 0.0,
     extrapolate: bool = False,
-) -> list[ImageCorrection]:
-    """Return one correction per time; arguments and errors as in `correct_points`."""
+) -> tuple[Maps, Array, list[dict[str, float]]]:
+    """Return maps, the values (n, 10) of the images' cameras to resample them with, and a summary.
+
+    The summary of an image holds the shift of a sample of points and its RMS sd, px. Arguments and
+    errors as in `correct_points`.
+    """
     steady, along = _predict(camera, log, times, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
-    maps = Maps(sensor, steady, camera.model.T0 if to is None else to)
     pixels = np.linspace(0, sensor.width * sensor.height - 1, _SAMPLE).astype(int)
     points = np.stack([pixels % sensor.width, pixels // sensor.width], axis=1).astype(float)
     ideal = ideal_points(sensor, steady, points)
@@ -141,22 +121,18 @@ def image_corrections(
     _, J, _ = partials(sensor, steady, np.zeros(6), direction)
     J = J[:, :, :10]
     found = []
-    for i, values in enumerate(along.values):
-        seen = project(sensor, values, np.zeros(6), direction)
+    for now in map(along.__getitem__, range(len(along))):
+        seen = project(sensor, now.values, np.zeros(6), direction)
         shift = np.linalg.norm(seen - points, axis=1)
-        variance = np.einsum("ncp,pq,ncq->nc", J, along.covariance[i], J, optimize=True)
-        found.append(
-            ImageCorrection(
-                maps,
-                values,
-                float(along.temperatures[i]),
-                float(np.sqrt(np.mean(shift**2))),
-                float(shift.max()),
-                float(np.sqrt(np.mean(variance))),
-                float(along.extrapolated[i]),
-            )
-        )
-    return found
+        variance = np.einsum("ncp,pq,ncq->nc", J, now.covariance, J, optimize=True)
+        found.append({
+            "temperature": now.temperature,
+            "rms_correction_px": float(np.sqrt(np.mean(shift**2))),
+            "largest_correction_px": float(shift.max()),
+            "rms_left_over_px": float(np.sqrt(np.mean(variance))),
+            "extrapolated_K": now.extrapolated,
+        })  # fmt: skip
+    return Maps(sensor, steady, camera.model.T0 if to is None else to), along.values, found
 
 
 def _predict(
@@ -277,8 +253,10 @@ def row_blocks(
             lines, line = lines[1:], 1
             for name in ("time", *columns):
                 if name not in header:
+                    hint = "; separate the columns with commas and write decimals with a point"
                     raise DataError(
                         f"{path}: there is no column {name!r}; there are {', '.join(header)}"
+                        + (hint if len(header) == 1 else "")
                     )
         if lines:
             yield _block(path, header, columns, lines, line, clock or DeviceClock())

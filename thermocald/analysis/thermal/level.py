@@ -142,7 +142,7 @@ def estimate_level(
 
 _GROSS = 6.0  # standard deviations from the neighbours in time
 _WINDOW = 9
-_MARGIN = 16.0  # χ² in excess of what a search finds by chance
+_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +192,12 @@ def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     best = int(np.argmax(gain))
     t = others.times
     time = float(0.5 * (t[best] + t[best + 1]))
-    if gain[best] < 5 * np.log(len(t)) + _MARGIN:
+    if gain[best] < event_threshold(others, 3):
         return Moved(time, np.zeros(3), np.zeros((3, 3)))
     return Moved(time, vectors[best], inverse_of_determined(N[best]))
+
+
+def event_threshold(series: ReducedSeries, coefficients: int) -> float:
+    """Return the χ² that an event has to explain, given its coefficients and the times tried."""
+    n = max(int((series.n > 0).sum()), 2)
+    return float((coefficients + 2) * np.log(n) + _MARGIN)

@@ -24,7 +24,7 @@ from thermocald.analysis.thermal.control_points import UNITS
 from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
-from thermocald.files import read_yaml
+from thermocald.files import QuantityReader, read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 from thermocald.result import Result, jsonable, new_figure, with_sds
@@ -47,9 +47,10 @@ if TYPE_CHECKING:
 
 _FARTHEST = 100.0  # largest distance of the surface, in extents of the control points
 _MISSED = 19.7  # noncentral χ² of a gross error that the test (0.1 %) misses one time in five
-_UNCHECKED = 10.0  # standard deviations by which such an error may move a place
+_UNCHECKED = 6.0  # standard deviations by which such an error may move a place
 _SOME = 50  # places for which this is computed
 _NONE = 1e-6  # share of a variance, or mm, that is rounding
+_TOO_GOOD = 0.1  # sigma0 below which standard deviations are not those of these points
 _CONTRADICTED = 1e-3  # heights whose differences are less probable contradict each other
 
 
@@ -78,64 +79,47 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
 
 
 def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
-    document = read_yaml(path)
-    kinds = [k for k in ("level", "plane", "line", "profile") if k in document]
-    if len(kinds) != 1 or set(document) - {*kinds, "sd", "sd_tilt_deg"}:
+    top = QuantityReader(path, read_yaml(path))
+    kinds = [k for k in ("level", "plane", "line", "profile") if k in top.mapping]
+    if len(kinds) != 1 or set(top.mapping) - {*kinds, "sd", "sd_tilt_deg"}:
         raise ConfigurationError(
             f"{path}: one of level, plane, line, profile is needed, optionally with sd and "
-            f"sd_tilt_deg; found: {', '.join(document)}"
+            f"sd_tilt_deg; found: {', '.join(map(str, top.mapping))}"
         )
-    scale = UNITS[control.unit]
-    sd = scale * _number(path, document, "sd")
-    tilt = np.radians(_number(path, document, "sd_tilt_deg"))
-    if "level" in document:
-        height = scale * _number(path, document, "level") - control.origin[2]
+    (kind,), scale = kinds, UNITS[control.unit]
+    sd = scale * top.number("sd", control.unit, 0.0, low=0.0)
+    tilt = np.radians(top.number("sd_tilt_deg", "deg", 0.0, low=0.0))
+    if kind == "level":
+        level, own_sd = top.quantity("level", control.unit)
         middle = control.field.points[:, :2].mean(axis=0)
-        return Plane(np.array([*middle, height]), np.array([0.0, 0.0, 1.0]), sd, tilt)
-    if "profile" in document:
-        points = _profile(path, document["profile"])
+        point = np.array([*middle, scale * level - control.origin[2]])
+        sd = sd if own_sd is None else scale * own_sd
+        return Plane(point, np.array([0.0, 0.0, 1.0]), sd, tilt)
+    if kind == "profile":
+        given = top.mapping["profile"]
+        if not isinstance(given, list) or len(given) < 2:
+            raise top.fail("profile", "needs at least two points [X, Y, Z], in order")
+        points = np.array([_vector(top, "profile", point) for point in given])
+        if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
+            raise top.fail("profile", "the same point is given twice in a row")
         return Profile(scale * points - control.origin, sd)
-    kind, way = ("plane", "normal") if "plane" in document else ("line", "direction")
-    parts = document[kind]
-    if not isinstance(parts, dict) or set(parts) != {"point", way}:
-        raise ConfigurationError(f"{path}, {kind}: needs point: [X, Y, Z] and {way}: [a, b, c]")
-    point = scale * _vector(path, parts, "point") - control.origin
-    along = _vector(path, parts, way)
+    way = "normal" if kind == "plane" else "direction"
+    parts = top.inner(kind)
+    parts.only(("point", way))
+    point = scale * _vector(parts, "point", parts.mapping.get("point")) - control.origin
+    along = _vector(parts, way, parts.mapping.get(way))
     size = float(np.linalg.norm(along))
     if not size > 0:
-        raise ConfigurationError(f"{path}, {kind}: {way} must not be zero")
+        raise parts.fail(way, "must not be zero")
     if kind == "line":
         return Line(point, along / size, sd)
     return Plane(point, along / size, sd, tilt)
 
 
-def _profile(path: Path, given: Any) -> Array:
-    if not isinstance(given, list) or len(given) < 2:
-        raise ConfigurationError(f"{path}, profile: needs at least two points [X, Y, Z], in order")
-    points = np.array([_vector(path, {"profile": point}, "profile") for point in given])
-    if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
-        raise ConfigurationError(f"{path}, profile: the same point is given twice in a row")
-    return points
-
-
-def _number(path: Path, document: dict[str, Any], key: str) -> float:
-    value = document.get(key, 0.0)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise ConfigurationError(f"{path}: {key} must be a number, not {value!r}")
-    if key != "level" and value < 0:
-        raise ConfigurationError(f"{path}: {key} must not be below 0")
-    return float(value)
-
-
-def _vector(path: Path, document: dict[str, Any], key: str) -> Array:
-    value = document[key]
-    try:
-        vector = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ConfigurationError(f"{path}: {key} must be three numbers, not {value!r}")
-    return vector
+def _vector(reader: QuantityReader, key: str, value: Any) -> Array:
+    if not isinstance(value, list) or len(value) != 3:
+        raise reader.fail(key, f"must be three numbers, not {value!r}")
+    return np.array([reader.finite(key, v) for v in value])
 
 
 @dataclass(frozen=True)
@@ -232,6 +216,11 @@ class Places(Result):
             single = len(self.rejected) == 1
             words = "contradicts the others and is" if single else "contradict the others and are"
             pose += f", {', '.join(self.rejected)} {words} left out"
+        if self.pose.redundancy > 4 and self.pose.sigma0 < _TOO_GOOD:
+            pose += (
+                "; they fit far better than their standard deviations say: are sX, sY, sZ in "
+                f"{self.unit}, and sx, sy in px?"
+            )
         if self.unchecked:
             pose += (
                 f"; the others hardly check {', '.join(self.unchecked)}: a gross error there could "
@@ -308,7 +297,12 @@ def measure_places(
     unchecked, unnoticed = _reliability(sensor, control, pose, image, surface, covariance)
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
-    levels = () if isinstance(surface, Plane) else _levels(points, covariance, moments, member)
+    levels: tuple[Level, ...] = ()
+    if not isinstance(surface, Plane):
+        on = replace(surface, sd_mm=0.0)
+        _, seen = place_on(sensor, states[member], pose.covariance, image, sigmas, on)
+        steep = seen.diagonal()[2::3] > 0  # a place on a horizontal line determines no height
+        levels = _levels(points, covariance, moments, np.where(steep, member, -1))
     return Places(
         names, points, covariance, (without + control.origin) / scale, control.unit, pose,
         tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
@@ -363,9 +357,9 @@ def _levels(
     found = []
     for k, time in enumerate(moments.tolist()):
         rows = np.flatnonzero(member == k)
-        Z, C = points[rows, 2], covariance[np.ix_(3 * rows + 2, 3 * rows + 2)]
-        if not (C.diagonal() > 0).all():  # places on a horizontal line determine no height
+        if not len(rows):
             continue
+        Z, C = points[rows, 2], covariance[np.ix_(3 * rows + 2, 3 * rows + 2)]
         weights = np.linalg.pinv(C, hermitian=True)
         variance = 1.0 / float(weights.sum())
         level = variance * float((weights @ Z).sum())

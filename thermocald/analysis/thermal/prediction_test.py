@@ -15,6 +15,7 @@ keeps its size, an event its own height and time.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,9 +24,10 @@ from thermocald.analysis.thermal.level import (
     average_residuals,
     estimate_level,
     estimate_step,
+    event_threshold,
     project_targets,
 )
-from thermocald.analysis.thermal.thermal_model import event_threshold
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
@@ -47,43 +49,18 @@ from thermocald.thermal.scan import Scanner
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.history import History
+    from thermocald.arrays import Array, Index
     from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
 _COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
-
-
-def derivatives(
-    history: History, field: TestField, model: ThermalModel, names: Sequence[str]
-) -> Array:
-    """Return ∂ epoch's parameters / ∂ model's parameters (E, 22, q), by central differences."""
-    found = []
-    for name in names:
-        group, key = name.rsplit(".", 1)
-        value = model.value(name)
-        step = 1e-3 * max(abs(value), 1e-6)
-        if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
-            step = searched.difference_step(value)
-        sides = (model.with_values({name: moved}) for moved in (value + step, value - step))
-        columns = []
-        for side in sides:
-            d, p = np.zeros((len(history.times), 22)), side.predict(history, field)
-            d[:, :10], d[:, 10:16], d[:, 16:19] = p.iop, p.eop, p.scale
-            for _, vector, active in p.displacements:
-                d[:, 19:22] += active[:, None] * vector
-            columns.append(d)
-        found.append((columns[0] - columns[1]) / (2.0 * step))
-    return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))
 
 
 def _weights(
@@ -246,17 +223,15 @@ def predicted_error(
         used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & near
     residuals = np.where(used, residuals, 0.0)
     residuals = residuals - residuals.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
-    # ∂ image points / ∂ parameters (T, 2, 22): camera, scales of the field, a displacement
-    at = series.at
-    moving = np.zeros((len(at.B), 2, 3))
-    moving[rows] = at.B[rows]
-    A = np.concatenate([at.A, at.B * source.field.points[:, None, :], moving], axis=2)
-    noise = (model.image_sigma * prediction.noise_factor[:, None, None]) ** 2
-    floor = noise + _variance(A, _thermometers(series, model, thermometer_sd))
+    A = image_partials(series, rows)
+    floor = (model.image_sigma * prediction.noise_factor[:, None, None]) ** 2
+    for share, variance in chain(*thermometer_noise(series, model, A, thermometer_sd)):
+        floor = floor + share[:, None, None] * variance
     rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
     coverage = float("nan")
     if not model.misses_an_effect:
-        bands = floor + _variance(A, _parameters(series, model))
+        own = _parameters(series, model)
+        bands = floor + np.einsum("tcp,epq,tcq->etc", A, own, A, optimize=True)
         coverage = float(np.mean(np.abs(residuals[used]) <= NORMAL_95 * np.sqrt(bands[used])))
     scale = source.sensor.pixel_pitch / model.interior.c * 10_000.0
     floor_px = float(np.sqrt(np.mean(floor[used])))
@@ -292,16 +267,23 @@ def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int6
     return placed
 
 
-def _variance(A: Array, covariance: Array) -> Array:
-    """Propagate parameters' covariances (E, 22, 22) to variances (E, T, 2) px² of image points."""
-    return np.asarray(np.einsum("tcp,epq,tcq->etc", A, covariance, A, optimize=True))
+def image_partials(series: ReducedSeries, rows: Index) -> Array:
+    """Return ∂ image points / ∂ parameters (T, 2, 22) px; rows: targets that a step displaces."""
+    at, moving = series.at, np.zeros((len(series.at.B), 2, 3))
+    moving[rows] = at.B[rows]
+    scales = at.B * series.source.field.points[:, None, :]
+    return np.concatenate([at.A, scales, moving], axis=2)
 
 
-def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: float) -> Array:
-    """Return the covariance (E, 22, 22) from the thermometers, relative to the series' mean.
+def thermometer_noise(
+    series: ReducedSeries, model: ThermalModel, A: Array, thermometer_sd: float
+) -> tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]:
+    """Return the image points' variances from the thermometers, relative to the series' mean.
 
-    Contains the readings' errors, propagated through each effect's operator, and what their times
-    leave unresolved.
+    First from the readings' errors, propagated through each effect's operator, then what the times
+    of the readings leave unresolved at most. Both are terms of a sum: a factor (E,) for each epoch
+    and a variance (T, 2) px² for each target. A (T, 2, 22): from `image_partials`; thermometer_sd
+    K: of a reading.
     """
     history = series.readings_history
     jump = series.thermometers[history.reference].slope_jump(history.times)
@@ -326,7 +308,7 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
             left = kind.unresolved(history, jump, **nonlinear)
             if np.any(left) and np.any(weights):
                 unresolved.append((weights, left))
-    covariance = np.zeros((len(history.times), 22, 22))
+    terms = []
     means = [np.asarray(S.mean(axis=0)).ravel() for _, _, S in operators]
     for (c, a, S), mean_s in zip(operators, means, strict=True):
         for (d, b, R), mean_r in zip(operators, means, strict=True):
@@ -334,28 +316,36 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
                 continue  # independent thermometers
             shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
             shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
-            covariance += thermometer_sd**2 * shared[:, None, None] * np.outer(c, d)
-    for c, left in unresolved:
-        covariance += left[:, None, None] ** 2 * np.outer(c, c)
-    return covariance
+            terms.append((thermometer_sd**2 * shared, (A @ c) * (A @ d)))
+    return terms, [(left**2, (A @ c) ** 2) for c, left in unresolved]
 
 
 def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
-    """Return the covariance (E, 22, 22) from the model's drift; the level is the series' own."""
-    history = series.readings_history
-    if model.covariance is None:
-        return np.zeros((len(history.times), 22, 22))
+    """Return the covariance (E, 22, 22) from the model's drift; the level is the series' own.
+
+    The derivatives by the model's parameters are central differences.
+    """
+    history, camera = series.readings_history, ThermalCamera(model)
     own = set()  # parameters that every series has of its own
     for e in model.effects:
         kind = catalogue.get(e.name)
         own |= {f"{e.name}.{n}" for n in (*kind.fresh, *(kind.linear if kind.is_event else ()))}
-    names = [
-        n for n in model.covariance_names
-        if not n.startswith(("exterior.", "interior.")) and n not in own
-    ]  # fmt: skip
-    rows = [model.covariance_names.index(n) for n in names]
-    Q = np.array(model.covariance)[np.ix_(rows, rows)]
-    J = derivatives(history, series.source.field, model, names)
-    drift = J - J.mean(axis=0)
+    levels = ("exterior.", "interior.")
+    names = [n for n in camera.parameters if not n.startswith(levels) and n not in own]
+    rows = [camera.parameters.index(n) for n in names]
+    Q = camera.covariance[np.ix_(rows, rows)]
+    J = np.zeros((len(history.times), 22, len(names)))
+    for i, name in enumerate(names):
+        group, key = name.rsplit(".", 1)
+        value = model.value(name)
+        step = 1e-3 * max(abs(value), 1e-6)
+        if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
+            step = searched.difference_step(value)
+        for side in (step, -step):
+            p = model.with_values({name: value + side}).predict(history, series.source.field)
+            J[:, :, i] += np.concatenate([p.iop, p.eop, p.scale, np.zeros((len(J), 3))], 1) / side
+            for _, vector, active in p.displacements:
+                J[:, 19:22, i] += active[:, None] * vector / side
+    drift = 0.5 * (J - J.mean(axis=0))
     found: Array = np.einsum("epi,ij,eqj->epq", drift, Q, drift, optimize=True)
     return found

@@ -22,6 +22,7 @@ from thermocald.analysis.thermal.level import (
     estimate_level,
     project_targets,
 )
+from thermocald.analysis.thermal.prediction_test import image_partials, thermometer_noise
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -132,6 +133,7 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
+_ROUGH = 1.25  # times the noise left over, from which a rate of change was not what readings show
 _SELDOM = 0.05  # bias of a delay by curvature between readings, over their interval
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
@@ -232,18 +234,17 @@ def _assess(
     image noise relative to that at T₀, None if it does not grow.
     """
     averaged = float(np.sqrt(np.median(s.source.per_row)))
-    # only a constant per target is removed from the residuals: the thermometer's noise remains
-    drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
-    left = np.hypot(sigma / averaged, reading_sd * np.sqrt(np.mean(drift**2)))
-    if noise is not None:
-        left *= float(np.sqrt(np.mean(noise**2)))
+    variance = (sigma / averaged) ** 2 * (1.0 if noise is None else float(np.mean(noise**2)))
+    A = image_partials(s, np.zeros(0, dtype=np.int64))
+    for share, of_targets in thermometer_noise(s, model, A, reading_sd)[0]:
+        variance += float(share.mean() * of_targets.mean())
     return SeriesFit(
         s.source.series or s.source.name,
         s.source.epochs(s.n > 0),
         _rms(s, model),
         reading_sd * averaged,
         None if s.source.counts is None else int((s.n > 0).sum()),
-        float(left),
+        float(np.sqrt(variance)),
     )
 
 
@@ -335,7 +336,11 @@ def build_camera(
     bulge = max(s.thermometers[s.history.reference].bulge for s in fitter.series)
     if delays and bulge > _SELDOM:
         fitted["read_seldom"] = {"effects": delays, "bulge": bulge}
-    if poorly := find_poorly_read(fitter, fit):
+    poorly = find_poorly_read(fitter, fit)
+    if verdict["left_over_in_noise"] > _ROUGH:
+        rated = [e.name for e in model.effects if catalogue.get(e.name).follows_rate]
+        poorly += [name for name in rated if name not in poorly]
+    if poorly:
         fitted["read_poorly"] = {"effects": poorly}
     share = sd["interior.c"] / model.interior.c
     rates = {p: (r, sd[f"rates.{p}"]) for p, r in model.rates.items() if r}

@@ -11,6 +11,12 @@ camera from either if depths are unknown: what is reported as a turn may be any 
 principal distance is determined by the scale. Standard deviations come from the scatter of the
 features that take part.
 
+Static features can be written as a recording that `discover` reads. A feature has a direction, but
+no depth: its target is placed on its ray, so far away that no movement of a mount matters. Such an
+image determines the camera's turns and its interior orientation, and nothing else. Depths differ
+from target to target, so that the projection centre is determined and is not correlated with the
+principal distance, as it would be with a plane.
+
 Source: Fischler, M. and Bolles, R. (1981): Random sample consensus, CACM 24(6); Lucas, B. and
 Kanade, T. (1981), in OpenCV's pyramidal form, tracked forwards and backwards.
 """
@@ -19,21 +25,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from scipy.special import fdtri
 
-from thermocald.analysis.thermal.scene_recording import Track, write_scene
 from thermocald.arrays import eight_bit
+from thermocald.epoch import Epoch
 from thermocald.errors import DataError, ImageError
 from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, partials
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import Result, new_figure, with_sds
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -62,7 +72,17 @@ _KNOWN = 1e6  # degrees of freedom that stand for a known variance
 _FEWEST_BEYOND = 3  # frames in excess of the parameters of a smooth course
 _MOVED_CHI2 = 30.7  # three degrees of freedom, one in a million
 _LEAST_PX = 0.03  # at the image's edge: real corners share a wobble of up to 0.02 px RMS
+_DISTANCE_MM = 1e6
+"""Distance of the targets: 1 mm of mount movement moves no image point by more than 0.01 px."""
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+_MOST_TARGETS = 200
+_STILL = 0.8  # fraction of the frames in which a feature has to follow the common movement
+_FEWEST_TARGETS = 12
 _LOCKED_PX = 0.004  # matching error that depends on the subpixel shift: common to all features
+
+
+Track = tuple["NDArray[np.int64]", "Array"]
+"""One frame's features that follow the common movement: rows (n,), image points (n, 2) px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +391,6 @@ def follow_scene(
     thermal: ThermalCamera,
     log: TemperatureLog,
     frames: Sequence[tuple[Path, float]],
-    extrapolate: bool = False,
     advance: Callable[[int], None] = lambda _: None,
     recording: Path | None = None,
 ) -> SceneCourse:
@@ -386,10 +405,10 @@ def follow_scene(
     times = np.array([time for _, time in frames])
     reference = decode_grey(frames[0][0])
     thermal = thermal.for_images(reference.shape[1], reference.shape[0])
-    along = thermal.along(log.times, log.channels, times, extrapolate)
+    along = thermal.along(log.times, log.channels, times)
     since = thermal.along(
-        log.times, log.channels, times, extrapolate, float(along.temperatures[0]),
-        thermal.reading_sd,
+        log.times, log.channels, times, relative_to=float(along.temperatures[0]),
+        temperature_sd=thermal.reading_sd,
     ).sd  # fmt: skip
     corners = detect_features(reference)
     E = len(frames)
@@ -439,3 +458,71 @@ def _f_bound(rank: int, factor: float, free: float) -> float:
     if factor < fdtri(free, _KNOWN, 0.75):
         free = _KNOWN
     return float(fdtri(rank, free, 1.0 - _MISSED_ALPHA / 2))
+
+
+def write_scene(
+    path: Path,
+    camera: Camera,
+    log: TemperatureLog,
+    times: Array,
+    points: Array,
+    tracks: Sequence[Track | None],
+) -> int:
+    """Write the static features as a recording; return how many there are.
+
+    times (E,) s UTC: of the frames; camera: at the first frame; points (F, 2) px: the features in
+    that frame; tracks: one per frame, None for a frame without a common movement. Raises DataError
+    for fewer than twelve static features, RecordingError if `path` cannot be written.
+    """
+    shown = [track for track in tracks if track is not None]
+    seen = np.bincount(np.concatenate([rows for rows, _ in shown]), minlength=len(points))
+    still = np.flatnonzero(seen >= _STILL * len(shown))
+    still = np.sort(still[np.argsort(-seen[still], kind="stable")[:_MOST_TARGETS]])
+    if len(still) < _FEWEST_TARGETS:
+        raise DataError(
+            f"{len(still)} features are static in most of the frames; a recording needs at least "
+            f"{_FEWEST_TARGETS}"
+        )
+    target = np.full(len(points), -1)
+    target[still] = np.arange(len(still))
+    noise = _feature_noise(points, shown, target)
+    rays = camera.rays(points[still])
+    depths = _DISTANCE_MM * 2.0 ** (2.0 * ((np.arange(len(still)) * _GOLDEN) % 1.0) - 1.0)
+    across = noise * camera.sensor.pixel_pitch / camera.interior.c * _DISTANCE_MM
+    field = TestField.build(
+        [f"feature{row}" for row in still], rays / -rays[:, 2:] * depths[:, None], across
+    )
+    name = camera.name
+    head = Head(
+        name, name, float(np.median(np.diff(times))) if len(times) > 1 else 1.0,
+        CameraSpec(name, camera.sensor, camera.interior.c, camera.interior),
+        {channel: Channel() for channel in log.channels},
+    )  # fmt: skip
+    nearest = np.clip(np.searchsorted(log.times, times, side="right") - 1, 0, None)
+    with RecordingWriter(path, head, field) as writer:
+        writer.keep_readings(log)
+        for number, (time, row, track) in enumerate(zip(times, nearest, tracks, strict=True), 1):
+            observed = None
+            if track is not None:
+                kept = target[track[0]] >= 0
+                sigmas = np.full((int(kept.sum()), 2), noise)
+                observed = Observations(target[track[0]][kept], track[1][kept], sigmas)
+            values = {channel: float(T[row]) for channel, T in log.channels.items()}
+            writer.append(Epoch(number, float(time), float(log.times[row]), values, None, observed))
+    return len(still)
+
+
+def _feature_noise(points: Array, shown: Sequence[Track], target: NDArray[np.int64]) -> float:
+    """Estimate the noise of an image point, px, from the differences of consecutive frames.
+
+    The common difference (shift, turn and scale) is removed first.
+    """
+    left = []
+    for (rows, at), (later, there) in pairwise(shown):
+        both, here, then = np.intersect1d(rows, later, return_indices=True)
+        of_targets = target[both] >= 0
+        moved = (there[then] - at[here])[of_targets]
+        if len(moved) > 6:
+            A = np.column_stack([np.ones(len(moved)), points[both][of_targets]])
+            left.append((moved - A @ np.linalg.lstsq(A, moved, rcond=None)[0]).ravel())
+    return max(mad_sd(np.concatenate(left)) / np.sqrt(2.0), 1e-3) if left else 0.1

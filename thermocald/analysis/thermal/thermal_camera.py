@@ -1,6 +1,6 @@
 """A thermal camera: its interior orientation, with covariance, for any temperature and history.
 
-    camera = ThermalCamera.load("camera.thermal.yaml")
+    camera = load_camera("camera.thermal.yaml")
     now = camera.at(35.0)                     # steady at 35 °C
     series = camera.along(times, temperatures)
     now.interior.c, now.sd["x0"], now.undistort(points), now.object_error(10_000.0)
@@ -19,8 +19,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,12 +30,15 @@ from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.modelled_camera import (
     NUMBER,
-    ModelledCamera,
+    Along,
+    Validity,
+    noise_share,
+    require_known,
     require_sd,
     steady_camera,
     widened,
 )
-from thermocald.arrays import seconds
+from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
@@ -46,21 +50,24 @@ from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
+    from thermocald.analysis.thermal.modelled_camera import SteadyCamera
     from thermocald.arrays import Array
     from thermocald.physics.model import ThermalModel
 
 
 USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
-_REMEMBERED = 6  # readings that the present effects follow from, besides two of each channel
+_NEEDED = 6  # readings that the present effects follow from, besides two of each channel
+_CHUNK = 20_000  # times predicted at once
+_STEP = 1e-3  # relative step of a parameter for its derivative
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
 
 @dataclass(frozen=True, repr=False)
-class ThermalCamera(ModelledCamera, Result):
+class ThermalCamera(Result):
     """A camera whose interior orientation is given for any temperature and history.
 
     model: the thermal model; fitted: what `fit` reports besides, None for a camera from a file.
@@ -72,11 +79,6 @@ class ThermalCamera(ModelledCamera, Result):
 
     model: ThermalModel
     fitted: Mapping[str, Any] | None = field(default=None, compare=False)
-
-    @classmethod
-    def load(cls, path: Path | str) -> Self:
-        """Read a model file. Raises ConfigurationError naming the file and key."""
-        return cls(read_model(Path(path)))
 
     def save(self, path: Path | str) -> Path:
         """Write the model file (YAML), whole or not at all, and return its path.
@@ -210,6 +212,44 @@ class ThermalCamera(ModelledCamera, Result):
         sd = self.thermometer_sd
         return USUAL_THERMOMETER_SD if sd is None else sd
 
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """The parameters with a standard deviation, as the model file names them."""
+        if self.model.covariance is not None:
+            return self.model.covariance_names
+        return (*self.model.sds, *(f"{e.name}.{k}" for e in self.model.effects for k in e.sds))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """The covariance of the parameters: the file's matrix, or its sds uncorrelated.
+
+        That of a type is widened so that 95 % of further cameras are within 1.96 sds: the scatter
+        of few specimens is itself uncertain (Student's t).
+        """
+        covariance: Array = self.model.covariance_of(self.parameters)
+        specimens = sum("camera" in fit for fit in self.model.fitted_on)
+        if specimens > 1:
+            from scipy.special import stdtrit
+
+            covariance = covariance * (float(stdtrit(specimens - 1, 0.975)) / BAND) ** 2
+        return covariance
+
+    @cached_property
+    def validity(self) -> Validity | None:
+        """The temperatures that the model was fitted on; None if it does not state them."""
+        limits = next(iter(self.model.validity.values()), None)
+        return None if limits is None else Validity(*limits)
+
+    @cached_property
+    def _steady(self) -> SteadyCamera:
+        return steady_camera(self.model, self.parameters, None)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The other thermometers that the model's effects follow."""
+        named = (e.values.get("channel") for e in self.model.effects)
+        return tuple(dict.fromkeys(str(c) for c in named if c))
+
     def at(
         self,
         temperature: float,
@@ -230,9 +270,6 @@ class ThermalCamera(ModelledCamera, Result):
         if math.isnan(T):
             raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
         require_sd(temperature_sd)
-        beyond = 0.0
-        if self.validity is not None and self.validity.beyond(T):
-            beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
         if channels is None:
             values, slope, J = self._steady.at(T)
         else:
@@ -241,14 +278,159 @@ class ThermalCamera(ModelledCamera, Result):
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
-        if beyond:
-            covariance += np.diag((slope * beyond) ** 2)
-        if channels is not None:
-            others = {name: np.array([float(value)]) for name, value in channels.items()}
-            outside, drift = self._beyond(others, extrapolate)
-            covariance = widened(covariance[None], drift)[0]
-            beyond = max(beyond, float(np.max(outside)))
-        return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
+        others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
+        beyond = 0.0
+        if others or (self.validity is not None and self.validity.beyond(T)):
+            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+            covariance += np.diag(drift)
+        return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
+
+    def along(
+        self,
+        times: ArrayLike,
+        temperatures: ArrayLike | Mapping[str, ArrayLike],
+        at: ArrayLike | None = None,
+        extrapolate: bool = False,
+        relative_to: float | None = None,
+        temperature_sd: float = 0.0,
+    ) -> Along:
+        """Return the camera along a temperature log, including effects with a memory.
+
+        times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
+        the reference first; at (E,): the times to predict for, by default `times`. The history
+        begins with the first time. relative_to °C: the covariance is that of the difference from
+        the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
+        the covariance (as if no effect had a memory, which would average it). Raises UsageError far
+        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
+        that run backwards, DataError for times `at` that the log does not cover.
+
+        >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
+        >>> along.values.shape, along.sd.shape
+        ((3, 10), (3, 10))
+        """
+        require_sd(temperature_sd)
+        if not isinstance(relative_to, (*NUMBER, type(None))):
+            raise UsageError(f"relative_to is {relative_to!r}: give one number, °C")
+        t = seconds(times)
+        columns = (
+            temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
+        )
+        try:
+            readings = {str(n): floats(c) for n, c in columns.items()}
+        except (TypeError, ValueError):
+            raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
+        instants = t if at is None else np.atleast_1d(seconds(at))
+        sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
+        shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
+        if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
+            raise UsageError(
+                f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
+                "each of its times, and at least one time"
+            )
+        if (np.diff(t) < 0).any():
+            raise UsageError("the times run backwards: give a log in the order of time")
+        reference = next(iter(readings))
+        if at is not None:
+            require_known(t, readings[reference], instants)
+        begin = float(min(t[0], instants.min()))
+        history = History(instants - begin, t - begin, readings, reference, self.model.T0)
+        others = {name: history.temperature(name) for name in self.channels if name in readings}
+        outside, drift = self._beyond(
+            history.temperature(), others, self.model.rate_vector, extrapolate
+        )
+        values, covariance = [], []
+        steady = None if relative_to is None else self._steady.at(relative_to)[2]
+        for first in range(0, len(instants), _CHUNK):
+            part = history.at(history.times[first : first + _CHUNK])
+            noise = temperature_sd**2 * noise_share(t - begin, part.times)
+            drive = self.model.drive(part)
+            found = self._orientation(part, drive, noise if temperature_sd else None, steady)
+            values.append(found[0])
+            covariance.append(found[1])
+        return Along(
+            self.model.sensor,
+            instants,
+            history.temperature(),
+            np.concatenate(values),
+            widened(np.concatenate(covariance), drift),
+            outside,
+            self.model.camera,
+        )
+
+    def _beyond(
+        self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
+    ) -> tuple[Array, Array]:
+        """Return how far outside (E,) K thermometers are, and the drift's variance (E, 10) there.
+
+        T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
+        """
+        outside = np.zeros(T.shape)
+        if self.validity is not None:
+            outside = self.validity.check(T, extrapolate)
+        variance = (rates * outside[:, None]) ** 2
+        drift: Array | float = 0.0
+        for effect in self.model.effects:
+            name = str(effect.values.get("channel", ""))
+            if name in others and name in self.model.validity:
+                of_fit = Validity(*self.model.validity[name], name)
+                beyond = of_fit.check(others[name], extrapolate)
+                own = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
+                outside = np.maximum(outside, beyond)
+                drift = drift + np.abs(beyond[:, None] * own)
+        return outside, variance + drift**2
+
+    def _orientation(
+        self,
+        history: History,
+        drive: Array,
+        noise: Array | None = None,
+        steady: Array | None = None,
+        driven: Mapping[tuple[str, float], Array] | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the interior orientation (E, 10) and its covariance (E, 10, 10).
+
+        drive (E,) °C: what the rates follow; noise (E,) K²: variance of a reading; driven:
+        {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
+        """
+        model = self.model
+        linear = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
+        for effect in model.effects:
+            if not catalogue.get(effect.name).is_drive:
+                linear = linear + model.influence(effect.name, history)
+        J = np.zeros((*linear.shape, len(self.parameters)))
+        for i, name in enumerate(self.parameters):
+            group, key = name.rsplit(".", 1)  # a formula may contain dots
+            if group == "interior":
+                J[:, IOP_NAMES.index(key), i] = 1.0
+            elif group == "rates":
+                J[:, IOP_NAMES.index(key), i] = drive - model.T0
+            elif not catalogue.get(group).is_drive:
+                up, down = (self._moved(name, s).influence(group, history) for s in (1.0, -1.0))
+                J[:, :, i] = (up - down) / (2.0 * self._step(name))
+            else:
+                if driven is None:
+                    up, down = (self._moved(name, s).drive(history) for s in (1.0, -1.0))
+                else:
+                    up, down = driven[name, 1.0], driven[name, -1.0]
+                slope = (up - down) / (2.0 * self._step(name))
+                J[:, :, i] = slope[:, None] * model.rate_vector
+        J = model.carried_derivatives(linear, J, self.parameters)
+        if steady is not None:
+            J -= steady
+        covariance: Array = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
+        if noise is not None:
+            rates = np.broadcast_to(model.rate_vector[:, None], (len(J), 10, 1))
+            slope = model.carried_derivatives(linear, rates)
+            covariance += noise[:, None, None] * slope * np.swapaxes(slope, 1, 2)
+        return model.carried(linear), covariance
+
+    def _step(self, name: str) -> float:
+        """Return the step of a parameter for its difference quotient."""
+        return _STEP * max(abs(self.model.value(name)), 1e-9)
+
+    def _moved(self, name: str, sign: float) -> ThermalModel:
+        """Return the model with one parameter moved by a step."""
+        return self.model.with_values({name: self.model.value(name) + sign * self._step(name)})
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
@@ -262,18 +444,15 @@ class ThermalCamera(ModelledCamera, Result):
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
-    def steady_polynomials(self) -> tuple[Array, Array, Array]:
-        """Return the steady camera's linear parameters as polynomials in T - T0: arrays (10,).
+    def steady_tables(self) -> tuple[tuple[Array, Array, Array], list[tuple[float, ...]]]:
+        """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
 
-        Raises UsageError for a model that needs more than one thermometer.
+        Three arrays (10,); of each knee the temperature °C and the ten parameters' change per
+        kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        return self._steady.p
-
-    def steady_knees(self) -> tuple[tuple[float, ...], ...]:
-        """Return each knee's temperature °C and the ten parameters' change per kelvin beyond it."""
-        return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
+        return self._steady.p, [(T, *rate.tolist()) for T, rate, _, _ in self._steady.knees]
 
 
 def load_camera(path: Path | str) -> ThermalCamera:
@@ -286,7 +465,7 @@ def load_camera(path: Path | str) -> ThermalCamera:
     """
     if not isinstance(path, (str, Path)):
         raise UsageError(f"the path of a model is {path!r}: give a text or a Path")
-    return ThermalCamera.load(Path(path).expanduser())
+    return ThermalCamera(read_model(Path(path).expanduser()))
 
 
 def _push(followers: list[Any], time: float, value: float) -> Array:
@@ -351,11 +530,10 @@ class LiveCamera:
             self._now = thermal.along([*self._times, t], history_of, [t])[0]
             self._remember(t, row)
             return self._now
-        outside = np.zeros(1)
-        if thermal.validity is not None:  # first, so that an error leaves the state unchanged
-            outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
         others = {name: np.array([T]) for name, T in zip(self._channels[1:], row[1:], strict=True)}
-        further, drift = thermal._beyond(others, extrapolate=False)
+        (beyond,), drift = thermal._beyond(  # an error leaves the state unchanged
+            np.array(row[:1]), others, thermal.model.rate_vector, extrapolate=False
+        )
         self._remember(t, row)
         times = np.array(self._times)
         readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
@@ -363,12 +541,9 @@ class LiveCamera:
         driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
         history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
-        linear = thermal._linear(history, drive)
-        covariance = thermal._propagate(history, drive, linear, outside, driven=driven)
-        values = model.carried(linear)[0]
-        beyond = float(np.max(np.maximum(outside, further)))
-        covariance = widened(covariance, drift)
-        self._now = Camera(model.sensor, row[0], values, covariance[0], beyond, model.camera)
+        values, covariance = thermal._orientation(history, drive, driven=driven)
+        C = widened(covariance, drift)[0]
+        self._now = Camera(model.sensor, row[0], values[0], C, float(beyond), model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:
@@ -454,7 +629,7 @@ class LiveCamera:
         self._times.append(time)
         self._rows.append(row)
         last = len(self._times) - 1
-        if not self.keeps_all and last >= _REMEMBERED + 2 * len(row):
+        if not self.keeps_all and last >= _NEEDED + 2 * len(row):
             T = np.array(self._rows)
             extremes = {*T.argmax(axis=0).tolist(), *T.argmin(axis=0).tolist()}
             needed = sorted({0, *extremes, last - 2, last - 1, last})

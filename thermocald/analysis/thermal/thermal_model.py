@@ -8,6 +8,10 @@ from the residuals of a free camera per epoch, so neither absorbs what the model
 
 The residuals are tested against both (`examine_rest`). If an effect is missing, the covariance is
 widened by its possible influence on the unknowns, and the result states it.
+
+A type is the mean of several specimens and the scatter between them. Its standard deviations are
+those of one more specimen: they contain the scatter and the uncertainty of the mean. A type serves
+a user who did not calibrate, and is the prior for a camera measured at few temperatures.
 """
 
 from __future__ import annotations
@@ -17,9 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.thermal.level import estimate_step
+from thermocald.analysis.statistics.random_effects import Population, population
+from thermocald.analysis.thermal.level import estimate_step, event_threshold
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
 from thermocald.analysis.thermal.result import build_camera
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
+from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
 from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
@@ -37,12 +46,10 @@ from thermocald.thermal.series import in_blocks
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-    from thermocald.physics.model import Distortion, ModelEffect
+    from thermocald.arrays import Array
+    from thermocald.physics.model import Distortion, ModelEffect, ThermalModel
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
-
-_EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
 def fit_thermal_model(
@@ -179,12 +186,6 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
     return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
 
 
-def event_threshold(series: ReducedSeries, coefficients: int) -> float:
-    """Return the χ² that an event has to explain, given its coefficients and the times tried."""
-    n = max(int((series.n > 0).sum()), 2)
-    return float((coefficients + 2) * np.log(n) + _EVENT_MARGIN)
-
-
 def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
     """Return a fit's terms without events that explain no more than chance beside the others."""
     terms = list(fit.terms)
@@ -199,3 +200,196 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
             fresh[block.series] = None
             terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))
     return tuple(terms)
+
+
+def fit_camera(
+    series: Sequence[ReducedSeries], listed: Sequence[ModelEffect], T0: float | None
+) -> ThermalCamera:
+    """Fit one camera; each of several series is also predicted from a fit to the others."""
+    camera = fit_thermal_model(series, listed, T0)
+    model, fitted = camera.model, camera.fitted or {}
+    errors = []
+    for k, left_out in enumerate(series if len(series) > 1 else ()):
+        rest = [s for i, s in enumerate(series) if i != k]
+        others = fit_thermal_model(
+            rest, model.effects, model.T0, search=False, distortion=model.distortion
+        )
+        errors.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
+    return replace(camera, fitted={**fitted, "prediction_test": errors})
+
+
+def fit_type(
+    series: Sequence[ReducedSeries], listed: Sequence[ModelEffect], T0: float | None, name: str
+) -> ThermalCamera:
+    """Fit each of several cameras and return their type: the model of one more specimen."""
+    cameras = list(dict.fromkeys(s.source.camera for s in series))
+    if T0 is None:
+        T0 = round(float(np.mean([s.history.temperature().mean() for s in series])), 1)
+    own = [[s for s in series if s.source.camera == c] for c in cameras]
+    distortion, _ = choose_distortion(series)
+    models = [fit_thermal_model(s, listed, T0, distortion=distortion).model for s in own]
+    found = type_model(models, name)
+    return ThermalCamera(found, {"cameras": cameras, "series": [], "prediction_test": []})
+
+
+def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
+    """Return the type model of several cameras' models, which must share one structure and one T₀.
+
+    Raises DataError for fewer than two models, or for models that are not alike.
+    """
+    if len(models) < 2:
+        raise DataError("a type model needs at least two cameras")
+    # an event of one camera is no property of the type
+    models = [
+        replace(m, effects=tuple(e for e in m.effects if not catalogue.get(e.name).is_event))
+        for m in models
+    ]
+    first = models[0]
+    for m in models[1:]:
+        same = [e.name for e in m.effects] == [e.name for e in first.effects]
+        same = same and m.distortion == first.distortion
+        if m.sensor != first.sensor or m.T0 != first.T0 or not same:
+            raise DataError(
+                f"the models of {first.camera} and {m.camera} are not alike: sensor, reference "
+                "temperature and effects must be the same; fit them with the same options"
+            )
+    names = _names(first)
+    values = np.array([[m.value(n) for n in names] for m in models])
+    n = len(models)
+    people = population(values, np.array([m.covariance_of(names) for m in models]))
+    low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
+    high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
+    channel = next(iter(first.validity), "temperature")
+    mean = with_covariance(first, names, people.mean, people.prior)
+    own = {k: v for k, v in mean.sds.items() if k.split(".")[0] in ("interior", "rates")}
+    return replace(
+        mean,
+        camera=name,
+        name=f"type {name}, {n} cameras",
+        exterior=None,
+        sds=own,
+        evidence={},
+        validity={channel: (low, high)} if low < high else first.validity,
+        fitted_on=tuple({"camera": m.camera, "version": m.version} for m in models),
+    )
+
+
+def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> ThermalCamera:
+    """Fit a camera that was measured at few temperatures, with its type as prior.
+
+    Non-linear parameters, which few temperatures may not determine at all, have the type's values
+    as priors in the adjustment; all others are shrunk towards the type afterwards. Raises
+    DataError.
+
+    `fitted["type"]` holds weights {rate or effect's parameter: fraction that comes from the type}:
+    the parameter's variance over its variance among the cameras of the type. A weight is 1 if the
+    recordings do not determine the parameter, so that its value and standard deviation are the
+    type's, and near 0 if they determine it fully.
+    """
+    require_type(kind)
+    sd = {e.name: e.sds for e in kind.effects}
+    priors = {
+        f"{e.name}.{key}": (float(value), float(sd[e.name][key]))
+        for e in kind.effects
+        for key, value in e.values.items()
+        if key in catalogue.get(e.name).nonlinear and sd[e.name].get(key, 0.0) > 0
+    }
+    fixed = [
+        f"{e.name}.{key}"
+        for e in kind.effects
+        for key in catalogue.get(e.name).nonlinear
+        if f"{e.name}.{key}" not in priors
+    ]
+    fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors, kind.distortion)
+    model = shrink_to_type(fitted.model, kind, priors)
+    names = [n for n in _names(kind) if not n.startswith("interior.") and kind.sd(n) > 0]
+    weights = {n: min(1.0, (model.sd(n) / kind.sd(n)) ** 2) for n in names}
+    about = {"name": kind.camera, "cameras": len(kind.fitted_on), "weights": weights}
+    return replace(fitted, model=model, fitted={**(fitted.fitted or {}), "type": about})
+
+
+def require_type(kind: ThermalModel) -> None:
+    """Raise DataError for a model that is not a type's."""
+    if kind.covariance is None or len(kind.fitted_on) < 2 or not all(
+        "camera" in one for one in kind.fitted_on
+    ):  # fmt: skip
+        raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
+
+
+def shrink_to_type(
+    model: ThermalModel,
+    kind: ThermalModel,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+) -> ThermalModel:
+    """Combine the model of a camera that was measured at few temperatures with its type.
+
+    model: its own fit; kind: the type from `type_model`, with the same T₀ and effects; priors: the
+    type's values that the fit has already used, {name: (value, sd)}. The standard deviations are
+    scaled so that 95 % lie within 1.96 of them even with few specimens.
+    """
+    names = _names(kind)
+    require_type(kind)
+    if model.sensor != kind.sensor or model.T0 != kind.T0 or _names(model) != names:
+        raise DataError(
+            f"the model of {model.camera} and the type {kind.camera} are not alike: sensor, "
+            "reference temperature and effects must be the same; fit with --t0 and --effect of "
+            "the type"
+        )
+    n = len(kind.fitted_on)
+    prior = np.array(kind.covariance)
+    own = model.covariance_of(names)
+    people = Population(
+        np.array([kind.value(name) for name in names]),
+        prior / (n + 1),
+        prior * n / (n + 1),
+        np.zeros_like(prior),
+        n - 1.0,
+    )
+    free = (np.diag(own) > 0) & (np.diag(prior) > 0)
+    information = np.zeros_like(prior)
+    information[np.ix_(free, free)] = scaled_inverse(own[np.ix_(free, free)])
+    values = np.array([model.value(name) for name in names])
+    gradient = np.zeros(len(names))
+    for name, (value, prior_sd) in (priors or {}).items():
+        # the type must count once: the fit's prior is removed
+        at = names.index(name)
+        information[at, at] -= 1.0 / prior_sd**2
+        gradient[at] = (values[at] - value) / prior_sd**2
+        if information[at, at] <= 0:
+            information[at], information[:, at], gradient[at] = 0.0, 0.0, 0.0
+    new = people.posterior(values, information, gradient)
+    sd = np.sqrt(np.maximum(np.diag(new.covariance), 0.0))
+    wider = np.ones(len(names))
+    for i in np.flatnonzero(sd > 0):
+        value, low, _ = new.interval(np.eye(len(names))[i])
+        wider[i] = (value - low) / (NORMAL_95 * sd[i])
+    shrunk = with_covariance(model, names, new.values, new.covariance * np.outer(wider, wider))
+    return replace(shrunk, evidence={**model.evidence, "shrunk_to_type": str(kind.camera)})
+
+
+def with_covariance(
+    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array
+) -> ThermalModel:
+    """Return the model with other values and another covariance of some numbers and its interior.
+
+    names: as in `ThermalModel.parameter_names`, the interior orientation's among them.
+    """
+    found = dict(zip(names, values.tolist(), strict=True))
+    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    moved = model.with_values({n: v for n, v in found.items() if not n.startswith("interior.")})
+    effects = tuple(
+        replace(e, sds={**e.sds, **{k: sd[f] for k in e.values if (f := f"{e.name}.{k}") in sd}})
+        for e in moved.effects
+    )
+    return replace(
+        moved,
+        interior=InteriorOrientation(**{p: found[f"interior.{p}"] for p in IOP_NAMES}),
+        effects=effects,
+        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
+        covariance_names=names,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+    )
+
+
+def _names(model: ThermalModel) -> tuple[str, ...]:
+    return tuple(n for n in model.parameter_names() if not n.startswith("exterior."))

@@ -87,13 +87,17 @@ def resect(
             suspects = ~fits
         except GeometryError:
             # of four points it draws three, whose pose may miss the fourth
-            rms, pose = resection(sensor, interior, points, observations.points)[0]
-            if n > _FEWEST or rms > _START * sensor.width:
+            found = resection(sensor, interior, points, observations.points)[:1]
+            pose = next((p for rms, p in found if rms <= _START * sensor.width), None)
+            if n > _FEWEST or pose is None:
                 why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
                 return failed("no_orientation", why, observations)
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
     if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
-        why = "too many control points contradict the others; check that x, y belong to X, Y, Z"
+        why = (
+            "too many control points contradict the others; check that x, y belong to X, Y, Z, and "
+            "that the camera is this one, with this lens and image size"
+        )
         return failed("too_many_rejected", why, observations)
     if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
         why = (
@@ -157,8 +161,8 @@ def place_on(
     image_points (n, 2), sigmas (n, 2) px; own (g, 10, 10): further covariances of the camera at g
     times; member (n,): time of each point. For a line, rays meet the plane through it that faces
     the camera, and points are projected onto the line: an image point's distance from the line's
-    image has no effect, and points have variance along the line only. Raises GeometryError for a
-    ray that does not meet the surface in front of the camera.
+    image has no effect, and points have variance along the line, and across it that of the line.
+    Raises GeometryError for a ray that does not meet the surface in front of the camera.
     """
     uv = np.atleast_2d(np.asarray(image_points, dtype=float))
     values = np.broadcast_to(values, (len(uv), 16))
@@ -204,12 +208,17 @@ def place_on(
             total[at[:, None], at] += lever @ Q @ lever.T
     if isinstance(surface, Line):
         direction = np.broadcast_to(surface.direction, X.shape)
+        point = np.broadcast_to(surface.point, X.shape)
         along = direction[:, :, None] * direction[:, None, :]
         n = len(X)
         blocks = total.reshape(n, 3, n, 3)
-        total = np.einsum("iab,ibjc,jcd->iajd", along, blocks, along, optimize=True)
-        total = total.reshape(3 * n, 3 * n)
-        X = surface.point + np.einsum("nab,nb->na", along, X - surface.point)
+        blocks = np.einsum("iab,ibjc,jcd->iajd", along, blocks, along, optimize=True)
+        # a line that is elsewhere takes its points with it; the lines of a profile are independent
+        taken = np.eye(3) - along + (along @ moved[:, :, None]) * normal[:, None, :]
+        same = (point[:, None] == point).all(axis=2) & (direction[:, None] == direction).all(axis=2)
+        shared_line = np.einsum("iab,jcb,ij->iajc", taken, taken, same, optimize=True)
+        total = (blocks + surface.sd_mm**2 * shared_line).reshape(3 * n, 3 * n)
+        X = point + np.einsum("nab,nb->na", along, X - point)
     return X, total
 
 
@@ -219,7 +228,7 @@ def _facing(line: Line, centre: Array) -> Plane:
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     if not (size > 0).all():
         raise GeometryError("the line passes through the camera, so that its image is a point")
-    return Plane(line.point, normal / size, line.sd_mm)
+    return Plane(line.point, normal / size)
 
 
 def _lines_of(profile: Profile, sensor: Sensor, values: Array, uv: Array) -> Line:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -50,6 +52,34 @@ def test_an_interrupted_run_goes_on(archive, tmp_path):
     blocks = blocks_of(archive, tmp_path)
     run_tasks(calibrate_block, blocks[:3])
     assert blocks_of(archive, tmp_path) == blocks[3:]
+
+
+def test_a_block_knows_the_frame_before_it(archive, tmp_path):
+    """Epoch 41, the first of a block, has the image points of epoch 40 again."""
+    shutil.copytree(archive / "M1", tmp_path / "M1")
+    path = tmp_path / "M1" / "observations.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    again = [line.replace("40,", "41,", 1) for line in lines if line.startswith("40,")]
+    path.write_text("".join([line for line in lines if line[:3] != "41,"] + again))
+    run_tasks(calibrate_block, blocks_of(tmp_path, tmp_path / "out"))
+    status = parquet.read_table(tmp_path / "out").sort_by("epoch").column("status").to_pylist()
+    assert [i + 1 for i, word in enumerate(status) if word != "ok"] == [41]
+    assert status[40] == "repeated_frame"
+
+
+def test_a_folder_that_cannot_be_read_is_not_called_empty(archive, tmp_path, monkeypatch, caplog):
+    with pytest.raises(DataError, match="gone: cannot be read: No such file or directory"):
+        find_blocks([tmp_path / "gone"], tmp_path, ())
+    scan = os.scandir
+
+    def refuse(path):
+        if str(path).endswith("M2"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert {block.recording.name for block in blocks_of(archive, tmp_path)} == {"M1"}
+    assert "M2: cannot be read: Permission denied; recordings in it are left out" in caplog.text
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ tried again first.
 
 from __future__ import annotations
 
+import logging
 import os
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +38,8 @@ from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 _ROUNDS = 3
 """How often a task is given to a cluster whose workers died during it."""
@@ -180,7 +183,14 @@ def find_series(sources: Sequence[Path]) -> dict[str, Path]:
 
 
 def _recordings(folder: Path) -> Iterator[tuple[tuple[str, str], Path]]:
-    for path in sorted({p.parent for p in folder.rglob("recording.yaml")}):
+    def unreadable(cause: OSError) -> None:
+        text = f"{cause.filename}: cannot be read: {cause.strerror}"
+        if cause.filename == str(folder):
+            raise DataError(text) from cause
+        log.warning("%s; recordings in it are left out", text)
+
+    below = os.walk(folder, onerror=unreadable)
+    for path in sorted(Path(place) for place, _, files in below if "recording.yaml" in files):
         head = read_head(path)
         yield (head.camera.name, head.series), path
 
@@ -215,10 +225,9 @@ def calibrate_block(block: Block) -> Outcome:
     recording = open_recording(block.recording)
     camera = recording.camera
     calibrator = Calibrator.of_recording(recording, AdjustmentSettings(free=block.free))
-    epochs = [
-        calibrator.calibrate(epoch)
-        for epoch in islice(recording.iter_epochs(), block.first, block.stop)
-    ]
+    rows = islice(recording.iter_epochs(), max(block.first - 1, 0), block.stop)
+    calibrator.begin_block(next(rows) if block.first else None)
+    epochs = list(map(calibrator.calibrate, rows))
     results = [EpochResult.from_adjustment(done.adjustment) for done in epochs]
     values = np.array([r.values for r in results])
     sds = np.array([r.sd for r in results])

@@ -210,18 +210,18 @@ def find_temperature_columns(
         for name in file.names
         if name not in times and _kind(file.column(name)) in ("number", "seconds")
     ]
-    named = [
-        n for n in numeric
-        if _TEMPERATURE_NAME.search(n) and not OTHER_NAME.search(n) and n not in wanted
-    ]  # fmt: skip
+    of_name = [n for n in numeric if _TEMPERATURE_NAME.search(n)]
+    plain = [n for n in of_name if not OTHER_NAME.search(n)]
+    # a mean is a reading unless it is one of another column
+    readings = tuple(n.lower() for n in plain)
+    means = [n for n in of_name if _MEAN.search(n) and not n.lower().startswith(readings)]
+    means = [n for n in means if not OTHER_NAME.search(_MEAN.sub("", n))]
+    named = [n for n in of_name if n in {*plain, *means} and n not in wanted]
     if wanted or named:
         return (*wanted, *named)
     others = [n for n in numeric if not OTHER_NAME.search(n) and n not in OUR_TIMES]
     if len(others) == 1:
         return (others[0],)
-    means = [n for n in numeric if _TEMPERATURE_NAME.search(n) and _MEAN.search(n)]
-    if len(means := [n for n in means if not OTHER_NAME.search(_MEAN.sub("", n))]) == 1:
-        return (means[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
     raise DataError(
         f"{file.path}: which column is the temperature? Give --temperature-column NAME. {shown}"

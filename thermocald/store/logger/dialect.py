@@ -105,7 +105,7 @@ class LoggerFile:
     """A table in a file: the names of its columns, and its detected form.
 
     first_line: line of the first row; sample: some rows from the beginning and the end; above: the
-    lines above the first row.
+    lines above the first row; is_cut: whether the last row is incomplete.
     """
 
     path: Path
@@ -116,6 +116,7 @@ class LoggerFile:
     decimal: str
     sample: tuple[tuple[str, ...], ...]
     above: tuple[str, ...] = ()
+    is_cut: bool = False
 
     @property
     def description(self) -> str:
@@ -171,7 +172,6 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             "separator and decimal mark (--separator ';' --decimal ',')"
         )
     head = [row for _, row in start[:first]]
-    above = tuple(" ".join(row) for row in head)
     # if another head follows, the rows so far were statistics
     for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
         row, next_row = start[i][1], start[i + 1][1]
@@ -187,7 +187,16 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             f"{path}, line {start[first][0]}: the rows hold more fields than the head: are commas "
             "used both in numbers and between columns? Change one of them"
         )
-    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above)
+    above = tuple(" ".join(row) for _, row in start[:first])
+    is_cut = not (begin + end)[-1].endswith(("\n", "\r")) and _is_shorter(rows, found)
+    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above, is_cut)
+
+
+def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
+    """Return whether the last number of the last row has fewer decimals than any above it."""
+    column = max(i for i, field in enumerate(rows[-1]) if field)
+    *others, last = (len(row[column].partition(decimal)[2]) for row in rows if row[column])
+    return last < min(others, default=0)
 
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:

@@ -139,8 +139,9 @@ class Table:
             if self.path.exists() and not self.path.is_file():
                 raise self._error(f"{self.path}: is not a file")
             return self.path.open(newline="", encoding="utf-8-sig")
-        except OSError as cause:
-            raise self._error(f"{self.path}: cannot be read: {cause.strerror}") from cause
+        except (OSError, ValueError) as cause:  # ValueError: a NUL character in the path
+            why = getattr(cause, "strerror", cause)
+            raise self._error(f"{self.path}: cannot be read: {why}") from cause
 
     def _header(self) -> list[str]:
         with self._open() as file:

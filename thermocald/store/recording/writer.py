@@ -8,8 +8,6 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Self
 
-import numpy as np
-
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
@@ -23,6 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any, TextIO
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch

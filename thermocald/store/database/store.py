@@ -72,8 +72,6 @@ class Store(SeriesReader):
         self._file = file  # None if the caller holds the lock, or there is none
         self._lock = threading.RLock()
         self._unchunked: set[int] = set()  # series whose chunks cannot be built
-        # series → last epoch number, number of rows that are in no chunk
-        self._ends: dict[int, tuple[int | None, int]] = {}
 
     @classmethod
     def open(
@@ -368,19 +366,15 @@ class Store(SeriesReader):
     def _append(self, series: StoredSeries, stored: StoredEpoch) -> None:
         epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not stored"):
-            last, loose = self._ends.get(series.id) or (
-                self.last_epoch(series), columns.SeriesColumns(self._db, series.id).count_loose()
-            )  # fmt: skip
+            last = self.last_epoch(series)
             if last is not None and epoch.number <= last:
                 raise StoreError(
                     f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
                     f"epoch {last}; numbers must increase"
                 )
             epochs.insert_epoch(self._db, series.id, stored)
-            full = loose + 1 >= columns.CHUNK
-            if full and series.id not in self._unchunked:
+            if series.id not in self._unchunked:
                 self._build_chunks(series)
-        self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
 
     def _build_chunks(self, series: StoredSeries) -> None:
         """Build chunks; if old rows are damaged, the series gets no more and is read from rows."""
@@ -419,24 +413,20 @@ class Store(SeriesReader):
     def add_event(self, event: Event) -> None:
         """Store an event."""
         with self._transaction("an event was not stored"):
-            row = {
-                "id": columns.next_id(self._db, "event"), "utc": event.utc,
-                "series_id": event.series, "epoch": event.epoch, "kind": event.kind,
-                "text": event.text, "data": epochs.to_json(event.data),
-            }  # fmt: skip
-            columns.insert_row(self._db, "event", row)
+            columns.insert_row(
+                self._db, "event", utc=event.utc, series_id=event.series, epoch=event.epoch,
+                kind=event.kind, text=event.text, data=epochs.to_json(event.data),
+            )  # fmt: skip
 
     def add_readings(self, readings: Sequence[LoggedReading]) -> None:
         """Store readings that belong to no epoch, in one transaction."""
         with self._transaction("readings were not stored"):
             for reading in readings:
-                row = {
-                    "id": columns.next_id(self._db, "reading"), "utc": reading.utc,
-                    "clock_trusted": int(reading.clock_trusted),
-                    "thermometer": reading.thermometer,
-                    "temperatures": epochs.to_json(reading.values),
-                }  # fmt: skip
-                columns.insert_row(self._db, "reading", row)
+                columns.insert_row(
+                    self._db, "reading", utc=reading.utc, thermometer=reading.thermometer,
+                    clock_trusted=int(reading.clock_trusted),
+                    temperatures=epochs.to_json(reading.values),
+                )  # fmt: skip
 
     def checkpoint(self) -> bool:
         """Move the -wal file into the store; return False if a reader or the disk prevents it."""

@@ -202,28 +202,17 @@ def strange_photographs(paths: Sequence[Path]) -> list[str]:
             f"{counted(len(copies), 'frame')} copied from another one, the first "
             f"{there[copy].name} from {there[original].name}"
         )
-    known = []
-    for path in there:
-        with suppress(DataError, DriverMissing, ImageError):
-            known.append(read_photograph(path))
+    known = [photograph for path in there if (photograph := known_photograph(path))]
     if len(known) > 1 and (other := other_camera(known)):
         found.append(other)
     return found
 
 
-def moment_taken(path: Path) -> datetime | None:
-    """Return the time of a photograph from its EXIF, or None."""
+def known_photograph(path: Path, source: str = "exif") -> Photograph | None:
+    """Return what `read_photograph` returns, or None where it would raise."""
     try:
-        return read_photograph(path).moment
+        return read_photograph(path, source)
     except (DataError, DriverMissing, ImageError):
-        return None
-
-
-def focal_length(path: Path) -> float | None:
-    """Return the focal length of a photograph from its EXIF, mm, or None."""
-    try:
-        return read_photograph(path, "file").focal_length
-    except (DriverMissing, ImageError):
         return None
 
 

@@ -229,8 +229,9 @@ class _Table:
             self._cut.append(self._lines.pop())
             self._seconds.pop()
             self._dated.pop(len(self._seconds), None)
-            for rows in (*self.values.values(), *([self.labels] if self.labels else [])):
-                rows.pop()
+            del self.labels[len(self._seconds) :]
+            for values in self.values.values():
+                values.pop()
 
     def _is_other_head(self, row: list[str]) -> bool:
         """Return whether a row without a time names columns, but not those of the head."""

@@ -175,10 +175,7 @@ def find_date_order(
     if same:
         return "dmy", []
     if not orders:
-        spans: dict[str, list[datetime]] = {}
-        for order in ("dmy", "mdy"):
-            ends = [parse_moment(text, order) for text in (first, last)]
-            spans[order] = [e if isinstance(e, datetime) else datetime.now(UTC) for e in ends]
+        spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in _WORDS}
         if near is not None:
             far = {}
             for order, span in spans.items():
@@ -189,7 +186,8 @@ def find_date_order(
                 return order, [
                     f"log: {first!r} is {_WORDS[order]}: this puts the log near the photographs"
                 ]
-        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in spans.items()}
+        ends = {o: [moment.replace(tzinfo=None) for moment in span] for o, span in spans.items()}
+        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in ends.items()}
         order = min(lengths, key=lambda o: lengths[o])
         if max(lengths.values()) > _LONGER * lengths[order]:
             return order, [f"log: {first!r} is {_WORDS[order]}: this makes the rows consecutive"]
@@ -197,6 +195,14 @@ def find_date_order(
         f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: give "
         "--date-order dmy or mdy"
     )
+
+
+def _moment(file: LoggerFile, names: tuple[str, ...], text: str, order: str) -> datetime:
+    try:
+        found = parse_moment(text, order)
+    except ValueError as cause:
+        raise DataError(f"{file.path}, column {names[0]!r}: {cause}") from cause
+    return found if isinstance(found, datetime) else datetime.now(UTC)
 
 
 def find_temperature_columns(
@@ -224,7 +230,8 @@ def find_temperature_columns(
         return (others[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
     raise DataError(
-        f"{file.path}: which column is the temperature? Give --temperature-column NAME. {shown}"
+        f"{file.path}: which column is the temperature? Give --temperature-column NAME. "
+        f"{shown[:400]}"
     )
 
 

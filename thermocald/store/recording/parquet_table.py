@@ -15,7 +15,7 @@ import logging
 import os
 import shutil
 import time
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -219,18 +219,15 @@ def _number_columns(table: Table) -> list[str]:
 def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
     """Write columns, given in parts, to a Parquet file."""
     pyarrow = _pyarrow()
-    with ExitStack() as opened:
-        writer = None
-        for columns in batches:
-            batch = pyarrow.table(dict(columns))
-            if writer is None:
-                words = [f.name for f in batch.schema if f.type == pyarrow.string()]
-                writer = opened.enter_context(
-                    pyarrow.parquet.ParquetWriter(
-                        path, batch.schema, compression="zstd", use_dictionary=words
-                    )
-                )
-            writer.write_table(batch)
+    tables = (pyarrow.table(dict(columns)) for columns in batches)
+    if (first := next(tables, None)) is None:
+        return
+    words = [f.name for f in first.schema if f.type == pyarrow.string()]
+    with pyarrow.parquet.ParquetWriter(
+        path, first.schema, compression="zstd", use_dictionary=words
+    ) as writer:
+        for table in chain([first], tables):
+            writer.write_table(table)
 
 
 def write_parquet(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:

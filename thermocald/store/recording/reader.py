@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 READINGS = "readings.csv"
 """The file with every reading of a log, in a recording of frames and a separate log."""
 _LARGEST_GAP_IN_INTERVALS = 10.0
-_AT_ONCE = 100_000  # frames: a year of them must fit into memory
 _KELVIN_FROM = 220.0  # as °C hotter than any camera, as K colder than any day
 _STRETCH = 8192  # readings in a row that are tested for kelvin: a part of a log may be in K
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
@@ -365,16 +364,11 @@ def interpolate_readings(
         only = float(values[0]) if len(values) else np.nan
         return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))
+    left = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
+    span = times[left + 1] - times[left]
+    result: Array = values[left] + (values[left + 1] - values[left]) / span * (frames - times[left])
+    outside = np.maximum(times[0] - frames, frames - times[-1])
+    on_reading = (frames == times[left]) | (frames == times[left + 1])
     gap = _LARGEST_GAP_IN_INTERVALS * interval
-    result = np.empty(frames.shape)
-    for first in range(0, len(frames), _AT_ONCE):
-        at = frames[first : first + _AT_ONCE]
-        left = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
-        span = times[left + 1] - times[left]
-        slope = (values[left + 1] - values[left]) / span
-        part = values[left] + slope * (at - times[left])
-        outside = np.maximum(times[0] - at, at - times[-1])
-        on_reading = (at == times[left]) | (at == times[left + 1])
-        part[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
-        result[first : first + _AT_ONCE] = part
+    result[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
     return result

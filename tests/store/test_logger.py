@@ -215,7 +215,7 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
     [
         (GERMAN, {"clock": DeviceClock()}, "no time zone: give it with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
-        (b"Date;Time;T\n" + 9 * b"05/06/2026;10:00;21\n" + b"05/06/2026;10:;21\n", {}, "10:' is no"),
+        (b"Date;Time;T\n" + 9 * b"05/06/2026;10:00;21\n" + b"05/06/2026;10:;21\n", {}, "10:' is"),
         (b"time;T\n05/06/2026 10:00;21\n05/06/2026 10:01+01:00;21\n", {}, "--date-order dmy or"),
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
         (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),

@@ -44,6 +44,8 @@ DIALECTS = {
     "a zone above the table": (
         ["Elitech RC-5", "Time zone: UTC+08:00", "No.;Time;Temperature(°C)"],
         lambda m, t, i: f"{i + 1};{m + timedelta(hours=8):%Y-%m-%d %H:%M:%S};{t:.2f}"),
+    "a compact date": (
+        ["No.,Date,Time,Temp °C"], lambda m, t, i: f"{i + 1},{m:%Y%m%d},{m:%H:%M:%S},{t:.2f}"),
     "Excel in French": (
         ["Date (UTC);Température"],
         lambda m, t, i: f"{m.day} juil. {m:%Y %H:%M:%S};{t:.2f}".replace(".", ",").replace(

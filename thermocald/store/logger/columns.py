@@ -33,7 +33,7 @@ _TEMPERATURE_NAME = re.compile(
 )
 OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
-    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt"
+    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt|ros[ée]e|roc[ií]o|rugiada"
     r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
     # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
@@ -252,10 +252,10 @@ def _kind_of(value: str) -> str:
         if is_date_like(value):
             return "moment" if ":" in value else "date"
         return "number" if number else "text"
-    if number:
-        return "seconds" if isinstance(found, datetime) else "number"
     if isinstance(found, datetime):
-        return "moment"
+        return "seconds" if number else "moment"
+    if number and (isinstance(found, time) or not value.startswith("20")):  # 20260614 is a date
+        return "number"
     return "time" if isinstance(found, time) else "date"
 
 

@@ -120,7 +120,9 @@ def output_place(path: Path) -> tuple[Path, bool]:
         raise OSError(errno.ENXIO, "it is a socket")
     if not is_ordinary(path):
         return path, True
-    what = _store_file(place)
+    what = "a store (an SQLite database)" if is_database(place) else ""
+    if _beginning(place).startswith(_WAL_MAGIC):
+        what = "the write-ahead log of a store"
     if place.name in _RECORDED and (place.parent / "recording.yaml").exists():
         what = "part of a recording"
     if what:
@@ -155,13 +157,6 @@ def is_ordinary(path: Path) -> bool:
 def is_database(path: Path) -> bool:
     """Return whether a file is an SQLite database."""
     return _beginning(path) == _DATABASE
-
-
-def _store_file(path: Path) -> str:
-    """Return what a file of a store is, "" for any other file."""
-    if is_database(path):
-        return "a store (an SQLite database)"
-    return "the write-ahead log of a store" if _beginning(path)[:4] in _WAL_MAGIC else ""
 
 
 def _beginning(path: Path) -> bytes:

@@ -61,30 +61,19 @@ class Outcome:
 
 
 def run_tasks(
-    work: Callable[[Any], Outcome],
-    tasks: Sequence[Any],
-    engine: str = "local",
-    jobs: int = 1,
-    report: Callable[[Outcome], None] = lambda _: None,
-) -> list[Outcome]:
-    """Run all tasks and return their outcomes in the order of completion.
+    work: Callable[[Any], Outcome], tasks: Sequence[Any], engine: str = "local", jobs: int = 1
+) -> Iterator[Outcome]:
+    """Run all tasks and yield their outcomes in the order of completion.
 
     work: a module's function. engine: `local`, with `jobs` processes, or the address of a Dask
-    scheduler, `tcp://host:8786`, whose workers see the same files. report: called with each outcome
-    on completion. Raises UsageError, ServerGone.
+    scheduler, `tcp://host:8786`, whose workers see the same files. Raises UsageError, ServerGone.
     """
     do = partial(_attempt, work)
     if engine == "local":
-        done = map(do, tasks) if jobs == 1 else _processes(do, tasks, jobs)
-    elif "://" in engine:
-        done = _cluster(do, tasks, engine)
-    else:
-        raise UsageError(f"--engine {engine}: give `local` or a Dask scheduler's tcp://HOST:PORT")
-    outcomes = []
-    for outcome in done:
-        outcomes.append(outcome)
-        report(outcome)
-    return outcomes
+        return map(do, tasks) if jobs == 1 else _processes(do, tasks, jobs)
+    if "://" in engine:
+        return _cluster(do, tasks, engine)
+    raise UsageError(f"--engine {engine}: give `local` or a Dask scheduler's tcp://HOST:PORT")
 
 
 def _attempt(work: Callable[[Any], Outcome], task: Any) -> Outcome:
@@ -200,7 +189,7 @@ def _at_server(address: Path) -> Iterator[tuple[tuple[str, str, str], Path]]:
         every = store.all_series()
     for one in every:
         parts = str(one.identity["station"]), one.camera, one.name
-        yield parts, ServerAddress.narrowed(address, *parts)
+        yield parts, ServerAddress.parse(address).narrowed(*parts)
 
 
 def find_blocks(

@@ -116,7 +116,7 @@ def test_a_row_that_is_cut_off_is_left_out(tmp_path):
     path.write_bytes(path.read_bytes()[:-5])  # of 22.60 is left 22
     found = read_log(path)
     assert found.times.tolist() == [m.timestamp() for m in MOMENTS[:-1]]
-    assert "line 13 is cut off" in found.notes[-1]
+    assert "the last row is cut off" in found.notes[-1]
 
 
 def test_rows_without_seconds_are_doubtful(tmp_path):

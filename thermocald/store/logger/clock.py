@@ -51,11 +51,13 @@ def time_zone(text: str) -> tzinfo:
 def stated_zones(text: str) -> dict[str, tzinfo]:
     """Return the zones that a column's head names, such as GMT+01:00, UTC or EST and EDT."""
     return {
-        offset or word: time_zone(offset)
-        if offset
-        else timezone(timedelta(hours=_ZONES_H.get(word.upper(), -6)))
-        for offset, word in _STATED_ZONE.findall(text)
+        name: time_zone(name) if name[-1].isdigit() else _zone_of_letters(name.upper())
+        for name in _STATED_ZONE.findall(text)
     }
+
+
+def _zone_of_letters(name: str) -> timezone:
+    return timezone(timedelta(hours=_ZONES_H.get(name, -6)))  # CST beside CDT
 
 
 def clock_error(text: str) -> float:
@@ -194,8 +196,8 @@ _ZONES_H = {
 """Zones by their letters; without CST, which China and America have."""
 _ZONE = rf"\s*(?P<zone>{'|'.join(_ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}:?\d{{2}}|[+-]\d{{2}})?"
 _STATED_ZONE = re.compile(
-    rf"(?<![^\W_])(?:((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?::?\d{{2}})?)"
-    rf"|((?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in _ZONES_H if len(n) > 2)})(?![^\W_]))"
+    rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?::?\d{{2}})?"
+    rf"|(?:(?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in _ZONES_H if len(n) > 2)})(?![^\W_]))"
 )
 _FULL = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})[ T,;_-]+(?:{_TIME}|{_COMPACT_TIME}){_ZONE}")
 _ONLY_DATE = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})")
@@ -315,7 +317,7 @@ def _zone(text: str | None) -> timezone | None:
     if not text:
         return None
     if text in _ZONES_H:
-        return timezone(timedelta(hours=_ZONES_H[text]))
+        return _zone_of_letters(text)
     sign = -1 if "-" in text else 1
     digits = re.sub(r"\D", "", text)
     return timezone(sign * timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0)))

@@ -136,7 +136,8 @@ class LoggerFile:
         """Yield each row with its line, with one field per name; missing ones are empty."""
         width = len(self.names)
         with self.path.open(encoding=self.encoding, errors="replace", newline="") as file:
-            for line, row in _parse_rows(self.path, file, self.separator):
+            lines = filter(_is_ended, file) if self.is_cut else file
+            for line, row in _parse_rows(self.path, lines, self.separator):
                 if line >= self.first_line:
                     yield line, _fit_width(row, width)
 
@@ -188,8 +189,12 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             "used both in numbers and between columns? Change one of them"
         )
     above = tuple(" ".join(row) for _, row in start[:first])
-    is_cut = not (begin + end)[-1].endswith(("\n", "\r")) and _is_shorter(rows, found)
+    is_cut = not _is_ended((begin + end)[-1]) and _is_shorter(rows, found)
     return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above, is_cut)
+
+
+def _is_ended(line: str) -> bool:
+    return line.endswith(("\n", "\r"))
 
 
 def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:

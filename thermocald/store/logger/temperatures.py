@@ -123,15 +123,11 @@ def read_log(
     times, channels, repeated = _sort_by_time(times, channels)
     if repeated:
         text = f"{counted(repeated, 'row')} with the time of the row before: left out"
+        without = "; the times have no seconds: take the logger's own file, not a spreadsheet's"
         rough = (
             repeated > _MOST_REPEATED * len(steps) and not (times % 60).any() and steps.min() >= 0
         )
-        notes.append(
-            f"doubtful: {text}; the times have no seconds: was the log saved by a spreadsheet? "
-            "Take the logger's own file"
-            if rough
-            else f"log: {text}"
-        )
+        notes.append(f"doubtful: {text}{without}" if rough else f"log: {text}")
     return TemperatureLog(times, channels, tuple(notes))
 
 
@@ -193,7 +189,6 @@ class _Table:
         self.values = {name: array("d") for name in names}
         self.units: dict[str, Counter[str]] = {name: Counter() for name in names}
         self._untimed: list[tuple[int, str]] = []
-        self._cut: list[int] = []
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
         self.labels: list[str] = []
 
@@ -225,13 +220,6 @@ class _Table:
                 self.values[name].append(self._value(line, name, row[place]))
             if label is not None:
                 self.labels.append(row[label])
-        if file.is_cut and self._lines:
-            self._cut.append(self._lines.pop())
-            self._seconds.pop()
-            self._dated.pop(len(self._seconds), None)
-            del self.labels[len(self._seconds) :]
-            for values in self.values.values():
-                values.pop()
 
     def _is_other_head(self, row: list[str]) -> bool:
         """Return whether a row without a time names columns, but not those of the head."""
@@ -260,10 +248,8 @@ class _Table:
                 f"log: {counted(len(self._untimed), 'row')} without a time: left out (line {line}: "
                 f"{text[:30]!r})"
             )
-        notes += [
-            f"log: line {line} is cut off (no line end, fewer digits than the others): left out"
-            for line in self._cut
-        ]
+        if self.file.is_cut:
+            notes.append("log: the last row is cut off (no line end, fewer digits): left out")
         for name, words in self._words.items():
             if words:
                 shown = ", ".join(repr(word) for word, _ in words.most_common(3))

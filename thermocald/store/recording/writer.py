@@ -17,7 +17,6 @@ from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
     from typing import Any, TextIO
 
@@ -208,16 +207,6 @@ class RecordingWriter:
             rows.writerows([*row, *absent] for row in written)
         before.unlink()
         self._columns += names
-
-
-def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]) -> None:
-    """Write a recording of some epochs in constant memory; their frames are copied.
-
-    Raises RecordingError, leaving nothing behind, if `path` exists or the disk is full.
-    """
-    with RecordingWriter(path, head, testfield) as writer:
-        for epoch in epochs:
-            writer.append(epoch)
 
 
 def _number(value: float, form: str) -> str:

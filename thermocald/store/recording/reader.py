@@ -206,9 +206,10 @@ class Recording:
             )
         if self.has_observations and not self.is_long:
             first: dict[bytes, int] = {}
-            twice = []
+            twice, last = [], 0
             for epoch in self.epochs:
                 if (o := epoch.observations) is not None and len(o):
+                    last = epoch.number
                     same = first.setdefault(o.targets.tobytes() + o.points.tobytes(), epoch.number)
                     twice += [(epoch.number, same)] if same != epoch.number else []
             if twice:
@@ -216,6 +217,8 @@ class Recording:
                     f"{counted(len(twice), 'epoch')} with the image points of another one: epoch "
                     f"{twice[0][0]} those of {twice[0][1]}"
                 )
+            if (none := int((columns.numbers > last).sum())) > 1:
+                found.append(f"the last {none} epochs have no observations: is the file cut off?")
         return found
 
     def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:

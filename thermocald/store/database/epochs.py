@@ -486,7 +486,7 @@ def examine(connection: sqlite3.Connection) -> Examination:
 def whole_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
-    """Yield rows of a table in KEPT as `examined_rows` does.
+    """Yield rows of a table in KEPT as `examined_rows` does, without the file's checksums.
 
     An epoch also has `covariance` and `observations`, packed bytes or None.
     """
@@ -497,6 +497,8 @@ def whole_rows(
                 row |= {"covariance": covariance or None, "observations": observations or None}
             except StoreError as error:
                 row["damage"] = str(error)
+        del row["checksum"]
+        row.pop("detail_checksum", None)
         yield row
 
 

@@ -242,18 +242,11 @@ class Store(SeriesReader):
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
         """Return up to `limit` rows of a growing table with ids above `after`, for a forwarder.
 
-        They are those of `database.epochs.whole_rows`, without the file's checksums.
+        They are those of `database.epochs.whole_rows`.
         """
         with self._reads(f"{table}s") as connection:
-            found = list(
-                epochs.whole_rows(
-                    connection, table, "WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
-                )
-            )
-        for row in found:
-            row.pop("checksum")
-            row.pop("detail_checksum", None)
-        return found
+            condition = "WHERE id > ? ORDER BY id LIMIT ?"
+            return list(epochs.whole_rows(connection, table, condition, (after, limit)))
 
     def frames_after(self, after: int, limit: int) -> list[epochs.KeptFrame]:
         """Return up to `limit` epochs with ids above `after` and their frames, for a forwarder."""

@@ -51,13 +51,9 @@ def time_zone(text: str) -> tzinfo:
 def stated_zones(text: str) -> dict[str, tzinfo]:
     """Return the zones that a column's head names, such as GMT+01:00, UTC or EST and EDT."""
     return {
-        name: time_zone(name) if name[-1].isdigit() else _zone_of_letters(name.upper())
+        name: time_zone(name) if name[-1].isdigit() else _zone(name.upper())
         for name in _STATED_ZONE.findall(text)
     }
-
-
-def _zone_of_letters(name: str) -> timezone:
-    return timezone(timedelta(hours=_ZONES_H.get(name, -6)))  # CST beside CDT
 
 
 def clock_error(text: str) -> float:
@@ -310,14 +306,13 @@ def _time(found: re.Match[str]) -> time:
                 raise ValueError(f"{hour} {groups['half']} is not a time")
             hour = hour % 12 + (12 if groups["half"][0] in "Pp" else 0)
     micro = int(part.ljust(6, "0")[:6]) if part else 0
-    return time(hour, minute, second, micro, tzinfo=_zone(groups["zone"]))
+    zone = _zone(groups["zone"]) if groups["zone"] else None
+    return time(hour, minute, second, micro, tzinfo=zone)
 
 
-def _zone(text: str | None) -> timezone | None:
-    if not text:
-        return None
-    if text in _ZONES_H:
-        return _zone_of_letters(text)
+def _zone(text: str) -> tzinfo:
+    if not text[-1].isdigit():
+        return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT
     sign = -1 if "-" in text else 1
     digits = re.sub(r"\D", "", text)
     return timezone(sign * timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0)))

@@ -89,6 +89,7 @@ _MOST_COLUMNS = 1000
 _SAMPLE = 400
 _CONSISTENT = 0.8
 _PREAMBLE = 12
+_ENDS = ("\n", "\r")
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
 _POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
@@ -136,7 +137,7 @@ class LoggerFile:
         """Yield each row with its line, with one field per name; missing ones are empty."""
         width = len(self.names)
         with self.path.open(encoding=self.encoding, errors="replace", newline="") as file:
-            lines = filter(_is_ended, file) if self.is_cut else file
+            lines = (text for text in file if text.endswith(_ENDS) or not self.is_cut)
             for line, row in _parse_rows(self.path, lines, self.separator):
                 if line >= self.first_line:
                     yield line, _fit_width(row, width)
@@ -189,12 +190,8 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             "used both in numbers and between columns? Change one of them"
         )
     above = tuple(" ".join(row) for _, row in start[:first])
-    is_cut = not _is_ended((begin + end)[-1]) and _is_shorter(rows, found)
+    is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
     return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above, is_cut)
-
-
-def _is_ended(line: str) -> bool:
-    return line.endswith(("\n", "\r"))
 
 
 def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:

@@ -303,12 +303,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         values = found[name]
         untimed = np.isfinite(values) & np.isnan(temperature_time)
         table.check("temperature_time", untimed, f"is empty although {name} was read")
-        table.check(name, values < -273.15, "is below absolute zero")
-        table.check(name, values > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
-        for rows in runs(len(values), _STRETCH):
-            known = rows.start + np.flatnonzero(np.isfinite(values[rows]))
-            if len(known) and values[known].min() > _KELVIN_FROM:
-                table.fail(int(known[0]), name, "seems to be in kelvin: subtract 273.15 to give °C")
+        _check_celsius(table, name, values)
     frames = tuple(map(str.strip, found["frame"]))
     files = FileFolder(folder)
     for row, frame in enumerate(frames):
@@ -332,6 +327,16 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     )
 
 
+def _check_celsius(table: Table, name: str, values: Array) -> None:
+    """Raise the table's error for a temperature (n,) °C that no camera has."""
+    table.check(name, values < -273.15, "is below absolute zero")
+    table.check(name, values > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
+    for rows in runs(len(values), _STRETCH):
+        known = rows.start + np.flatnonzero(np.isfinite(values[rows]))
+        if len(known) and values[known].min() > _KELVIN_FROM:
+            table.fail(int(known[0]), name, "seems to be in kelvin: subtract 273.15 to give °C")
+
+
 def _read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     """Read a `readings.csv`. Raises RecordingError naming line and column."""
     table = Table(path, ["time", *channels])
@@ -341,7 +346,7 @@ def _read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     if fault := time_fault(times):
         table.fail(fault[0], "time", fault[1])
     for name, values in columns.items():
-        table.check(name, values < -273.15, "is below absolute zero")
+        _check_celsius(table, name, values)
     return TemperatureLog(times, {name: columns.get(name, np.empty(0)) for name in channels})
 
 

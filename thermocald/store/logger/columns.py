@@ -220,8 +220,8 @@ def find_temperature_columns(
     plain = [n for n in of_name if not OTHER_NAME.search(n)]
     # a mean is a reading unless it is one of another column
     readings = tuple(n.lower() for n in plain)
-    means = [n for n in of_name if _MEAN.search(n) and not n.lower().startswith(readings)]
-    means = [n for n in means if not OTHER_NAME.search(_MEAN.sub("", n))]
+    of = {n: _MEAN.sub("", n).lower().lstrip(" _.-") for n in of_name if _MEAN.search(n)}
+    means = {n for n, o in of.items() if not OTHER_NAME.search(o) and not o.startswith(readings)}
     named = [n for n in of_name if n in {*plain, *means} and n not in wanted]
     if wanted or named:
         return (*wanted, *named)

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone.*", re.IGNORECASE)
-"""A line above the table that states the time zone."""
+_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNORECASE)
+"""A line above the table that states the time zone; cities behind it may have summer time."""
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
 """Lines above a table that state °F."""
@@ -79,7 +79,7 @@ def read_log(
     options = options or LogOptions()
     file = open_log(path, options.separator, options.decimal)
     time_names = find_time_columns(file, options)
-    lines = [found[0] for line in file.above if (found := _ZONE_LINE.search(line))]
+    lines = [found[1] for line in file.above if (found := _ZONE_LINE.search(line))]
     clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 READINGS = "readings.csv"
 """The file with every reading of a log, in a recording of frames and a separate log."""
-_LARGEST_GAP_IN_INTERVALS = 10.0
+LARGEST_GAP = 10.0  # of readings, in their usual intervals
 _KELVIN_FROM = 220.0  # as °C hotter than any camera, as K colder than any day
 _STRETCH = 8192  # readings in a row that are tested for kelvin: a part of a log may be in K
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
@@ -377,6 +377,6 @@ def interpolate_readings(
     result: Array = values[left] + (values[left + 1] - values[left]) / span * (frames - times[left])
     outside = np.maximum(times[0] - frames, frames - times[-1])
     on_reading = (frames == times[left]) | (frames == times[left + 1])
-    gap = _LARGEST_GAP_IN_INTERVALS * interval
+    gap = LARGEST_GAP * interval
     result[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
     return result

@@ -20,6 +20,7 @@ import numpy as np
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
+from thermocald.numbers import counted
 from thermocald.store.database import columns, epochs
 from thermocald.store.database.file import (
     Mode,
@@ -270,8 +271,7 @@ class Store(SeriesReader):
         tail = read_wal_tail(helper(self.path, "wal"))
         damaged = list(found.damaged)
         if tail.lost:
-            lost = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
-            lost = "all transactions" if tail.lost < 0 else lost
+            lost = "all transactions" if tail.lost < 0 else counted(tail.lost, "transaction")
             damaged.insert(0, f"the -wal file: {lost} in it cannot be read")
         found = replace(found, damaged=tuple(damaged), unfinished=tail.unfinished)
         if not found.damaged:

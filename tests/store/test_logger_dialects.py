@@ -91,12 +91,6 @@ def test_the_zone_in_the_head_of_the_times_is_theirs(tmp_path, head, offset_h, z
     assert used == any("gives the time zone" in note for note in found.notes)
 
 
-def test_a_zone_in_the_head_that_is_not_the_one_given_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"EST/EDT in the head .* Europe/Berlin: give --log-timez"):
-        read(tmp_path / "log.csv", ["Time (EST/EDT),T °C"],
-             lambda m, t, i: f"{m:%Y-%m-%d %H:%M:%S},{t}", zone="Europe/Berlin")  # fmt: skip
-
-
 @pytest.mark.parametrize("head", ["time;RH %;T °C", "time;T °F"])
 def test_another_head_below_is_refused(tmp_path, head):
     """A file of two logs: below the second head the columns are others."""

@@ -17,7 +17,6 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -214,7 +213,7 @@ def calibrate_block(block: Block) -> Outcome:
     recording = open_recording(block.recording)
     camera = recording.camera
     calibrator = Calibrator.of_recording(recording, AdjustmentSettings(free=block.free))
-    rows = islice(recording.iter_epochs(), max(block.first - 1, 0), block.stop)
+    rows = recording.iter_epochs(slice(max(block.first - 1, 0), block.stop))
     calibrator.begin_block(next(rows) if block.first else None)
     epochs = list(map(calibrator.calibrate, rows))
     results = [EpochResult.from_adjustment(done.adjustment) for done in epochs]

@@ -140,16 +140,19 @@ class Recording:
         rows = self._observation_file.load()
         return [self._epoch(i, rows.of_epoch(i)) for i in range(len(self))]
 
-    def iter_epochs(self) -> Iterator[Epoch]:
-        """Yield the epochs; a long recording (`is_long`) is read in constant memory.
+    def iter_epochs(self, window: slice = slice(None)) -> Iterator[Epoch]:
+        """Yield the epochs, or some of them (from 0).
 
-        The rows of its observations must be in the order of the epochs.
+        A long recording (`is_long`) is read in constant memory; the rows of its observations must
+        be in the order of the epochs.
         """
         if "epochs" in self.__dict__ or (self.has_observations and not self.is_long):
-            yield from self.epochs
+            yield from self.epochs[window]
             return
-        seen = self._observation_file.stream() if self.has_observations else repeat(None)
-        for i, observations in zip(range(len(self)), seen, strict=False):
+        rows = range(len(self))[window]
+        part = slice(rows.start, rows.stop)
+        seen = self._observation_file.stream(part) if self.has_observations else repeat(None)
+        for i, observations in zip(rows, seen, strict=False):
             yield self._epoch(i, observations)
 
     def _epoch(self, i: int, observations: Observations | None) -> Epoch:

@@ -177,7 +177,9 @@ def workers(full: bool) -> dict[str, float]:
             processes = [Process(p.pid) for p in started]
             begin = _processor_time(processes)
             seconds, _ = timed(
-                lambda: run_tasks(calibrate_block, todo, cluster.address if cluster else "local")
+                lambda: list(
+                    run_tasks(calibrate_block, todo, cluster.address if cluster else "local")
+                )
             )
             return _processor_time(processes) - begin, seconds
 
@@ -188,7 +190,7 @@ def workers(full: bool) -> dict[str, float]:
         time.sleep(5)
         for count, cluster in enumerate(clusters):  # so that everything is imported
             warm = blocks(f"warm{count}")[: 2 * max(count, 1)]
-            run_tasks(calibrate_block, warm, cluster.address if cluster else "local")
+            list(run_tasks(calibrate_block, warm, cluster.address if cluster else "local"))
         for number in range(6 if full else 2):
             rounds.append([])
             for count, cluster in enumerate(clusters):

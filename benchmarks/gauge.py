@@ -34,13 +34,13 @@ from tests.analysis.test_gauge import START, TAU, World, thermal_camera
 from tests.main_paths.crooked import SIZE, project
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR, corner_field, draw, station
+from tests.store.small import write_recording
 from thermocald.analysis.thermal.gauge import plan_gauge
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.adjustment import adjust
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.writer import write_recording
 
 GOAL = 1.2
 # Runs on two machines gave 1.14 to 1.21 for JPEGs; for grey values see above

@@ -6,12 +6,22 @@ import json
 import os
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
+import thermocald as tc
 from thermocald.addresses import HostNames, is_loopback
-from thermocald.errors import ConfigurationError, DataError, RecordingError
-from thermocald.files import dump_yaml, overwrite_json, read_json, read_yaml
+from thermocald.errors import ConfigurationError, DataError, RecordingError, ThermocaldError
+from thermocald.files import (
+    check_output,
+    dump_yaml,
+    is_database,
+    overwrite_json,
+    read_json,
+    read_yaml,
+    write_text,
+)
 from thermocald.numbers import typeset_powers, with_sd
 from thermocald.parallel import in_order
 
@@ -56,6 +66,7 @@ BAD = [
     ("[" * 5000, "file.yaml"),
     (BOMB, "aliases without end"),
     ("a: &a [*a]\n", "aliases without end"),
+    ('a: ["x\\0y"]\n', r"'x\\x00y' holds a NUL character"),
 ]
 
 
@@ -65,6 +76,25 @@ def test_one_clear_error(write, text, message):
     with pytest.raises(ConfigurationError, match=message) as caught:
         read_yaml(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda path: is_database(path) or tc.open(path),
+        tc.open,
+        tc.load_camera,
+        tc.read_testfield,
+        lambda path: tc.calibrate([path], path),
+        read_yaml,
+        lambda path: write_text(Path(path), ""),
+        lambda path: write_text(Path(path) / "file", ""),
+        lambda path: check_output(Path(path), "folder"),
+    ],
+)
+def test_a_path_with_nul_is_an_error_in_words(use):
+    with pytest.raises(ThermocaldError, match=r"NUL|null byte"):
+        use(Path("x\0y"))
 
 
 def test_the_caller_chooses_the_error(tmp_path):

@@ -15,6 +15,7 @@ from hypothesis import given, settings, strategies
 import thermocald as tc
 from tests.commands import call
 from tests.drivers.fakes.sysfs import Sysfs
+from tests.store.small import write_recording
 from tests.store.test_crafted import change
 from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline
 from thermocald.acquisition.thermometers import Thermometers, require_columns
@@ -30,7 +31,6 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.writer import write_recording
 from thermocald.store.schema import COLUMN_NAMES
 
 LIKE_OURS = [

@@ -75,10 +75,10 @@ def check_output(path: Path, kind: Output = "file") -> None:
     `output_place` decides which files may be replaced; a new recording replaces nothing. The
     nearest existing folder must accept files; missing folders are made when the output is written.
     """
-    place = Path(os.path.realpath(path))
-    if kind == "either":
-        kind = "folder" if place.is_dir() else "file"
     try:
+        place = _followed(path)
+        if kind == "either":
+            kind = "folder" if place.is_dir() else "file"
         if kind == "file" and output_place(path)[1]:
             return  # a device or a pipe
         within = place.parent if kind == "file" else place
@@ -105,7 +105,7 @@ def output_place(path: Path) -> tuple[Path, bool]:
     OSError for a folder, a disk, a file without write permission, and a file with measurements:
     `-o` in place of `--store` must not cost a store.
     """
-    place = Path(os.path.realpath(path))
+    place = _followed(path)
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -120,12 +120,21 @@ def output_place(path: Path) -> tuple[Path, bool]:
         raise OSError(errno.ENXIO, "it is a socket")
     if not is_ordinary(path):
         return path, True
-    what = _store_file(place)
+    what = "a store (an SQLite database)" if is_database(place) else ""
+    if _beginning(place).startswith(_WAL_MAGIC):
+        what = "the write-ahead log of a store"
     if place.name in _RECORDED and (place.parent / "recording.yaml").exists():
         what = "part of a recording"
     if what:
         raise FileExistsError(errno.EEXIST, f"it is {what}")
     return place, False
+
+
+def _followed(path: Path) -> Path:
+    """Return the place that links lead to. Raises OSError for a name that no file can have."""
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "the name holds a NUL character")
+    return Path(os.path.realpath(path))
 
 
 def mount_point(path: Path) -> Path:
@@ -150,18 +159,11 @@ def is_database(path: Path) -> bool:
     return _beginning(path) == _DATABASE
 
 
-def _store_file(path: Path) -> str:
-    """Return what a file of a store is, "" for any other file."""
-    if is_database(path):
-        return "a store (an SQLite database)"
-    return "the write-ahead log of a store" if _beginning(path)[:4] in _WAL_MAGIC else ""
-
-
 def _beginning(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             return file.read(len(_DATABASE))
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a NUL character in the path
         return b""
 
 
@@ -223,6 +225,7 @@ def utc_stamp() -> str:
 def make_folder(path: Path) -> None:
     """Make a folder and its parents unless it exists; raises OutputError."""
     try:
+        _followed(path)
         path.mkdir(parents=True, exist_ok=True)
     except OSError as cause:
         raise cannot_write(path, cause) from cause
@@ -317,9 +320,9 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
         if path.exists() and path.stat().st_size > _MOST_BYTES:
             raise error(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB")
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as cause:
-        what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
-        raise error(f"{path}: cannot be read: {what}") from cause
+    except (OSError, ValueError) as cause:
+        what = "is not UTF-8 text" if isinstance(cause, UnicodeDecodeError) else cause
+        raise error(f"{path}: cannot be read: {getattr(cause, 'strerror', what)}") from cause
     try:
         if _is_too_deep(text):
             raise error(f"{path}: is nested deeper than {_DEEPEST} levels")
@@ -341,8 +344,8 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     for key in document:
         if not isinstance(key, str):
             raise error(f"{path}: key {key!r} must be text")
-    if _is_too_large(document):
-        raise error(f"{path}: holds more than {_MOST_VALUES} values, or aliases without end")
+    if wrong := _fault(document):
+        raise error(f"{path}: {wrong}")
     return document
 
 
@@ -350,24 +353,27 @@ def _is_too_deep(text: str) -> bool:
     """Return whether lists and mappings are nested so deeply that the stack might not suffice."""
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > _DEEPEST:
-                return True
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            return True
     return False
 
 
-def _is_too_large(document: dict[str, Any]) -> bool:
-    """Return whether there are too many values: a few aliases (`*a`) can stand for billions."""
+def _fault(document: dict[str, Any]) -> str:
+    """Return what is wrong with the values: too many, or a text with NUL, which no path may hold.
+
+    A few aliases (`*a`) can stand for billions of values.
+    """
     left, waiting = _MOST_VALUES, [document]
     while waiting and left > 0:
         value: Any = waiting.pop()
         left -= 1
+        if isinstance(value, str) and "\0" in value:
+            return f"{value[:40]!r} holds a NUL character; remove it"
         if isinstance(value, dict | list):
             waiting.extend(value.values() if isinstance(value, dict) else value)
-    return left <= 0
+    return "" if left > 0 else f"holds more than {_MOST_VALUES} values, or aliases without end"
 
 
 class _Dumper(yaml.SafeDumper):

@@ -174,6 +174,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
             if not _accepts(kinds[name], value):
                 words = [_KINDS[kind.split("[")[0]][1] for kind in _alternatives(kinds[name])]
                 wanted = " or ".join(word for word in words if word != "None")
+                wanted += " without a NUL character" * ("\\x00" in repr(value))
                 raise UsageError(f"{name} is {repr(value)[:80]}; it must be {wanted}")
         return function(*given, **named)
 
@@ -195,6 +196,8 @@ def _is_of(kind: str, value: Any) -> bool:
     if outer not in _KINDS:
         return True
     if isinstance(value, bool) or not isinstance(value, _KINDS[outer][0]):
+        return False
+    if isinstance(value, str | Path) and "\0" in str(value):
         return False
     if not inner or not isinstance(value, Collection):  # an iterator can be read only once
         return True

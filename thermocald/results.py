@@ -22,7 +22,7 @@ from thermocald.numbers import typeset_powers, with_sd
 from thermocald.output.study.summary import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
-from thermocald.store.logger.photographs import focal_length
+from thermocald.store.logger.photographs import known_photograph
 from thermocald.store.recording.sense import doubt_lines, interior_doubts
 
 if TYPE_CHECKING:
@@ -169,7 +169,8 @@ class Calibration(Result):
             )
         if self.pitch_assumed:
             return found
-        nominal = self.file.principal_distance or focal_length(Path(result.photographs[0].path))
+        first = known_photograph(Path(result.photographs[0].path), "file")
+        nominal = self.file.principal_distance or (first.focal_length if first else None)
         c, x0, y0 = result.interior.as_array()[:3].tolist()
         return found + interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 

@@ -17,6 +17,7 @@ import yaml
 
 from tests.daemon.forking import Forked, Forker
 from tests.drivers.small_camera import write_small_camera
+from tests.store.small import write_recording
 from thermocald.epoch import Epoch
 from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import project
@@ -25,7 +26,6 @@ from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.testfield_file import write_testfield
-from thermocald.store.recording.writer import write_recording
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import fast_run, make_recording, replayed_camera
+from tests.store.small import write_recording
 from thermocald.config import CalibrationConfig
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.writer import write_recording
 
 EPOCHS = 12
 PLAIN = {"target_offsets": False, "exterior": "per_epoch"}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import fast_run, make_recording, replayed_camera
+from tests.store.small import write_recording
 from thermocald.analysis.series.recorded import table_of_stored
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -16,7 +17,6 @@ from thermocald.physics.testfields import demonstration_field, demonstration_mod
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.writer import write_recording
 from thermocald.store.sources import StoredRecording
 
 EPOCHS, WHEN = 18, 13

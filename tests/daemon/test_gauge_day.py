@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from tests.daemon.conftest import fast_run
+from tests.store.small import write_recording
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
@@ -19,7 +20,6 @@ from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import write_model
 from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.writer import write_recording
 
 pytestmark = pytest.mark.slow
 

@@ -41,7 +41,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
     """One of two is killed, then the other after every few blocks and replaced, as on machines
     that are lent.
     """
-    run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
+    list(run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10)))
     out = tmp_path / "many"
     client = start_client(archive, out, dask)
     killed = done = 0
@@ -66,7 +66,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
 def test_workers_killed_while_they_measure_cost_no_frame(tmp_path, dask):
     """Frames are measured again; all recordings are equal, so that one reference suffices."""
     write_frame_archive(tmp_path / "archive", 40, 10)
-    run_tasks(calibrate_block, blocks_of(tmp_path / "archive" / "M00", tmp_path / "one", 10))
+    list(run_tasks(calibrate_block, blocks_of(tmp_path / "archive" / "M00", tmp_path / "one", 10)))
     (expected,) = (tmp_path / "one").iterdir()
     out = tmp_path / "many"
     client = start_client(tmp_path / "archive", out, dask)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -30,14 +32,14 @@ def blocks_of(archive, out, size=40):
 def calibrated(archive, tmp_path_factory):
     """All blocks, in this process."""
     out = tmp_path_factory.mktemp("calibrated")
-    run_tasks(calibrate_block, blocks_of(archive, out))
+    list(run_tasks(calibrate_block, blocks_of(archive, out)))
     return out
 
 
 def test_processes_give_the_bits_of_one_and_what_fails_costs_itself(archive, calibrated, tmp_path):
     blocks = blocks_of(archive, tmp_path)
     gone = replace(blocks[1], recording=tmp_path / "gone", target=tmp_path / "gone.parquet")
-    done = run_tasks(calibrate_block, [*blocks[:2], gone, *blocks[2:]], jobs=2)
+    done = list(run_tasks(calibrate_block, [*blocks[:2], gone, *blocks[2:]], jobs=2))
     assert sorted(bool(o.error) for o in done) == [False, False, False, False, True]
     assert sum(o.calibrated for o in done) == 160
     assert files(calibrated) == files(tmp_path)
@@ -48,13 +50,41 @@ def test_processes_give_the_bits_of_one_and_what_fails_costs_itself(archive, cal
 
 def test_an_interrupted_run_goes_on(archive, tmp_path):
     blocks = blocks_of(archive, tmp_path)
-    run_tasks(calibrate_block, blocks[:3])
+    list(run_tasks(calibrate_block, blocks[:3]))
     assert blocks_of(archive, tmp_path) == blocks[3:]
+
+
+def test_a_block_knows_the_frame_before_it(archive, tmp_path):
+    """Epoch 41, the first of a block, has the image points of epoch 40 again."""
+    shutil.copytree(archive / "M1", tmp_path / "M1")
+    path = tmp_path / "M1" / "observations.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    again = [line.replace("40,", "41,", 1) for line in lines if line.startswith("40,")]
+    path.write_text("".join([line for line in lines if line[:3] != "41,"] + again))
+    list(run_tasks(calibrate_block, blocks_of(tmp_path, tmp_path / "out")))
+    status = parquet.read_table(tmp_path / "out").sort_by("epoch").column("status").to_pylist()
+    assert [i + 1 for i, word in enumerate(status) if word != "ok"] == [41]
+    assert status[40] == "repeated_frame"
+
+
+def test_a_folder_that_cannot_be_read_is_not_called_empty(archive, tmp_path, monkeypatch, caplog):
+    with pytest.raises(DataError, match="gone: cannot be read: No such file or directory"):
+        find_blocks([tmp_path / "gone"], tmp_path, ())
+    scan = os.scandir
+
+    def refuse(path):
+        if str(path).endswith("M2"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert {block.recording.name for block in blocks_of(archive, tmp_path)} == {"M1"}
+    assert "M2: cannot be read: Permission denied; recordings in it are left out" in caplog.text
 
 
 @pytest.mark.slow
 def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path):
-    done = run_tasks(die, blocks_of(archive, tmp_path), jobs=2)
+    done = list(run_tasks(die, blocks_of(archive, tmp_path), jobs=2))
     assert sorted(o.error for o in done) == ["", "", "", "its process died twice"]
 
 
@@ -62,7 +92,7 @@ def test_bad_usage_is_said(archive, tmp_path):
     with pytest.raises(DataError, match="no recording"):
         find_blocks([tmp_path], tmp_path, ())
     with pytest.raises(UsageError, match="give `local` or"):
-        run_tasks(calibrate_block, [], "fast")
+        list(run_tasks(calibrate_block, [], "fast"))
     with pytest.raises(UsageError, match="must be one of calibrate, discover, study"):
         find_series_tasks([archive], tmp_path, "dream")
     with pytest.raises(DataError, match="no recording or series is there"):

@@ -39,7 +39,7 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
         store.append(series, epoch, extra={f"x{evil}": 2.0})
     Forwarder(tmp_path / "k.db", address(server), evil).send_waiting()
     base = Path(server.address(name="thermocald"))
-    narrowed = ServerAddress.narrowed(base, evil, evil, evil)
+    narrowed = ServerAddress.parse(base).narrowed(evil, evil, evil)
     with ServerStore.open(narrowed) as there:
         (found,) = there.all_series()
         columns = there.series_columns(found, [channel, f"x{evil}", "epoch"])

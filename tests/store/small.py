@@ -9,6 +9,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.writer import RecordingWriter
 from thermocald.store.series import EpochResult
 
 
@@ -17,6 +18,12 @@ def create_small_series(store, name: str = "M1", start: str = ""):
     camera = CameraSpec("rpi", Sensor(640, 480, 0.001))
     head = Head("a", name, 10.0, camera, {"t": Channel()})
     return store.create_series(head, TestField.build(["a"], np.zeros((1, 3))), start=start)
+
+
+def write_recording(path, head, testfield, epochs) -> None:
+    with RecordingWriter(path, head, testfield) as writer:
+        for epoch in epochs:
+            writer.append(epoch)
 
 
 def small_epoch(number: int, begin_s: float = 1e9, interval_s: float = 1.0) -> Epoch:

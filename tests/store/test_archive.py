@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import thermocald as tc
+from tests.store.small import write_recording
 from thermocald.epoch import Epoch
 from thermocald.store.database.archive import archive_series, archive_store
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.writer import write_recording
 from thermocald.store.series import clock_corrections
 
 

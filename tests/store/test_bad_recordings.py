@@ -110,6 +110,10 @@ def without_its_end(path) -> None:
 # a file, its damage, part of the message
 FILES = {
     "kelvin": ("epochs.csv", in_kelvin, r"kelvin: subtract 273\.15"),
+    "kelvin in every reading": (
+        "readings.csv", lambda path: path.write_text(
+            "time,temperature,board_temperature\n1600000000,20,294.5\n1600000001,20,294.6\n"),
+        r"line 2, column board_temperature: seems to be in kelvin"),
     "semicolons": (
         "epochs.csv", lambda path: path.write_text(path.read_text().replace(",", ";")),
         "separate the columns with commas"),

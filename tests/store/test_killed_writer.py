@@ -9,10 +9,10 @@ import signal
 import numpy as np
 import pytest
 
+from tests.store.small import write_recording
 from tests.store.test_kills import kill_one
 from thermocald.errors import RecordingError, StoreError, StoreFullError
 from thermocald.store.database.store import Store
-from thermocald.store.recording.writer import write_recording
 
 
 def test_a_killed_writer_loses_at_most_the_epoch_in_hand(forker, store_path, head, field):

@@ -215,6 +215,9 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
     [
         (GERMAN, {"clock": DeviceClock()}, "no time zone: give it with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
+        (b"Date;Time;T\n" + 9 * b"05/06/2026;10:00;21\n" + b"05/06/2026;10:;21\n", {}, "10:' is"),
+        (b"Time (EST/EDT),T\n2026-06-14 12:00,20\n", {}, "EST/EDT.*Berlin: give --log-timezone"),
+        (b"time;T\n05/06/2026 10:00;21\n05/06/2026 10:01+01:00;21\n", {}, "--date-order dmy or"),
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
         (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),
         (b"time,T (F)\n2026-06-14 12:00,20 C\n2026-06-14 12:01,20 C\n", {}, "at once.*--unit"),
@@ -334,12 +337,8 @@ def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
     assert DeviceClock().utc([moment + timedelta(seconds=1)], str) == JUNE + 1
 
 
-def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_path):
-    """Loggers stay on standard time in summer and state it; the photographs' zone differs."""
+def test_a_zone_that_is_given_for_the_logger_overrules_that_of_its_head(tmp_path):
     standard = HOBO.replace("GMT+02:00", "GMT+01:00")
-    log = logged(tmp_path, standard)
-    assert log.times.tolist() == [JUNE + 3600, JUNE + 3660]
-    assert any("the header gives the time zone GMT+01:00" in note for note in log.notes)
     forced = logged(tmp_path, standard, clock=DeviceClock(time_zone("+02:00"), forced=True))
     assert forced.times.tolist() == [JUNE, JUNE + 60]
     assert any("is used instead" in note for note in forced.notes)

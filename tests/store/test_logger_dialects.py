@@ -18,11 +18,11 @@ CELSIUS = [21.5 + 0.1 * i for i in range(12)]
 NEAR = (MOMENTS[0].timestamp(), MOMENTS[-1].timestamp())
 
 
-def read(path, head, row, unit=""):
+def read(path, head, row, unit="", zone="UTC"):
     """Read a log of a head and one row per moment, °C and number."""
     rows = [row(m, t, i) for i, (m, t) in enumerate(zip(MOMENTS, CELSIUS, strict=True))]
     path.write_bytes("\r\n".join([*head, *rows, ""]).encode())
-    options = LogOptions(clock=DeviceClock(zone=time_zone("UTC")), unit=unit or None)
+    options = LogOptions(clock=DeviceClock(zone=time_zone(zone)), unit=unit or None)
     return read_log(path, options, NEAR)
 
 
@@ -38,6 +38,22 @@ DIALECTS = {
                        lambda m, t, i: f"temp,{int(m.timestamp())}000000000,{t:.2f}"),
     "InfluxDB in µs": (["name,time,value"],
                        lambda m, t, i: f"temp,{int(m.timestamp())}000000,{t:.2f}"),
+    "HOBOconnect, in Eastern standard time": (
+        ["#,Date-Time (EST),Temperature (°F)"],
+        lambda m, t, i: f"{i + 1},{m - timedelta(hours=5):%m/%d/%Y %H:%M:%S},{1.8 * t + 32:.2f}"),
+    "a zone above the table": (
+        ["Elitech RC-5", "Time zone: UTC+08:00", "No.;Time;Temperature(°C)"],
+        lambda m, t, i: f"{i + 1};{m + timedelta(hours=8):%Y-%m-%d %H:%M:%S};{t:.2f}"),
+    "a compact date": (
+        ["No.,Date,Time,Temp °C"], lambda m, t, i: f"{i + 1},{m:%Y%m%d},{m:%H:%M:%S},{t:.2f}"),
+    "Excel in French": (
+        ["Date (UTC);Température"],
+        lambda m, t, i: f"{m.day} juil. {m:%Y %H:%M:%S};{t:.2f}".replace(".", ",").replace(
+            "juil,", "juil.")),
+    "Campbell TOA5, a mean": (
+        ['"TOA5","river","CR1000X"', '"TIMESTAMP","RECORD","BattV_Min","AirT_Avg","AirT_Max"',
+         '"TS","RN","Volts","Deg C","Deg C"', '"","","Min","Avg","Max"'],
+        lambda m, t, i: f'"{m:%Y-%m-%d %H:%M:%S}",{i},12.7,{t:.2f},{t + 1:.2f}'),
     "least, most and mean": (
         ["time,T max °C,T min °C,T avg °C"],
         lambda m, t, i: f"{int(m.timestamp())},{t + 0.5:.2f},{t - 0.5:.2f},{t:.2f}"),
@@ -51,6 +67,62 @@ def test_it_is_read_without_a_question(tmp_path, name):
     (values,) = found.channels.values()
     assert np.abs(values - CELSIUS).max() < 0.006
     assert not [note for note in found.notes if "doubtful" in note]
+
+
+@pytest.mark.parametrize(
+    ("head", "offset_h", "zone"),
+    [
+        ("Zeit (MEZ)", 1, "Europe/Berlin"),
+        ("timestamp_utc", 0, "Europe/Berlin"),
+        ("Time (EST/EDT)", -4, "America/New_York"),
+        ("Time (CST/CDT)", -5, "America/Chicago"),
+        ("Time (CST)", 8, "Asia/Shanghai"),
+        ("Time, GMT-03:30", -3.5, "Europe/Berlin"),
+        ("Time zone: (UTC+01:00) Berlin, Rome\r\nTime", 2, "Europe/Berlin"),
+    ],
+)
+def test_the_zone_in_the_head_of_the_times_is_theirs(tmp_path, head, offset_h, zone):
+    def row(m, t, i):
+        return f"{m + timedelta(hours=offset_h):%Y-%m-%d %H:%M:%S};{t:.2f}"
+
+    found = read(tmp_path / "log.csv", [f"{head};T °C"], row, zone=zone)
+    assert found.times.tolist() == [m.timestamp() for m in MOMENTS]
+    used = "(CST)" not in head and "Berlin" not in head
+    assert used == any("gives the time zone" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("head", ["time;RH %;T °C", "time;T °F"])
+def test_another_head_below_is_refused(tmp_path, head):
+    """A file of two logs: below the second head the columns are others."""
+
+    def row(m, t, i):
+        below = f"{head}\r\n" if i == 6 else ""
+        return f"{below}{m:%Y-%m-%d %H:%M:%S};{t:.2f}"
+
+    heads = ["time;T °C", *(f"2026-07-06 13:{i}:00;21.4" for i in range(30, 45))]
+    with pytest.raises(DataError, match="line 23: another head begins here"):
+        read(tmp_path / "log.csv", heads, row)
+    found = read(tmp_path / "log.csv", heads, lambda m, t, i: row(m, t, i).replace(head, heads[0]))
+    assert len(found.times) == 27
+
+
+def test_a_row_that_is_cut_off_is_left_out(tmp_path):
+    path = tmp_path / "log.csv"
+    read(path, ["time,T °C"], lambda m, t, i: f"{int(m.timestamp())},{t:.2f}")
+    path.write_bytes(path.read_bytes()[:-5])  # of 22.60 is left 22
+    found = read_log(path)
+    assert found.times.tolist() == [m.timestamp() for m in MOMENTS[:-1]]
+    assert "the last row is cut off" in found.notes[-1]
+
+
+def test_rows_without_seconds_are_doubtful(tmp_path):
+    found = read(
+        tmp_path / "log.csv",
+        ["time,T °C"],
+        lambda m, t, i: f"{START + timedelta(seconds=60 * (i // 6)):%Y-%m-%d %H:%M},{t}",
+    )
+    assert "doubtful: 10 rows with the time of the row before" in found.notes[-1]
+    assert "the times have no seconds" in found.notes[-1]
 
 
 @pytest.mark.parametrize("head", ["temp", "T1", "Sensor 1", "value"])

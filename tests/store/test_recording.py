@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.store.small import write_recording
 from tests.store.test_bad_recordings import set_field
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
@@ -18,7 +19,7 @@ from thermocald.store.recording import observation_file, parquet_table
 from thermocald.store.recording import reader as module
 from thermocald.store.recording.reader import open_recording, read_recording
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
-from thermocald.store.recording.writer import RecordingWriter, write_recording
+from thermocald.store.recording.writer import RecordingWriter
 
 
 def same(a: Observations, b: Observations) -> bool:

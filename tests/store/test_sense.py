@@ -208,6 +208,10 @@ DOUBTS = {
         lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store accepts it"),
     "an hour as the interval": (
         lambda p: head(p, "interval: 10.0", "interval: 3600"), "every 10 s"),
+    "a file that is cut off": (
+        lambda p: (p / "observations.csv").write_text(
+            (p / "observations.csv").read_text().partition("\n17,")[0] + "\n"),
+        "epochs have no observations: is the file cut off?"),
     "an epoch twice": (repeat_epoch, "1 epoch with the image points of another one: epoch 18"),
     "85.00 of a DS18B20": (
         lambda p: change(p, "epochs.csv", temperature=put("85.0", 12, 30, 31)),

@@ -226,7 +226,10 @@ def reprocess(
         tasks, what = find_series_tasks(sources, out, do), "series"
     work = calibrate_block if do == "calibrate" else partial(analyse, do, sets)
     with progress(len(tasks), what) as advance:
-        outcomes = run_tasks(work, tasks, engine, jobs, lambda _: advance(1))
+        outcomes = []
+        for outcome in run_tasks(work, tasks, engine, jobs):
+            outcomes.append(outcome)
+            advance(1)
     count, failed = len(outcomes), [o for o in outcomes if o.error]
     document: dict[str, Any]
     if do == "calibrate":

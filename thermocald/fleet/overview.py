@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.store.server.connection import ServerAddress
-    from thermocald.store.server.fleet_reader import StationState
 
     Findings = Iterator[tuple[str, str]]
 
@@ -56,7 +55,8 @@ def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[Fleet
         stations = reader.stations()
         cameras = reader.cameras(now, path)
     for camera in cameras:
-        _complete(camera, stations.get(camera.station), now)
+        camera.state = stations.get(camera.station, camera.state)
+        _complete(camera, now)
     return now, cameras
 
 
@@ -95,13 +95,12 @@ def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
     return types
 
 
-def _complete(camera: FleetCamera, state: StationState | None, now: float) -> None:
+def _complete(camera: FleetCamera, now: float) -> None:
     """Fill a camera's fields from its last epochs and its samples; now: s UTC."""
     recent = camera.recent
     reference = next(iter(camera.head.channels), "")
     known = [t for e in recent if math.isfinite(t := e.temperatures.get(reference, math.nan))]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
-    camera.state = state
     sensor = camera.head.camera.sensor
     # the model that the camera reports, else the size of its images and pixels
     model = str(camera.identity.get("model") or camera.identity.get("card") or "").strip()
@@ -197,7 +196,7 @@ def _late(camera: FleetCamera, now: float) -> Findings:
     if camera.lag_s > limit:
         since = f"no epoch for {short_duration(camera.lag_s)}"
         state = camera.state
-        if state is None:
+        if state.contact is None:
             why = "; its station has never reported"
         elif now - state.contact > _SILENT_S:
             ago = short_duration(now - state.contact)
@@ -207,7 +206,7 @@ def _late(camera: FleetCamera, now: float) -> Findings:
         else:
             why = ", though its station reports: check the camera and its daemon"
         yield "late", since + why
-    if camera.state is not None and camera.state.stores > 1:
+    if camera.state.stores > 1:
         text = (
             f"{camera.state.stores} stores report under its station's name, perhaps from a copied "
             "card; give each station its own name (forward.station)"
@@ -219,7 +218,7 @@ def _late(camera: FleetCamera, now: float) -> Findings:
             "or a backup was restored; move a copied card's store away, so that a new one is made"
         )
         yield "twins", text
-    if camera.state is not None and (count := camera.state.refused):
+    if count := camera.state.refused:
         yield "refused", f"the server refused {count} rows of its station; its log names them"
 
 
@@ -269,7 +268,7 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
         return
     if now - camera.last_ok > _OLD_S and camera.lag_s < _OLD_S:
         yield "calibrate", f"the last result is {short_duration(now - camera.last_ok)} old"
-    low, high = camera.range
+    low, high = camera.temperature_range or (math.nan, math.nan)
     outside = max(low - camera.temperature, camera.temperature - high)
     if outside > _OUTSIDE_K:
         text = (
@@ -306,7 +305,7 @@ def _odd(camera: FleetCamera, kind: dict[str, Any] | None) -> Findings:
 
 
 def _clock(camera: FleetCamera) -> Findings:
-    clock = camera.clock_s
+    clock = camera.state.clock
     if clock is not None and abs(clock) > _CLOCK_S:
         offset = f"{short_duration(abs(clock))} {'ahead of' if clock > 0 else 'behind'}"
         yield (

@@ -10,13 +10,14 @@ tried again first.
 
 from __future__ import annotations
 
+import logging
 import os
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +37,8 @@ from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 _ROUNDS = 3
 """How often a task is given to a cluster whose workers died during it."""
@@ -58,30 +60,19 @@ class Outcome:
 
 
 def run_tasks(
-    work: Callable[[Any], Outcome],
-    tasks: Sequence[Any],
-    engine: str = "local",
-    jobs: int = 1,
-    report: Callable[[Outcome], None] = lambda _: None,
-) -> list[Outcome]:
-    """Run all tasks and return their outcomes in the order of completion.
+    work: Callable[[Any], Outcome], tasks: Sequence[Any], engine: str = "local", jobs: int = 1
+) -> Iterator[Outcome]:
+    """Run all tasks and yield their outcomes in the order of completion.
 
     work: a module's function. engine: `local`, with `jobs` processes, or the address of a Dask
-    scheduler, `tcp://host:8786`, whose workers see the same files. report: called with each outcome
-    on completion. Raises UsageError, ServerGone.
+    scheduler, `tcp://host:8786`, whose workers see the same files. Raises UsageError, ServerGone.
     """
     do = partial(_attempt, work)
     if engine == "local":
-        done = map(do, tasks) if jobs == 1 else _processes(do, tasks, jobs)
-    elif "://" in engine:
-        done = _cluster(do, tasks, engine)
-    else:
-        raise UsageError(f"--engine {engine}: give `local` or a Dask scheduler's tcp://HOST:PORT")
-    outcomes = []
-    for outcome in done:
-        outcomes.append(outcome)
-        report(outcome)
-    return outcomes
+        return map(do, tasks) if jobs == 1 else _processes(do, tasks, jobs)
+    if "://" in engine:
+        return _cluster(do, tasks, engine)
+    raise UsageError(f"--engine {engine}: give `local` or a Dask scheduler's tcp://HOST:PORT")
 
 
 def _attempt(work: Callable[[Any], Outcome], task: Any) -> Outcome:
@@ -180,7 +171,14 @@ def find_series(sources: Sequence[Path]) -> dict[str, Path]:
 
 
 def _recordings(folder: Path) -> Iterator[tuple[tuple[str, str], Path]]:
-    for path in sorted({p.parent for p in folder.rglob("recording.yaml")}):
+    def unreadable(cause: OSError) -> None:
+        text = f"{cause.filename}: cannot be read: {cause.strerror}"
+        if cause.filename == str(folder):
+            raise DataError(text) from cause
+        log.warning("%s; recordings in it are left out", text)
+
+    below = os.walk(folder, onerror=unreadable)
+    for path in sorted(Path(place) for place, _, files in below if "recording.yaml" in files):
         head = read_head(path)
         yield (head.camera.name, head.series), path
 
@@ -190,7 +188,7 @@ def _at_server(address: Path) -> Iterator[tuple[tuple[str, str, str], Path]]:
         every = store.all_series()
     for one in every:
         parts = str(one.identity["station"]), one.camera, one.name
-        yield parts, ServerAddress.narrowed(address, *parts)
+        yield parts, ServerAddress.parse(address).narrowed(*parts)
 
 
 def find_blocks(
@@ -215,10 +213,9 @@ def calibrate_block(block: Block) -> Outcome:
     recording = open_recording(block.recording)
     camera = recording.camera
     calibrator = Calibrator.of_recording(recording, AdjustmentSettings(free=block.free))
-    epochs = [
-        calibrator.calibrate(epoch)
-        for epoch in islice(recording.iter_epochs(), block.first, block.stop)
-    ]
+    rows = recording.iter_epochs(slice(max(block.first - 1, 0), block.stop))
+    calibrator.begin_block(next(rows) if block.first else None)
+    epochs = list(map(calibrator.calibrate, rows))
     results = [EpochResult.from_adjustment(done.adjustment) for done in epochs]
     values = np.array([r.values for r in results])
     sds = np.array([r.sd for r in results])

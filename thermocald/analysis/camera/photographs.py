@@ -30,7 +30,7 @@ from thermocald.photogrammetry.network.common_interior import CommonInterior, ad
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import with_sds
-from thermocald.store.logger.photographs import find_copies, moment_taken
+from thermocald.store.logger.photographs import find_copies, known_photograph
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -74,8 +74,8 @@ class PhotographResult:
     @property
     def time(self) -> str | None:
         """The time in its EXIF data, or None."""
-        taken = moment_taken(Path(self.path))
-        return None if taken is None else taken.isoformat()
+        taken = known_photograph(Path(self.path))
+        return None if taken is None else taken.moment.isoformat()
 
     @property
     def n_rejected(self) -> int:

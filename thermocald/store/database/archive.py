@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, StoreError, UsageError
-from thermocald.files import make_folder, new_file, utc_stamp
+from thermocald.files import make_folder, utc_stamp, write_parts
 from thermocald.names import FileFolder
+from thermocald.result import csv_text
 from thermocald.store.database.store import Store
 from thermocald.store.recording.writer import RecordingWriter
 from thermocald.store.series import series_times
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
+    from thermocald.result import Columns
     from thermocald.store.series import StoredSeries
 
 
@@ -109,15 +110,15 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
     written: dict[str, Path] = {}
     for name, columns in channels.items():
         written[name] = folder / f"thermometer-{name}.csv"
-        with (
-            new_file(written[name]) as partial,
-            partial.open("w", encoding="utf-8", newline="") as file,
-        ):
-            rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(["time", "clock_trusted", *columns])
-            for reading in store.readings(name):
-                values = [reading.values.get(channel, "") for channel in columns]
-                rows.writerow([f"{reading.utc:.6f}", int(reading.clock_trusted), *values])
+        rows: Iterator[Columns] = (
+            {
+                "time": [f"{reading.utc:.6f}"],
+                "clock_trusted": [str(int(reading.clock_trusted))],
+                **{channel: [str(reading.values.get(channel, ""))] for channel in columns},
+            }
+            for reading in store.readings(name)
+        )
+        write_parts(written[name], csv_text(rows))
     return written
 
 

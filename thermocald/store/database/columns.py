@@ -30,7 +30,7 @@ from thermocald.errors import StoreError
 from thermocald.store.schema import EPOCH_NUMBERS, EPOCH_TEXTS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -91,18 +91,23 @@ def require_checksum(
         )
 
 
-def next_id(connection: sqlite3.Connection, table: str) -> int:
-    """Return the id of the next row; SQLite does not assign it, as the checksum covers it."""
-    (found,) = connection.execute(f"SELECT ifnull(max(id), 0) + 1 FROM {table}").fetchone()
+def last_id(connection: sqlite3.Connection, table: str) -> int:
+    """Return the id of the last row; 0 without rows."""
+    (found,) = connection.execute(f"SELECT ifnull(max(id), 0) FROM {table}").fetchone()
     return int(found)
 
 
-def insert_row(connection: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-    """Insert a row, given without its `checksum`, in the caller's transaction."""
+def insert_row(connection: sqlite3.Connection, table: str, **given: Any) -> int:
+    """Insert a row, given without `id` and `checksum`, in the caller's transaction; return its id.
+
+    SQLite does not assign the id, as the checksum covers it.
+    """
+    row = {"id": last_id(connection, table) + 1, **given}
     numbers, texts = ([row[name] for name in names] for names in KEPT[table])
     values = (*numbers, *texts, row_checksum(numbers, texts))
     if connection.execute(_INSERT[table], values).rowcount != 1:
         raise sqlite3.IntegrityError(f"a foreign trigger keeps rows out of {table}; drop it")
+    return int(row["id"])
 
 
 def examined_rows(
@@ -244,9 +249,9 @@ def insert_chunk(
     columns: dict[str, Array],
 ) -> None:
     """Write columns (n,) of the epochs from row `first_row` to number `last` as one chunk."""
-    last_id = next_id(connection, "epoch") - 1
+    written = last_id(connection, "epoch")
     rows = [
-        (series, name, first_row, last, last_id, values.tobytes())
+        (series, name, first_row, last, written, values.tobytes())
         for name, values in columns.items()
     ]
     connection.executemany(
@@ -315,14 +320,6 @@ class SeriesColumns:
             self._fill("number", numbers)
             _overwrite(columns, numbers, _columns(self._connection, late, ["number", *names]))
         return columns
-
-    def count_loose(self) -> int:
-        """Count the epochs that are in no chunk yet."""
-        (count,) = self._connection.execute(
-            "SELECT count(*) FROM epoch WHERE series_id = ? AND revision = 0 AND number > ?",
-            (self._series, self.last_number),
-        ).fetchone()
-        return int(count)
 
     def build(self) -> None:
         """Write chunks while there are enough rows, in the caller's transaction."""

@@ -36,7 +36,6 @@ from thermocald.store.database.columns import (
     checked_chunks,
     examined_rows,
     insert_row,
-    next_id,
     read_epochs,
     require_checksum,
     row_checksum,
@@ -185,10 +184,8 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     """Insert one epoch with its details, in the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
-    id_ = next_id(connection, "epoch")
-    parts = _detail_rows(epoch.number, id_, result.covariance, seen)
+    parts = _detail_parts(epoch.number, result.covariance, seen)
     row: dict[str, Any] = {
-        "id": id_,
         "series_id": series,
         "number": epoch.number,
         "revision": stored.revision,
@@ -212,24 +209,24 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
         **dict(zip(_SDS, result.sd.tolist(), strict=True)),
         "detail_checksum": row_checksum((), data=b"".join(data for _, data in parts)),
     }
-    insert_row(connection, "epoch", row)
-    kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts).rowcount
+    first = insert_row(connection, "epoch", **row) * _PARTS
+    details = [(first + part, data) for part, data in parts]
+    kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", details).rowcount
     if parts and kept != len(parts):
         raise sqlite3.IntegrityError("a foreign trigger keeps rows out of detail; drop it")
 
 
-def _detail_rows(
-    number: int, id_: int, covariance: Array | None, seen: Observations | None
+def _detail_parts(
+    number: int, covariance: Array | None, seen: Observations | None
 ) -> list[tuple[int, bytes]]:
-    """Return covariance and observations as rows of the table `detail`."""
-    first = id_ * _PARTS
-    parts = [] if covariance is None else [(first, pack_covariance(covariance))]
+    """Return covariance and observations as numbered parts of the table `detail`."""
+    parts = [] if covariance is None else [(0, pack_covariance(covariance))]
     if seen is not None:
         data = pack_observations(seen)
         cuts = range(0, len(data), _PART_BYTES)
         if len(cuts) >= _PARTS:
             raise StoreError(f"epoch {number}: {len(seen)} observations are too many to store")
-        parts += [(first + 1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
+        parts += [(1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
     return parts
 
 
@@ -489,7 +486,7 @@ def examine(connection: sqlite3.Connection) -> Examination:
 def whole_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
-    """Yield rows of a table in KEPT as `examined_rows` does.
+    """Yield rows of a table in KEPT as `examined_rows` does, without the file's checksums.
 
     An epoch also has `covariance` and `observations`, packed bytes or None.
     """
@@ -500,6 +497,8 @@ def whole_rows(
                 row |= {"covariance": covariance or None, "observations": observations or None}
             except StoreError as error:
                 row["damage"] = str(error)
+        del row["checksum"]
+        row.pop("detail_checksum", None)
         yield row
 
 

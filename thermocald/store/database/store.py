@@ -20,6 +20,7 @@ import numpy as np
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
+from thermocald.numbers import counted
 from thermocald.store.database import columns, epochs
 from thermocald.store.database.file import (
     Mode,
@@ -72,8 +73,6 @@ class Store(SeriesReader):
         self._file = file  # None if the caller holds the lock, or there is none
         self._lock = threading.RLock()
         self._unchunked: set[int] = set()  # series whose chunks cannot be built
-        # series → last epoch number, number of rows that are in no chunk
-        self._ends: dict[int, tuple[int | None, int]] = {}
 
     @classmethod
     def open(
@@ -244,18 +243,11 @@ class Store(SeriesReader):
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
         """Return up to `limit` rows of a growing table with ids above `after`, for a forwarder.
 
-        They are those of `database.epochs.whole_rows`, without the file's checksums.
+        They are those of `database.epochs.whole_rows`.
         """
         with self._reads(f"{table}s") as connection:
-            found = list(
-                epochs.whole_rows(
-                    connection, table, "WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
-                )
-            )
-        for row in found:
-            row.pop("checksum")
-            row.pop("detail_checksum", None)
-        return found
+            condition = "WHERE id > ? ORDER BY id LIMIT ?"
+            return list(epochs.whole_rows(connection, table, condition, (after, limit)))
 
     def frames_after(self, after: int, limit: int) -> list[epochs.KeptFrame]:
         """Return up to `limit` epochs with ids above `after` and their frames, for a forwarder."""
@@ -279,8 +271,7 @@ class Store(SeriesReader):
         tail = read_wal_tail(helper(self.path, "wal"))
         damaged = list(found.damaged)
         if tail.lost:
-            lost = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
-            lost = "all transactions" if tail.lost < 0 else lost
+            lost = "all transactions" if tail.lost < 0 else counted(tail.lost, "transaction")
             damaged.insert(0, f"the -wal file: {lost} in it cannot be read")
         found = replace(found, damaged=tuple(damaged), unfinished=tail.unfinished)
         if not found.damaged:
@@ -368,19 +359,15 @@ class Store(SeriesReader):
     def _append(self, series: StoredSeries, stored: StoredEpoch) -> None:
         epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not stored"):
-            last, loose = self._ends.get(series.id) or (
-                self.last_epoch(series), columns.SeriesColumns(self._db, series.id).count_loose()
-            )  # fmt: skip
+            last = self.last_epoch(series)
             if last is not None and epoch.number <= last:
                 raise StoreError(
                     f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
                     f"epoch {last}; numbers must increase"
                 )
             epochs.insert_epoch(self._db, series.id, stored)
-            full = loose + 1 >= columns.CHUNK
-            if full and series.id not in self._unchunked:
+            if series.id not in self._unchunked:
                 self._build_chunks(series)
-        self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
 
     def _build_chunks(self, series: StoredSeries) -> None:
         """Build chunks; if old rows are damaged, the series gets no more and is read from rows."""
@@ -419,24 +406,20 @@ class Store(SeriesReader):
     def add_event(self, event: Event) -> None:
         """Store an event."""
         with self._transaction("an event was not stored"):
-            row = {
-                "id": columns.next_id(self._db, "event"), "utc": event.utc,
-                "series_id": event.series, "epoch": event.epoch, "kind": event.kind,
-                "text": event.text, "data": epochs.to_json(event.data),
-            }  # fmt: skip
-            columns.insert_row(self._db, "event", row)
+            columns.insert_row(
+                self._db, "event", utc=event.utc, series_id=event.series, epoch=event.epoch,
+                kind=event.kind, text=event.text, data=epochs.to_json(event.data),
+            )  # fmt: skip
 
     def add_readings(self, readings: Sequence[LoggedReading]) -> None:
         """Store readings that belong to no epoch, in one transaction."""
         with self._transaction("readings were not stored"):
             for reading in readings:
-                row = {
-                    "id": columns.next_id(self._db, "reading"), "utc": reading.utc,
-                    "clock_trusted": int(reading.clock_trusted),
-                    "thermometer": reading.thermometer,
-                    "temperatures": epochs.to_json(reading.values),
-                }  # fmt: skip
-                columns.insert_row(self._db, "reading", row)
+                columns.insert_row(
+                    self._db, "reading", utc=reading.utc, thermometer=reading.thermometer,
+                    clock_trusted=int(reading.clock_trusted),
+                    temperatures=epochs.to_json(reading.values),
+                )  # fmt: skip
 
     def checkpoint(self) -> bool:
         """Move the -wal file into the store; return False if a reader or the disk prevents it."""

@@ -48,6 +48,14 @@ def time_zone(text: str) -> tzinfo:
         ) from None
 
 
+def stated_zones(text: str) -> dict[str, tzinfo]:
+    """Return the zones that a column's head names, such as GMT+01:00, UTC or EST and EDT."""
+    return {
+        name: time_zone(name) if name[-1].isdigit() else _zone(name.upper())
+        for name in _STATED_ZONE.findall(text)
+    }
+
+
 def clock_error(text: str) -> float:
     """Return by how many seconds a clock was ahead, from `+00:03:12`, `-12:30` or `+4.5` (s).
 
@@ -176,7 +184,17 @@ _TIME = (
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _COMPACT_TIME = r"(?P<ct>\d{6})(?:[.,]?(?P<cf>\d{1,9}))?"
-_ZONE = r"\s*(?P<zone>Z|UTC|GMT|CES?T|MES?Z|(?:UTC|GMT)?[+-]\d{2}:?\d{2}|[+-]\d{2})?"
+_ZONES_H = {
+    "Z": 0, "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "MEZ": 1, "CEST": 2,
+    "MESZ": 2, "EET": 2, "EEST": 3, "EST": -5, "EDT": -4, "CDT": -5, "MST": -7, "MDT": -6,
+    "PST": -8, "PDT": -7, "JST": 9, "AEST": 10, "AEDT": 11,
+}  # fmt: skip
+"""Zones by their letters; without CST, which China and America have."""
+_ZONE = rf"\s*(?P<zone>{'|'.join(_ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}:?\d{{2}}|[+-]\d{{2}})?"
+_STATED_ZONE = re.compile(
+    rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?::?\d{{2}})?"
+    rf"|(?:(?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in _ZONES_H if len(n) > 2)})(?![^\W_]))"
+)
 _FULL = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})[ T,;_-]+(?:{_TIME}|{_COMPACT_TIME}){_ZONE}")
 _ONLY_DATE = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})")
 _ONLY_TIME = re.compile(rf"{_TIME}{_ZONE}")
@@ -189,14 +207,14 @@ _NAMED_DATE = re.compile(
 _MONTHS = {
     name: number
     for number, names in enumerate(
-        ("jan", "feb", "mar mär mrz mrt", "apr", "may mai mei", "jun", "jul", "aug", "sep",
-         "oct okt", "nov", "dec dez"), 1)
+        ("jan ene gen", "feb fev fév fév", "mar mär mär mrz mrt", "apr avr abr", "may mai mei mag",
+         "jun juin giu", "jul juil lug", "aug aou aoû aoû ago", "sep set", "oct okt ott out", "nov",
+         "dec dez déc déc dic"), 1)
     for name in names.split()
 }  # fmt: skip
-"""Months by their first letters in English, German and Dutch."""
+"""Months by their first letters in six languages; those that begin with `jui` by four."""
 _WORD = re.compile(r"[A-Za-z]{3}")
 _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
-_ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
 _PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
 
 
@@ -254,7 +272,8 @@ def _month_to_number(text: str) -> str:
     found = _NAMED_DATE.fullmatch(text)
     if found is None:
         return text
-    month = _MONTHS.get((found["m1"] or found["m2"])[:3].lower())
+    word = (found["m1"] or found["m2"]).lower()
+    month = _MONTHS.get(word[:4]) or _MONTHS.get(word[:3])
     if month is None:
         return text
     day, year = int(found["d1"] or found["d2"]), found["y1"] or found["y2"]
@@ -287,14 +306,13 @@ def _time(found: re.Match[str]) -> time:
                 raise ValueError(f"{hour} {groups['half']} is not a time")
             hour = hour % 12 + (12 if groups["half"][0] in "Pp" else 0)
     micro = int(part.ljust(6, "0")[:6]) if part else 0
-    return time(hour, minute, second, micro, tzinfo=_zone(groups["zone"]))
+    zone = _zone(groups["zone"]) if groups["zone"] else None
+    return time(hour, minute, second, micro, tzinfo=zone)
 
 
-def _zone(text: str | None) -> timezone | None:
-    if not text:
-        return None
-    if text in _ZONES_H:
-        return timezone(timedelta(hours=_ZONES_H[text]))
+def _zone(text: str) -> tzinfo:
+    if not text[-1].isdigit():
+        return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT
     sign = -1 if "-" in text else 1
     digits = re.sub(r"\D", "", text)
     return timezone(sign * timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0)))

@@ -33,7 +33,7 @@ _TEMPERATURE_NAME = re.compile(
 )
 OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
-    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt"
+    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt|ros[ée]e|roc[ií]o|rugiada"
     r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
     # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
@@ -175,10 +175,7 @@ def find_date_order(
     if same:
         return "dmy", []
     if not orders:
-        spans: dict[str, list[datetime]] = {}
-        for order in ("dmy", "mdy"):
-            ends = [parse_moment(text, order) for text in (first, last)]
-            spans[order] = [e if isinstance(e, datetime) else datetime.now(UTC) for e in ends]
+        spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in _WORDS}
         if near is not None:
             far = {}
             for order, span in spans.items():
@@ -189,7 +186,8 @@ def find_date_order(
                 return order, [
                     f"log: {first!r} is {_WORDS[order]}: this puts the log near the photographs"
                 ]
-        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in spans.items()}
+        ends = {o: [moment.replace(tzinfo=None) for moment in span] for o, span in spans.items()}
+        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in ends.items()}
         order = min(lengths, key=lambda o: lengths[o])
         if max(lengths.values()) > _LONGER * lengths[order]:
             return order, [f"log: {first!r} is {_WORDS[order]}: this makes the rows consecutive"]
@@ -197,6 +195,14 @@ def find_date_order(
         f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: give "
         "--date-order dmy or mdy"
     )
+
+
+def _moment(file: LoggerFile, names: tuple[str, ...], text: str, order: str) -> datetime:
+    try:
+        found = parse_moment(text, order)
+    except ValueError as cause:
+        raise DataError(f"{file.path}, column {names[0]!r}: {cause}") from cause
+    return found if isinstance(found, datetime) else datetime.now(UTC)
 
 
 def find_temperature_columns(
@@ -210,21 +216,22 @@ def find_temperature_columns(
         for name in file.names
         if name not in times and _kind(file.column(name)) in ("number", "seconds")
     ]
-    named = [
-        n for n in numeric
-        if _TEMPERATURE_NAME.search(n) and not OTHER_NAME.search(n) and n not in wanted
-    ]  # fmt: skip
+    of_name = [n for n in numeric if _TEMPERATURE_NAME.search(n)]
+    plain = [n for n in of_name if not OTHER_NAME.search(n)]
+    # a mean is a reading unless it is one of another column
+    readings = tuple(n.lower() for n in plain)
+    of = {n: _MEAN.sub("", n).lower().lstrip(" _.-") for n in of_name if _MEAN.search(n)}
+    means = {n for n, o in of.items() if not OTHER_NAME.search(o) and not o.startswith(readings)}
+    named = [n for n in of_name if n in {*plain, *means} and n not in wanted]
     if wanted or named:
         return (*wanted, *named)
     others = [n for n in numeric if not OTHER_NAME.search(n) and n not in OUR_TIMES]
     if len(others) == 1:
         return (others[0],)
-    means = [n for n in numeric if _TEMPERATURE_NAME.search(n) and _MEAN.search(n)]
-    if len(means := [n for n in means if not OTHER_NAME.search(_MEAN.sub("", n))]) == 1:
-        return (means[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
     raise DataError(
-        f"{file.path}: which column is the temperature? Give --temperature-column NAME. {shown}"
+        f"{file.path}: which column is the temperature? Give --temperature-column NAME. "
+        f"{shown[:400]}"
     )
 
 
@@ -245,10 +252,10 @@ def _kind_of(value: str) -> str:
         if is_date_like(value):
             return "moment" if ":" in value else "date"
         return "number" if number else "text"
-    if number:
-        return "seconds" if isinstance(found, datetime) else "number"
     if isinstance(found, datetime):
-        return "moment"
+        return "seconds" if number else "moment"
+    if number and (isinstance(found, time) or not value.startswith("20")):  # 20260614 is a date
+        return "number"
     return "time" if isinstance(found, time) else "date"
 
 

@@ -89,6 +89,7 @@ _MOST_COLUMNS = 1000
 _SAMPLE = 400
 _CONSISTENT = 0.8
 _PREAMBLE = 12
+_ENDS = ("\n", "\r")
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
 _POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
@@ -105,7 +106,7 @@ class LoggerFile:
     """A table in a file: the names of its columns, and its detected form.
 
     first_line: line of the first row; sample: some rows from the beginning and the end; above: the
-    lines above the first row.
+    lines above the first row; is_cut: whether the last row is incomplete.
     """
 
     path: Path
@@ -116,6 +117,7 @@ class LoggerFile:
     decimal: str
     sample: tuple[tuple[str, ...], ...]
     above: tuple[str, ...] = ()
+    is_cut: bool = False
 
     @property
     def description(self) -> str:
@@ -135,7 +137,8 @@ class LoggerFile:
         """Yield each row with its line, with one field per name; missing ones are empty."""
         width = len(self.names)
         with self.path.open(encoding=self.encoding, errors="replace", newline="") as file:
-            for line, row in _parse_rows(self.path, file, self.separator):
+            lines = (text for text in file if text.endswith(_ENDS) or not self.is_cut)
+            for line, row in _parse_rows(self.path, lines, self.separator):
                 if line >= self.first_line:
                     yield line, _fit_width(row, width)
 
@@ -171,7 +174,6 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             "separator and decimal mark (--separator ';' --decimal ',')"
         )
     head = [row for _, row in start[:first]]
-    above = tuple(" ".join(row) for row in head)
     # if another head follows, the rows so far were statistics
     for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
         row, next_row = start[i][1], start[i + 1][1]
@@ -187,7 +189,16 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             f"{path}, line {start[first][0]}: the rows hold more fields than the head: are commas "
             "used both in numbers and between columns? Change one of them"
         )
-    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above)
+    above = tuple(" ".join(row) for _, row in start[:first])
+    is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
+    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above, is_cut)
+
+
+def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
+    """Return whether the last number of the last row has fewer decimals than any above it."""
+    column = max(i for i, field in enumerate(rows[-1]) if field)
+    *others, last = (len(row[column].partition(decimal)[2]) for row in rows if row[column])
+    return last < min(others, default=0)
 
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:

@@ -32,7 +32,7 @@ from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.logger.clock import iso, parse_moment
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import EpochColumns, Recording
+from thermocald.store.recording.reader import LARGEST_GAP, EpochColumns, Recording
 from thermocald.store.recording.sense import doubt_lines, pitch_doubts, time_fault
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -202,28 +202,17 @@ def strange_photographs(paths: Sequence[Path]) -> list[str]:
             f"{counted(len(copies), 'frame')} copied from another one, the first "
             f"{there[copy].name} from {there[original].name}"
         )
-    known = []
-    for path in there:
-        with suppress(DataError, DriverMissing, ImageError):
-            known.append(read_photograph(path))
+    known = [photograph for path in there if (photograph := known_photograph(path))]
     if len(known) > 1 and (other := other_camera(known)):
         found.append(other)
     return found
 
 
-def moment_taken(path: Path) -> datetime | None:
-    """Return the time of a photograph from its EXIF, or None."""
+def known_photograph(path: Path, source: str = "exif") -> Photograph | None:
+    """Return what `read_photograph` returns, or None where it would raise."""
     try:
-        return read_photograph(path).moment
+        return read_photograph(path, source)
     except (DataError, DriverMissing, ImageError):
-        return None
-
-
-def focal_length(path: Path) -> float | None:
-    """Return the focal length of a photograph from its EXIF, mm, or None."""
-    try:
-        return read_photograph(path, "file").focal_length
-    except (DriverMissing, ImageError):
         return None
 
 
@@ -289,9 +278,6 @@ def _positive(value: Any) -> float | None:
     return number if 0 < number < 1e6 else None
 
 
-_LARGEST_GAP_IN_INTERVALS = 10.0
-
-
 def read_series(
     photographs: Sequence[Photograph],
     clock: DeviceClock,
@@ -311,10 +297,9 @@ def read_series(
     pitch, distance mm: used instead of EXIF's. Raises DataError for photographs of different sizes
     or cameras, for times without a zone, and if log and photographs do not overlap in time.
     """
-    sizes = {(p.width, p.height) for p in photographs}
-    if len(sizes) > 1:
-        one = photographs[0]
-        other = next(p for p in photographs if (p.width, p.height) != (one.width, one.height))
+    one = photographs[0]
+    size = one.width, one.height
+    if other := next((p for p in photographs if (p.width, p.height) != size), None):
         raise DataError(
             f"{other.path}: has {other.width} × {other.height} px, {one.path.name} "
             f"{one.width} × {one.height}: a recording has one camera in one position; import "
@@ -351,8 +336,7 @@ def read_series(
         )
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
     _require_overlap(times, logged.times)
-    row = _nearest_rows(times, logged.times)
-    near, row = row >= 0, np.maximum(row, 0)
+    row, near = _nearest_rows(times, logged.times)
     channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
     columns = EpochColumns(
         np.arange(1, len(times) + 1), times, np.where(near, logged.times[row], np.nan), channels,
@@ -400,13 +384,12 @@ def _require_overlap(frames: Array, log: Array) -> None:
     )
 
 
-def _nearest_rows(frames: Array, log: Array) -> NDArray[np.int64]:
-    """Return the row of the log nearest to each frame, -1 if it is over ten intervals away."""
+def _nearest_rows(frames: Array, log: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the row of the log nearest to each frame, and whether it is within ten intervals."""
     right = np.clip(np.searchsorted(log, frames), 1, len(log) - 1)
     left = right - 1
     row = np.where(frames - log[left] <= log[right] - frames, left, right)
-    far = np.abs(log[row] - frames) > _LARGEST_GAP_IN_INTERVALS * np.median(np.diff(log))
-    return np.where(far, -1, row).astype(np.int64)
+    return row, np.abs(log[row] - frames) <= LARGEST_GAP * np.median(np.diff(log))
 
 
 def _camera_of(

@@ -18,7 +18,12 @@ import numpy as np
 from thermocald.errors import DataError
 from thermocald.names import channel_fault
 from thermocald.numbers import column_label, counted
-from thermocald.store.logger.clock import DeviceClock, parse_moment, time_zone, whole_seconds
+from thermocald.store.logger.clock import (
+    DeviceClock,
+    parse_moment,
+    stated_zones,
+    whole_seconds,
+)
 from thermocald.store.logger.columns import (
     OTHER_NAME,
     LogOptions,
@@ -30,6 +35,7 @@ from thermocald.store.logger.columns import (
 )
 from thermocald.store.logger.dialect import (
     OUR_TIMES,
+    TIME_NAME,
     UNIT_BEHIND,
     LoggerFile,
     open_log,
@@ -45,7 +51,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-_HEADER_ZONE = re.compile(r"(?:GMT|UTC)\s*[+-]\s*\d{1,2}(?::?\d{2})?", re.IGNORECASE)
+_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNORECASE)
+"""A line above the table that states the time zone; cities behind it may have summer time."""
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
 """Lines above a table that state °F."""
@@ -54,11 +61,12 @@ _LABEL = "entity_id"
 _CHANGES = "last_changed"
 """Home Assistant's column of times: it writes a row when the value changes, and only then."""
 _PAUSE, _LONGEST_PAUSE_S = 5.0, 86400.0  # of the usual interval: a longer one is a pause
-_NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
+_NO_READING = {-127.0, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
+_MOST_REPEATED = 0.1  # of the rows
 
 
 def read_log(
@@ -71,7 +79,8 @@ def read_log(
     options = options or LogOptions()
     file = open_log(path, options.separator, options.decimal)
     time_names = find_time_columns(file, options)
-    clock, notes = _apply_header_zone(options.clock, " ".join(time_names))
+    lines = [found[1] for line in file.above if (found := _ZONE_LINE.search(line))]
+    clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
     table = _Table(file, time_names, names, order)
@@ -113,7 +122,12 @@ def read_log(
     ]  # fmt: skip
     times, channels, repeated = _sort_by_time(times, channels)
     if repeated:
-        notes.append(f"log: {counted(repeated, 'row')} with the time of the row before: left out")
+        text = f"{counted(repeated, 'row')} with the time of the row before: left out"
+        without = "; the times have no seconds: take the logger's own file, not a spreadsheet's"
+        rough = (
+            repeated > _MOST_REPEATED * len(steps) and not (times % 60).any() and steps.min() >= 0
+        )
+        notes.append(f"doubtful: {text}{without}" if rough else f"log: {text}")
     return TemperatureLog(times, channels, tuple(notes))
 
 
@@ -184,13 +198,20 @@ class _Table:
         columns = [(name, file.names.index(name)) for name in self.names]
         label = file.names.index(_LABEL) if _LABEL in file.names else None
         bare = set(self._time_names) <= set(OUR_TIMES)
+        head = 0
         for line, row in file.rows():
             text = " ".join(row[place] for place in self._places)
             seconds = _as_seconds(text) if bare else None
             moment = None if seconds is not None else self._moment(line, text)
             if seconds is None and moment is None:
                 self._untimed.append((line, text))
+                head = line if self._is_other_head(row) else head
                 continue
+            if head:
+                raise DataError(
+                    f"{file.path}, line {head}: another head begins here, and columns may differ "
+                    "from it on: make a file of each part"
+                )
             if moment is not None:
                 self._dated[len(self._seconds)] = moment
             self._seconds.append(np.nan if seconds is None else seconds)
@@ -199,6 +220,13 @@ class _Table:
                 self.values[name].append(self._value(line, name, row[place]))
             if label is not None:
                 self.labels.append(row[label])
+
+    def _is_other_head(self, row: list[str]) -> bool:
+        """Return whether a row without a time names columns, but not those of the head."""
+        text = " ".join(row).strip()
+        named = any(TIME_NAME.search(row[place]) for place in self._places)
+        above = any(line.startswith(text) for line in self.file.above)
+        return named and not above and not re.search(r"\d:\d\d", text)
 
     def where(self, row: int) -> str:
         """Return a row's place in the file for messages."""
@@ -220,6 +248,8 @@ class _Table:
                 f"log: {counted(len(self._untimed), 'row')} without a time: left out (line {line}: "
                 f"{text[:30]!r})"
             )
+        if self.file.is_cut:
+            notes.append("log: the last row is cut off (no line end, fewer digits): left out")
         for name, words in self._words.items():
             if words:
                 shown = ", ".join(repr(word) for word, _ in words.most_common(3))
@@ -278,15 +308,23 @@ def _as_seconds(text: str) -> float | None:
 
 def _apply_header_zone(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
     """Return the logger's clock with the zone in the head of its times, and notes."""
-    stated = _HEADER_ZONE.search(header)
-    if stated is None:
+    stated = stated_zones(header)
+    if not stated:
         return clock, []
+    note = f"log: the header gives the time zone {'/'.join(stated)}"
     if clock.forced:
-        note = "the one given for the logger is used instead"
-        return clock, [f"log: the header gives the time zone {stated[0]}; {note}"]
-    # takes precedence over --timezone, which is for times without a zone
-    zoned = replace(clock, zone=time_zone(stated[0]))
-    return zoned, [f"log: the header gives the time zone {stated[0]}"]
+        return clock, [f"{note}; the one given for the logger is used instead"]
+    offsets = {zone.utcoffset(None) for zone in stated.values()}
+    if len(offsets) == 1:
+        # takes precedence over --timezone, which is for times without a zone
+        return replace(clock, zone=next(iter(stated.values()))), [note]
+    seasons = [datetime(2026, month, 1, tzinfo=clock.zone) for month in (1, 7)]
+    if clock.zone is not None and {moment.utcoffset() for moment in seasons} != offsets:
+        raise DataError(
+            f"{'/'.join(stated)} in the head of the log's times is not the time zone {clock.zone}: "
+            "give --log-timezone, such as --log-timezone America/New_York"
+        )
+    return clock, [note]
 
 
 def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[str, Array]:

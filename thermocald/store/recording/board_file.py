@@ -49,11 +49,12 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
     34_25_DICT_5X5.pdf`: 8 rows of 11 squares of 34 mm). Raises TestFieldError naming file and key.
     """
     named = _CALIB_IO.fullmatch(path.name)
-    if named is not None:
-        return _of_calib_io(path, named, sigma)
     # keys are compared in a plain form: `Square_Length_mm` → `squarelength`
-    plain = {re.sub(r"[^a-z0-9]", "", k.lower().removesuffix("_mm")): v
-             for k, v in read_yaml(path, TestFieldError).items()}  # fmt: skip
+    plain = _keys_in_name(path, named) if named else {
+        re.sub(r"[^a-z0-9]", "", k.lower().removesuffix("_mm")): v
+        for k, v in read_yaml(path, TestFieldError).items()
+    }  # fmt: skip
+    whose = "calib.io's" if named else "a"
     board = _Reader(path, plain)
     kind = str(plain.get("targettype", plain.get("type", ""))).lower()
     if not kind and any(k in plain for k in _SYNONYMS["dictionary"]):
@@ -82,7 +83,7 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
             if {"squaresx", "numsquaresx"} & set(plain):  # one more than corners
                 columns, rows = columns - 1, rows - 1
             field = boards.chessboard(columns, rows, square, sigma=sigma)
-            return field, f"a chessboard of {columns} × {rows} inner corners, {square:g} mm"
+            return field, f"{whose} chessboard of {columns} × {rows} inner corners, {square:g} mm"
         marker = board.length("marker")
         key = board.find_key("dictionary")
         if plain.get(key) is None:
@@ -91,7 +92,7 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
         field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
         return field, (
-            f"a ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
+            f"{whose} ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
             f"{marker:g} mm of {name}"
         )
     wrong = f"{kind!r} is unknown" if kind else "is missing"
@@ -119,30 +120,21 @@ class _Reader(QuantityReader):
         return 1e3 * length if length < 1 else length
 
 
-def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple[TestField, str]:
-    """Return the board that a file's name describes."""
-    kind, rows, columns = named[1].lower(), int(named[2]), int(named[3])
-    square = float(named[4])
-    if kind == "checker":
-        field = boards.chessboard(columns - 1, rows - 1, square, sigma=sigma)
-        return field, (
-            f"calib.io's checkerboard of {columns - 1} × {rows - 1} inner corners, {square:g} mm"
-        )
+def _keys_in_name(path: Path, named: re.Match[str]) -> dict[str, Any]:
+    """Return the keys of the board that a file's name describes."""
+    keys = {"type": named[1].lower(), "squaresx": int(named[3]), "squaresy": int(named[2]),
+            "square": float(named[4])}  # fmt: skip
+    if keys["type"] == "checker":
+        return keys
     if named[5] is None or named[6] is None:
         raise TestFieldError(
-            f"{path}: the name does not describe the markers; give --charuco {columns}x{rows} "
-            f"--square {square:g} with --marker and --dictionary"
+            f"{path}: the name does not describe the markers; give --charuco "
+            f"{named[3]}x{named[2]} --square {named[4]} with --marker and --dictionary"
         )
     # the smaller dictionaries of a marker size are the first markers of the largest
     name = named[6].upper()
     name = name if name.count("_") > 1 else f"{name}_1000"
-    field = boards.charuco(
-        columns, rows, square, float(named[5]), _dictionary(path, name), sigma=sigma
-    )
-    return field, (
-        f"calib.io's ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
-        f"{float(named[5]):g} mm of {name}"
-    )
+    return {**keys, "marker": float(named[5]), "dictionary": name}
 
 
 def _dictionary(path: Path, value: Any) -> str:

@@ -125,13 +125,12 @@ class ObservationFile:
             whole = whole.rows(np.argsort(whole.epochs, kind="stable"))
         return whole
 
-    def stream(self, window: slice | None = None) -> Iterator[Observations]:
-        """Yield the observations of each epoch of epochs.csv, in constant memory.
+    def stream(self, window: slice) -> Iterator[Observations]:
+        """Yield the observations of the epochs in a window of epochs.csv, in constant memory.
 
-        window: only these epochs. Raises RecordingError if the rows are not in the order of their
-        epochs.
+        Raises RecordingError if the rows are not in the order of their epochs.
         """
-        for rows, first, stop in self._blocks(None if window is None else [window], self._quality):
+        for rows, first, stop in self._blocks([window], self._quality):
             self._refuse_duplicates(rows)
             for epoch in range(first, stop):
                 yield rows.of_epoch(epoch)

@@ -14,9 +14,8 @@ import hashlib
 import logging
 import os
 import shutil
-import tempfile
 import time
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
 
 REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 _ROWS = 1 << 18
-_MOST_COLUMNS = 200
 
 log = logging.getLogger(__name__)
 
@@ -55,25 +53,18 @@ class ParquetTable(Table):
     """
 
     seeks = True
+    _head, _most_columns = "", 200
 
     def __init__(self, path: Path, required: Sequence[str], original: Table | None = None) -> None:
-        parquet = _pyarrow().parquet
-        self.path = path
+        super().__init__(path, required)
         self._original = original
+
+    def _header(self) -> list[str]:
+        parquet = _pyarrow().parquet
         try:
-            schema = parquet.read_schema(path)
+            return list(parquet.read_schema(self.path).names)
         except (OSError, ValueError) as cause:
-            raise RecordingError(f"{path}: is not readable as Parquet: {cause}") from cause
-        self.columns: list[str] = list(schema.names)
-        if len(self.columns) > _MOST_COLUMNS:
-            raise RecordingError(
-                f"{path}: has {len(self.columns)} columns; at most {_MOST_COLUMNS} are read"
-            )
-        for name in required:
-            if name not in self.columns:
-                raise RecordingError(
-                    f"{path}: column {name} is missing; found: {', '.join(self.columns)[:200]}"
-                )
+            raise RecordingError(f"{self.path}: is not readable as Parquet: {cause}") from cause
 
     def chunks(
         self,
@@ -131,10 +122,8 @@ class ColumnChunk(Chunk):
         empty = np.asarray(column.is_null())
         values: Array = column.cast(_pyarrow().float64(), safe=False).to_numpy(zero_copy_only=False)
         wrong = ~np.isfinite(values) & ~(empty & empty_is_nan)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            self.fail(row, name, "is empty; a number is required" if empty[row]
-                      else f"{values[row]} is not a finite number")  # fmt: skip
+        self.check(name, wrong, lambda row: "is empty; a number is required" if empty[row]
+                   else f"{values[row]} is not a finite number")  # fmt: skip
         return values
 
     def is_number(self, name: str) -> bool:
@@ -184,24 +173,16 @@ def parse_once(table: Table) -> Table:
         return ParquetTable(copy, REQUIRED, table)
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
-    except (OSError, ValueError, RecordingError) as cause:  # pyarrow raises the first two
+    except (OSError, RuntimeError, ValueError, RecordingError) as cause:  # pyarrow, or no home
         log.debug("%s has no binary copy: %s", table.path, cause)
     return table
 
 
 def _cache() -> Path:
-    """Return the folder of copies, which must be this user's own; OSError if it is not."""
-    with suppress(OSError, RuntimeError):
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        folder = Path(base) / "thermocald"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    folder = Path(tempfile.gettempdir()) / f"thermocald-{os.geteuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    owner = folder.lstat()
-    if folder.is_symlink() or owner.st_uid != os.geteuid() or owner.st_mode & 0o077:
-        raise OSError(f"{folder} is not this user's own")
+    """Return the folder of copies, made if needed; OSError or RuntimeError if it cannot be."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "thermocald"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     return folder
 
 
@@ -238,18 +219,15 @@ def _number_columns(table: Table) -> list[str]:
 def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
     """Write columns, given in parts, to a Parquet file."""
     pyarrow = _pyarrow()
-    with ExitStack() as opened:
-        writer = None
-        for columns in batches:
-            batch = pyarrow.table(dict(columns))
-            if writer is None:
-                words = [f.name for f in batch.schema if f.type == pyarrow.string()]
-                writer = opened.enter_context(
-                    pyarrow.parquet.ParquetWriter(
-                        path, batch.schema, compression="zstd", use_dictionary=words
-                    )
-                )
-            writer.write_table(batch)
+    tables = (pyarrow.table(dict(columns)) for columns in batches)
+    if (first := next(tables, None)) is None:
+        return
+    words = [f.name for f in first.schema if f.type == pyarrow.string()]
+    with pyarrow.parquet.ParquetWriter(
+        path, first.schema, compression="zstd", use_dictionary=words
+    ) as writer:
+        for table in chain([first], tables):
+            writer.write_table(table)
 
 
 def write_parquet(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:

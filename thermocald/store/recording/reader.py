@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
 READINGS = "readings.csv"
 """The file with every reading of a log, in a recording of frames and a separate log."""
-_LARGEST_GAP_IN_INTERVALS = 10.0
-_AT_ONCE = 100_000  # frames: a year of them must fit into memory
+LARGEST_GAP = 10.0  # of readings, in their usual intervals
 _KELVIN_FROM = 220.0  # as °C hotter than any camera, as K colder than any day
 _STRETCH = 8192  # readings in a row that are tested for kelvin: a part of a log may be in K
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
@@ -141,16 +140,19 @@ class Recording:
         rows = self._observation_file.load()
         return [self._epoch(i, rows.of_epoch(i)) for i in range(len(self))]
 
-    def iter_epochs(self) -> Iterator[Epoch]:
-        """Yield the epochs; a long recording (`is_long`) is read in constant memory.
+    def iter_epochs(self, window: slice = slice(None)) -> Iterator[Epoch]:
+        """Yield the epochs, or some of them (from 0).
 
-        The rows of its observations must be in the order of the epochs.
+        A long recording (`is_long`) is read in constant memory; the rows of its observations must
+        be in the order of the epochs.
         """
         if "epochs" in self.__dict__ or (self.has_observations and not self.is_long):
-            yield from self.epochs
+            yield from self.epochs[window]
             return
-        seen = self._observation_file.stream() if self.has_observations else repeat(None)
-        for i, observations in zip(range(len(self)), seen, strict=False):
+        rows = range(len(self))[window]
+        part = slice(rows.start, rows.stop)
+        seen = self._observation_file.stream(part) if self.has_observations else repeat(None)
+        for i, observations in zip(rows, seen, strict=False):
             yield self._epoch(i, observations)
 
     def _epoch(self, i: int, observations: Observations | None) -> Epoch:
@@ -207,9 +209,10 @@ class Recording:
             )
         if self.has_observations and not self.is_long:
             first: dict[bytes, int] = {}
-            twice = []
+            twice, last = [], 0
             for epoch in self.epochs:
                 if (o := epoch.observations) is not None and len(o):
+                    last = epoch.number
                     same = first.setdefault(o.targets.tobytes() + o.points.tobytes(), epoch.number)
                     twice += [(epoch.number, same)] if same != epoch.number else []
             if twice:
@@ -217,6 +220,8 @@ class Recording:
                     f"{counted(len(twice), 'epoch')} with the image points of another one: epoch "
                     f"{twice[0][0]} those of {twice[0][1]}"
                 )
+            if (none := int((columns.numbers > last).sum())) > 1:
+                found.append(f"the last {none} epochs have no observations: is the file cut off?")
         return found
 
     def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:
@@ -301,12 +306,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         values = found[name]
         untimed = np.isfinite(values) & np.isnan(temperature_time)
         table.check("temperature_time", untimed, f"is empty although {name} was read")
-        table.check(name, values < -273.15, "is below absolute zero")
-        table.check(name, values > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
-        for rows in runs(len(values), _STRETCH):
-            known = rows.start + np.flatnonzero(np.isfinite(values[rows]))
-            if len(known) and values[known].min() > _KELVIN_FROM:
-                table.fail(int(known[0]), name, "seems to be in kelvin: subtract 273.15 to give °C")
+        _check_celsius(table, name, values)
     frames = tuple(map(str.strip, found["frame"]))
     files = FileFolder(folder)
     for row, frame in enumerate(frames):
@@ -330,6 +330,16 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     )
 
 
+def _check_celsius(table: Table, name: str, values: Array) -> None:
+    """Raise the table's error for a temperature (n,) °C that no camera has."""
+    table.check(name, values < -273.15, "is below absolute zero")
+    table.check(name, values > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
+    for rows in runs(len(values), _STRETCH):
+        known = rows.start + np.flatnonzero(np.isfinite(values[rows]))
+        if len(known) and values[known].min() > _KELVIN_FROM:
+            table.fail(int(known[0]), name, "seems to be in kelvin: subtract 273.15 to give °C")
+
+
 def _read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     """Read a `readings.csv`. Raises RecordingError naming line and column."""
     table = Table(path, ["time", *channels])
@@ -339,7 +349,7 @@ def _read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     if fault := time_fault(times):
         table.fail(fault[0], "time", fault[1])
     for name, values in columns.items():
-        table.check(name, values < -273.15, "is below absolute zero")
+        _check_celsius(table, name, values)
     return TemperatureLog(times, {name: columns.get(name, np.empty(0)) for name in channels})
 
 
@@ -365,16 +375,11 @@ def interpolate_readings(
         only = float(values[0]) if len(values) else np.nan
         return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))
-    gap = _LARGEST_GAP_IN_INTERVALS * interval
-    result = np.empty(frames.shape)
-    for first in range(0, len(frames), _AT_ONCE):
-        at = frames[first : first + _AT_ONCE]
-        left = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
-        span = times[left + 1] - times[left]
-        slope = (values[left + 1] - values[left]) / span
-        part = values[left] + slope * (at - times[left])
-        outside = np.maximum(times[0] - at, at - times[-1])
-        on_reading = (at == times[left]) | (at == times[left + 1])
-        part[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
-        result[first : first + _AT_ONCE] = part
+    left = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
+    span = times[left + 1] - times[left]
+    result: Array = values[left] + (values[left + 1] - values[left]) / span * (frames - times[left])
+    outside = np.maximum(times[0] - frames, frames - times[-1])
+    on_reading = (frames == times[left]) | (frames == times[left + 1])
+    gap = LARGEST_GAP * interval
+    result[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
     return result

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 
 _MAX_EXACT_INTEGER = 2**53
-_MOST_COLUMNS = 1000
 _LONGEST_HEADER = 200_000
 _LEFT_EMPTY = "; leave the field empty if there is none"
 
@@ -40,6 +39,7 @@ class Table:
     """
 
     seeks = False
+    _head, _most_columns = ", line 1", 1000
 
     def __init__(
         self,
@@ -52,6 +52,13 @@ class Table:
         self._text = text
         self._error = error
         self.columns = self._header()
+        if (count := len(self.columns)) > self._most_columns:
+            raise error(
+                f"{path}{self._head}: has {count} columns; at most {self._most_columns} are read"
+            )
+        for name in self.columns:
+            if name and self.columns.count(name) > 1:
+                raise error(f"{path}{self._head}: column {name!r} is duplicated")
         for name in required:
             if name not in self.columns:
                 raise error(self._missing(name))
@@ -139,8 +146,9 @@ class Table:
             if self.path.exists() and not self.path.is_file():
                 raise self._error(f"{self.path}: is not a file")
             return self.path.open(newline="", encoding="utf-8-sig")
-        except OSError as cause:
-            raise self._error(f"{self.path}: cannot be read: {cause.strerror}") from cause
+        except (OSError, ValueError) as cause:  # ValueError: a NUL character in the path
+            why = getattr(cause, "strerror", cause)
+            raise self._error(f"{self.path}: cannot be read: {why}") from cause
 
     def _header(self) -> list[str]:
         with self._open() as file:
@@ -155,15 +163,7 @@ class Table:
                 raise self._unreadable(1, cause) from cause
         if header is None:
             raise self._error(f"{self.path}: is empty; the first line must name the columns")
-        names = [name.strip() for name in header]
-        if len(names) > _MOST_COLUMNS:
-            raise self._error(
-                f"{self.path}, line 1: has {len(names)} columns; at most {_MOST_COLUMNS} are read"
-            )
-        for name in names:
-            if name and names.count(name) > 1:
-                raise self._error(f"{self.path}, line 1: column {name!r} is duplicated")
-        return names
+        return [name.strip() for name in header]
 
     def _unreadable(self, line: int, cause: Exception) -> ThermocaldError:
         if isinstance(cause, UnicodeDecodeError):
@@ -177,7 +177,7 @@ class Table:
             hint = "; separate the columns with commas and write decimals with a point"
         elif near := [c for c in self.columns if re.split(r"\W", c.lower())[0] == name.lower()]:
             hint = f"; is {near[0]!r} meant? Write {name}, without a unit, in these letters"
-        return f"{self.path}, line 1: column {name} is missing; found: {found[:200]}{hint}"
+        return f"{self.path}{self._head}: column {name} is missing; found: {found[:200]}{hint}"
 
     def _line(self, row: int) -> int:
         """Count the lines of the file up to a row: quoted fields may span several."""
@@ -227,25 +227,19 @@ class Chunk:
             values = np.array(
                 [self._number(i, name, text, empty_is_nan) for i, text in enumerate(column)]
             )
-            wrong = ~np.isfinite(values)
-            if empty_is_nan:
-                wrong &= np.array([bool(text.strip()) for text in column])
-        else:
-            wrong = ~np.isfinite(values)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            self.fail(
-                row, name, f"{column[row]!r} is not a finite number" + _LEFT_EMPTY * empty_is_nan
-            )
+        wrong = ~np.isfinite(values)
+        if empty_is_nan and wrong.any():
+            wrong &= np.array([bool(text.strip()) for text in column])
+        hint = _LEFT_EMPTY * empty_is_nan
+        self.check(name, wrong, lambda row: f"{column[row]!r} is not a finite number{hint}")
         return values
 
     def integers(self, name: str) -> NDArray[np.int64]:
         """Return a column as (n,) integers that are not negative."""
         values = self.numbers(name)
         wrong = (values != np.floor(values)) | (values < 0) | (values >= _MAX_EXACT_INTEGER)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            self.fail(row, name, f"{self.text(name)[row]!r} is not an integer of at least 0")
+        text = self.text
+        self.check(name, wrong, lambda row: f"{text(name)[row]!r} is not an integer of at least 0")
         return values.astype(np.int64)
 
     def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:

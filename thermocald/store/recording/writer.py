@@ -8,8 +8,6 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Self
 
-import numpy as np
-
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
@@ -19,10 +17,10 @@ from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
     from typing import Any, TextIO
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
@@ -184,23 +182,15 @@ class RecordingWriter:
             )
         if added := [name for name in columns if name not in self._columns]:
             self._add_columns(added)
-        forms: list[str] = []
-        values: list[list[Any]] = [[_quoted(self._field.names[i]) for i in seen.targets.tolist()]]
-        for name in self._columns:
-            if name not in columns:
-                forms.append(_ABSENT.get(name, ""))
-                continue
-            column = columns[name]
-            if (known := np.isfinite(column)).all():
-                forms.append("%.5f" if name in ("x", "y") else "%.6g")
-                values.append(column.tolist())
-            else:
-                forms.append("%s")
-                values.append(np.where(known, np.char.mod("%.6g", column), "").tolist())
-        # one format for the whole epoch: three times as fast as csv.writer row by row
-        line = ",".join([f"{number},%s", *forms]) + "\n"
-        rows = zip(*values, strict=True)
-        self._observations.write((line * len(seen)) % tuple(value for row in rows for value in row))
+        names = [self._field.names[i] for i in seen.targets.tolist()]
+        cells = [
+            [_number(v, ".5f" if name in ("x", "y") else ".6g") for v in columns[name].tolist()]
+            if name in columns
+            else [_ABSENT.get(name, "")] * len(seen)
+            for name in self._columns
+        ]
+        rows = csv.writer(self._observations, lineterminator="\n")
+        rows.writerows(zip([number] * len(seen), names, *cells, strict=True))
 
     def _add_columns(self, names: list[str]) -> None:
         """Add columns to the rows of observations written so far."""
@@ -219,23 +209,7 @@ class RecordingWriter:
         self._columns += names
 
 
-def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]) -> None:
-    """Write a recording of some epochs in constant memory; their frames are copied.
-
-    Raises RecordingError, leaving nothing behind, if `path` exists or the disk is full.
-    """
-    with RecordingWriter(path, head, testfield) as writer:
-        for epoch in epochs:
-            writer.append(epoch)
-
-
 def _number(value: float, form: str) -> str:
     if not math.isfinite(value):
         return ""
     return f"{value:{form}}" if form else repr(float(value))
-
-
-def _quoted(text: str) -> str:
-    if any(mark in text for mark in ',"\r\n'):
-        return '"' + text.replace('"', '""') + '"'
-    return text

@@ -12,6 +12,7 @@ import re
 import threading
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
@@ -29,7 +30,6 @@ from thermocald.store import schema
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from psycopg import Connection
 
@@ -114,16 +114,12 @@ class ServerAddress:
         url = urlunsplit(("postgresql", parts.netloc, parts.path, rest, ""))
         return cls(url, **selection)
 
-    @staticmethod
-    def narrowed(source: Path, station: str, camera: str, series: str) -> Path:
+    def narrowed(self, station: str, camera: str, series: str) -> Path:
         """Return the address as a path that selects one series instead."""
-        from pathlib import Path
-
-        parts = urlsplit(_SCHEME.sub("postgresql://", str(source)))
-        rest = [(n, v) for n, v in parse_qsl(parts.query) if n not in _OURS]
-        chosen = [("station", station), ("camera", camera), ("series", series)]
-        query = urlencode([*rest, *chosen], quote_via=quote, safe="")
-        return Path(urlunsplit((parts.scheme, parts.netloc, parts.path, query, "")))
+        parts = urlsplit(self.url)
+        chosen = zip(_OURS, (station, camera, series), strict=True)
+        query = urlencode([*parse_qsl(parts.query), *chosen], quote_via=quote, safe="")
+        return Path(urlunsplit(parts._replace(query=query)))
 
     @property
     def place(self) -> str:

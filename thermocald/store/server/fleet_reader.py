@@ -49,17 +49,19 @@ class RecentEpoch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StationState:
-    """A station's state as it reported it.
+    """A station's state as it reported it; all None if it never did.
 
     contact: s UTC, by the server's clock; clock: s, the station's minus the server's; waiting,
     refused: numbers of rows; stores: number of stores that reported under its name within an hour.
     """
 
-    contact: float
-    clock: float
-    waiting: int
-    refused: int
-    version: str
+    JSON: ClassVar = {"contact": "", "clock": "clock_s", "refused": "", "stores": ""}
+
+    contact: float | None = None
+    clock: float | None = None
+    waiting: int | None = None
+    refused: int | None = None
+    version: str | None = None
     stores: int = 1
 
 
@@ -77,10 +79,10 @@ class FleetCamera:
     """A camera of a station: its data on a server and, from `state` on, its overview.
 
     head, identity: of its last series; epochs, results: numbers over all series; last_ok: s UTC, of
-    the last epoch with a result; range: °C of the reference in all epochs with a result; both NaN
-    without one; recent: the last epochs, newest first; samples (n, 9): series, frame_time, °C of
-    the reference, c, sd, x0, sd, y0, sd (mm) of epochs with a result, spread over all; copied:
-    whether one of the last epochs has two times, as two copies of one store give.
+    the last epoch with a result, NaN without one; temperature_range: °C of the reference in all
+    epochs with a result; recent: the last epochs, newest first; samples (n, 9): series, frame_time,
+    °C of the reference, c, sd, x0, sd, y0, sd (mm) of epochs with a result, spread over all;
+    copied: whether one of the last epochs has two times, as two copies of one store give.
 
     lag_s: time since the last epoch, by the server's clock; on_the_way_s: median time of the last
     epochs' transfer, NaN if unknown; ok: fraction of the last epochs with a result; temperature:
@@ -91,10 +93,8 @@ class FleetCamera:
     """
 
     JSON: ClassVar = {
-        "head": "", "identity": "", "last_time": "last_epoch", "last_ok": "", "range": "",
-        "copied": "", "recent": "", "samples": "", "state": "", "calibrated_range":
-        "temperature_range", "shift_sds": "", "odd": "odd_p", "waiting": "waiting",
-        "clock_s": "clock_s", "version": "version",
+        "head": "", "identity": "", "last_time": "last_epoch", "last_ok": "", "copied": "",
+        "recent": "", "samples": "", "state": "*", "shift_sds": "", "odd": "odd_p",
     }  # fmt: skip
 
     station: str
@@ -106,12 +106,12 @@ class FleetCamera:
     epochs: int
     results: int
     last_ok: float
-    range: tuple[float, float]
+    temperature_range: tuple[float, float] | None
     copied: bool = False
     recent: list[RecentEpoch] = field(default_factory=list)
     samples: Array = field(default_factory=lambda: np.empty((0, 9)))
     type: str = ""
-    state: StationState | None = None
+    state: StationState = StationState()
     lag_s: float = math.nan
     on_the_way_s: float = math.nan
     ok: float = math.nan
@@ -125,26 +125,6 @@ class FleetCamera:
     @property
     def name(self) -> str:
         return f"{self.station}/{self.camera}"
-
-    @property
-    def calibrated_range(self) -> tuple[float, float] | None:
-        """`range`, or None without a result."""
-        return self.range if math.isfinite(self.range[0]) else None
-
-    @property
-    def waiting(self) -> int | None:
-        """Number of rows waiting at its station."""
-        return None if self.state is None else self.state.waiting
-
-    @property
-    def clock_s(self) -> float | None:
-        """Its station's clock minus the server's, s."""
-        return None if self.state is None else self.state.clock
-
-    @property
-    def version(self) -> str | None:
-        """The version of its station's program."""
-        return None if self.state is None else self.state.version
 
 
 class FleetReader(Connected):
@@ -194,12 +174,14 @@ class FleetReader(Connected):
         for _, found in groupby(series, key=lambda one: (one.station, one.camera)):
             every = list(found)
             newest = every[-1]
+            low = _extreme(min, (one.low for one in every))
+            high = _extreme(max, (one.high for one in every))
             camera = FleetCamera(
                 newest.station, newest.camera, newest.name, heads[newest.key],
                 json.loads(newest.identity), newest.last,
                 sum(one.epochs for one in every), sum(one.results for one in every),
                 _extreme(max, (one.last_ok for one in every)),
-                (_extreme(min, (o.low for o in every)), _extreme(max, (o.high for o in every))),
+                (low, high) if math.isfinite(low) else None,
             )  # fmt: skip
             owned.append((camera, every))
         self._read_recent({every[-1].key: camera for camera, every in owned})

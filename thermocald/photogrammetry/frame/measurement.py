@@ -27,7 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
-from thermocald.photogrammetry.targets.boards import find_chessboards, predict_corners
+from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, Word, inspect_frame
@@ -104,15 +104,15 @@ class Measurement:
 
     observations: none if the status is not ok; missed: {row: reason} for targets of the field that
     are in view and not measured; orientation: approximate, None if the targets do not determine
-    it; markers: places of the marker corners; searched: why a tracker searched the whole frame,
-    empty if it measured in windows only.
+    it; corners: where corners of markers and squares are, measured or not; searched: why a tracker
+    searched the whole frame, empty if it measured in windows only.
     """
 
     observations: Observations
     status: FrameStatus = OK
     missed: dict[int, str] = field(default_factory=dict)
     orientation: Orientation | None = None
-    markers: Corners | None = None
+    corners: Corners = field(default_factory=Corners.none)
     searched: str = ""
 
 
@@ -140,15 +140,16 @@ class _Frame:
     def __init__(self, image: Image, testfield: TestField, camera: CameraSpec) -> None:
         self._image, self._field, self._camera = image, testfield, camera
         self._missed: dict[int, str] = {}
-        self._markers = locate_markers(image, testfield, self._missed)
+        self._markers = self._places = locate_markers(image, testfield, self._missed)
 
     def measure(self) -> Measurement:
         """Measure markers and squares, then the circles."""
         if turned := corners_turned_deg(self._markers, self._field):
             return self._other_field(_TURNED.format(turned))
-        corners = measure_corners(self._image, self._markers, self._missed)
         if "chess_corner" in self._field.kinds:
-            corners = corners.joined(find_chessboards(self._image, self._field, self._missed))
+            boards = locate_chessboards(self._image, self._field, self._missed)
+            self._places = self._markers.joined(boards)
+        corners = measure_corners(self._image, self._places, self._missed)
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
             return self._finish(corners)
@@ -178,6 +179,7 @@ class _Frame:
         except GeometryError:
             return Observations.none()
         places = predict_corners(self._field, rows, orientation, self._markers)
+        self._places = self._places.joined(places)
         found = measure_corners(self._image, places, self._missed)
         for row in found.targets.tolist():
             self._missed.pop(row, None)
@@ -283,11 +285,11 @@ class _Frame:
         elif n < _FEWEST:
             word, why = "too_few", f"only {n} targets are found in the frame"
         status = FrameStatus(word, why)
-        return Measurement(observations, status, self._missed, orientation, self._markers)
+        return Measurement(observations, status, self._missed, orientation, self._places)
 
     def _other_field(self, why: str) -> Measurement:
         status = FrameStatus("other_field", why)
-        return Measurement(Observations.none(), status, self._missed, None, self._markers)
+        return Measurement(Observations.none(), status, self._missed, None, self._places)
 
 
 def _why_nothing(missed: dict[int, str]) -> str:

@@ -29,7 +29,7 @@ from thermocald.photogrammetry.targets.circle import first_reasons, normal_cdf
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array, Image, Single
+    from thermocald.arrays import Array, Image, Mask, Single
 
 
 REACH_PX = 10.0
@@ -64,9 +64,21 @@ class Corners:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def part(self, some: slice) -> Corners:
+    @classmethod
+    def none(cls) -> Corners:
+        """Return no corners."""
+        places = np.empty((0, 2))
+        return cls(np.empty(0, dtype=np.int64), places, places, places, np.empty(0))
+
+    def select(self, some: slice | Mask) -> Corners:
         """Return some of the corners."""
         return Corners(*(getattr(self, f.name)[some] for f in fields(self)))
+
+    def joined(self, other: Corners) -> Corners:
+        """Return these corners and others, whose places count if both have a corner."""
+        mine = self.select(~np.isin(self.rows, other.rows))
+        pairs = ((getattr(mine, f.name), getattr(other, f.name)) for f in fields(self))
+        return Corners(*(np.concatenate(pair) for pair in pairs))
 
     def moved(self, found: Observations) -> Corners:
         """Move places and neighbours to the observed corners, those not observed by the median."""
@@ -90,7 +102,7 @@ def measure_corners(
     """
     found = Observations.none()
     for i in range(0, len(corners), _CHUNK):
-        some, reasons = _fit(image, corners.part(slice(i, i + _CHUNK)))
+        some, reasons = _fit(image, corners.select(slice(i, i + _CHUNK)))
         if missed is not None:
             missed.update(reasons)
         found = found.joined(some)

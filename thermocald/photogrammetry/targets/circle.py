@@ -398,7 +398,10 @@ def _reasons(
         (cut, "cut off by the image's edge"),
         ((minor < _SMALLEST_SEMI_AXIS_PX) | (pixels < _FEWEST_PIXELS), "too small"),
         (fit.saturation > _LARGEST_SATURATION, "saturated"),
-        (~np.isfinite(p).all(axis=1) | (np.abs(p[:, 7]) < _LEAST_CONTRAST * noise_sd), "too little contrast"),
+        (
+            ~np.isfinite(p).all(axis=1) | (np.abs(p[:, 7]) < _LEAST_CONTRAST * noise_sd),
+            "too little contrast",
+        ),
         (p[:, 5] > np.maximum(0.75 * minor, 1.2), "too blurred for its size"),
         (
             (move > np.maximum(_LARGEST_MOVE * minor, 2.0))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,11 @@ from thermocald.photogrammetry.field.testfield import (
     sheet_normals,
     target_normals,
 )
-from thermocald.photogrammetry.frame.measurement import predict_circles
+from thermocald.photogrammetry.frame.measurement import (
+    REPEATED,
+    find_repeated,
+    predict_circles,
+)
 from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
@@ -178,6 +183,13 @@ class Survey:
     field: TestField
     measured: dict[str, str]
 
+    @property
+    def unused(self) -> dict[str, str]:
+        """Why photographs and targets were left out, by name."""
+        stations = {s.photo for s in self.network.stations}
+        notes = {name: note for name, note in self.measured.items() if name not in stations}
+        return notes | self.network.unused
+
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `testfield survey` writes with `--json`."""
         n = self.network
@@ -214,7 +226,7 @@ class Survey:
             "targets": targets,
             "stations": stations,
             "rejected": n.rejected,
-            "unused": n.unused,
+            "unused": self.unused,
             "measured": self.measured,
             "advice": advice(n),
         }  # fmt: skip
@@ -235,7 +247,7 @@ class Survey:
                 f"shape is accurate to 1:{1 / n.relative_accuracy:.0f} of the field"
             ),
             f"  datum: {n.datum}",
-            *(f"  left out: {name}: {reason}" for name, reason in n.unused.items()),
+            *(f"  left out: {name}: {reason}" for name, reason in self.unused.items()),
             *(f"  better: {note}" for note in advice(n)),
         ]
 
@@ -341,7 +353,7 @@ def _measure_first(
         try:
             image = load()
         except ImageError as error:
-            notes[name] = str(error)
+            notes[name] = str(error).removeprefix(f"{name}: ")
             continue
         expected = None if sensor is None else (sensor.width, sensor.height)
         status = inspect_frame(image, expected)
@@ -395,6 +407,8 @@ def _measure_again(
         off = np.linalg.norm(fit.points - maps.centre, axis=1)
         seen = corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))
         notes[name] = f"{len(seen)} targets"
-        if len(seen):
+        if same := find_repeated(seen, photos):
+            notes[name] = REPEATED.format(Path(same).name)
+        elif len(seen):
             photos[name] = seen
     return photos

@@ -24,7 +24,8 @@ from thermocald.photogrammetry.epoch.adjustment import (
     cold_start,
     pose_only,
 )
-from thermocald.photogrammetry.frame.measurement import measure
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated, measure
 from thermocald.photogrammetry.linalg import correlation_matrix
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.field.testfield import TestField
 
 _IMAGES = frozenset(
     {".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"}
@@ -156,18 +157,21 @@ def calibrate_photographs(
     """Measure and calibrate photographs; a file that is no image gets a status and a reason."""
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
-    copies = find_copies(paths)
+    copies, usable = find_copies(paths), dict[str, Observations]()
     for k, path in enumerate(paths):
         try:
             if k in copies:
                 raise ImageError(f"is a copy of {paths[copies[k]].name}")
             found = measure(decode_grey(path), testfield, camera)
+            if same := find_repeated(found.observations, usable):
+                raise ImageError(REPEATED.format(Path(same).name))
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
             failures[k] = (word, str(error))
             measured.append(None)
         else:
             measured.append(found.observations)
+            usable[str(path)] = found.observations
             if not found.status.ok:
                 failures[k] = (found.status.word, found.status.reason)
         if advance is not None:

@@ -40,6 +40,8 @@ from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_ma
 from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
@@ -302,6 +304,26 @@ def _why_nothing(missed: dict[int, str]) -> str:
     return f"{len(reasons)} targets are seen and none can be measured: {word} ({count})" + (
         f"; {remedy}" if remedy else ""
     )
+
+
+REPEATED = "shows the view of {}, with the same errors: a copy in another encoding? Counts once"
+_SAME_SHARE = 0.9
+_SAME_ERRORS = 0.5  # of the differences that independent errors would have
+
+
+def find_repeated(observations: Observations, earlier: Mapping[str, Observations]) -> str | None:
+    """Return the name of earlier observations of the same view with the same errors, or None.
+
+    So is a photograph in another encoding: it would count twice.
+    """
+    for name, other in earlier.items():
+        both, i, j = np.intersect1d(observations.targets, other.targets, return_indices=True)
+        if len(both) >= max(_SAME_SHARE * max(len(observations), len(other)), _FEWEST):
+            sigmas = np.hypot(observations.sigmas[i], other.sigmas[j])
+            z = (observations.points[i] - other.points[j]) / sigmas
+            if np.mean(z**2) < _SAME_ERRORS**2:
+                return name
+    return None
 
 
 _FEWEST_BLURS = 6

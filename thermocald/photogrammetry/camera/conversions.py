@@ -83,6 +83,8 @@ def convert(
     the target's parameters to the pixels that the source's move. Raises GeometryError if the
     source's distortion folds back inside the image.
     """
+    from scipy.optimize import least_squares  # 20 MB that a live daemon does not need
+
     if source is target:
         return values, covariance, True, 0.0, 0.0
     own = source.to_brown(sensor, values)
@@ -98,7 +100,11 @@ def convert(
     residual = project_target(result, checked) - check
     exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
     if not exact:
-        result = _fit(project_target, result, grid, directions)
+        result = least_squares(
+            lambda v: (project_target(v, directions) - grid).ravel(), result,
+            lambda v: _derivative(project_target, v, directions),
+            x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=None, max_nfev=50,
+        ).x  # fmt: skip
         residual = project_target(result, checked) - check
     propagated = None
     if covariance is not None:
@@ -142,34 +148,6 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
         f"the {family.name} model has no rays for some of the image: its distortion folds back "
         "inside the picture; it was calibrated over a smaller area, or its parameters are wrong"
     )
-
-
-def _fit(
-    target: Callable[[Array, Array], Array], start: Array, pixels: Array, directions: Array
-) -> Array:
-    """Fit a family's parameters over the image area by Gauss-Newton with step halving."""
-
-    def cost_of(values: Array) -> float:
-        r = pixels - target(values, directions)
-        return float(np.sum(r * r)) if np.all(np.isfinite(r)) else np.inf
-
-    values = start.astype(float)
-    cost = cost_of(values)
-    for _ in range(50):
-        G = _derivative(target, values, directions)
-        step = _least_squares(G, (pixels - target(values, directions)).reshape(-1, 1))[:, 0]
-        for _halving in range(20):
-            new = cost_of(values + step)
-            if new < cost:
-                break
-            step /= 2
-        else:
-            return values
-        values = values + step
-        if cost - new < 1e-12 * cost:
-            return values
-        cost = new
-    return values
 
 
 def _least_squares(G: Array, rhs: Array) -> Array:

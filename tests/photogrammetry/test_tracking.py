@@ -92,14 +92,6 @@ def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     assert np.abs(z.mean(axis=(0, 1))).max() < 4 / np.sqrt(z.shape[0] * z.shape[1])
 
 
-def test_weights_are_renewed_after_movement(tracker, rng, no_search):
-    weights = []
-    for px in (0.0, 0.08, 0.4, 0.4):
-        tracker.measure(noisy(_render(_shifted(px)), rng))
-        weights.append(tracker._circles[1])
-    assert weights[0] is weights[1] is not weights[2] is weights[3]
-
-
 def test_light_and_noise_may_change(tracker, clean, rng, no_search):
     for factor in (0.9, 0.5, 1.1):
         measured = tracker.measure(noisy(clean * factor, rng))

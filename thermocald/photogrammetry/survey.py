@@ -395,7 +395,7 @@ def _measure_again(
     normals (n, 3): NaN where unknown. Adds to `notes`. A circle more than some pixels from its
     predicted place is another one and is left out.
     """
-    stations, photos = {s.photo: s for s in network.stations}, {}
+    stations, photos = {s.photo: s for s in network.stations}, dict[str, Observations]()
     for name, load in pictures.items():
         if name not in stations:
             continue

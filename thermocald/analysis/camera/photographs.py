@@ -34,7 +34,7 @@ from thermocald.result import with_sds
 from thermocald.store.logger.photographs import find_copies, moment_taken
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -205,14 +205,25 @@ def calibrate_observations(
     elif usable:
         try:
             start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
-            rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            oriented = {}
+            for k, o in usable.items():
+                with suppress(GeometryError):
+                    points = testfield.points[o.targets]
+                    _, oriented[k], _ = approximate_orientation(
+                        sensor, points, o.points, interior=start
+                    )
+            if not oriented:
+                raise GeometryError("no pose explains the targets of any photograph")
+            rows, poses = list(oriented), list(oriented.values())
+            chosen = [usable[k] for k in rows]
+            together = adjust_common_interior(sensor, testfield, chosen, start, poses, settings)
             left_out = together.left_out
             failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
             rows = [k for i, k in enumerate(rows) if i not in left_out]
             reason = "; ".join(together.reasons)
         except GeometryError as error:
             reason = str(error)
-    poses: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
+    found: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
     if together is None or reason:
         # the given camera is held
         status, interior, estimated = "held", camera.interior, False
@@ -227,7 +238,7 @@ def calibrate_observations(
             pose = pose_only(sensor, testfield, seen[k], interior, settings)
             if pose.ok:
                 used = ~np.isin(pose.targets, pose.rejected)
-                poses[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
+                found[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
             else:
                 failures[k] = (pose.status, pose.reason)
     else:
@@ -235,16 +246,16 @@ def calibrate_observations(
         covariance, sigma0 = together.covariance, together.sigma0
         redundancy, disagreement = together.redundancy, together.disagreement
         sds = np.sqrt(np.diagonal(together.exterior_covariances, axis1=1, axis2=2))
-        found = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
-        poses = dict(zip(rows, found, strict=True))
+        each = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
+        found = dict(zip(rows, each, strict=True))
     results = []
     for k, name in enumerate(names):
         n = len(seen[k]) if k in seen else 0
-        if k not in poses:
+        if k not in found:
             word, why = failures.get(k, ("no_orientation", "no pose explains its targets"))
             results.append(PhotographResult(name, word, why, n))
             continue
-        o, (used, rest, exterior, sd) = seen[k], poses[k]
+        o, (used, rest, exterior, sd) = seen[k], found[k]
         rms = float(np.sqrt(np.mean(rest[used] ** 2)))
         rejected = tuple(testfield.names[t] for t in o.targets[~used])
         results.append(
@@ -270,23 +281,6 @@ def _first_camera(
         # distortion from a weak photograph is a bad initial value for the others
         start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
     return start
-
-
-def _adjust_together(
-    usable: Mapping[int, Observations], testfield: TestField, sensor: Sensor,
-    interior: InteriorOrientation, settings: AdjustmentSettings,
-) -> tuple[list[int], CommonInterior]:  # fmt: skip
-    """Adjust the photographs whose targets fit a pose; return their positions and the result."""
-    rows, poses = [], []
-    for k, o in usable.items():
-        with suppress(GeometryError):
-            points = testfield.points[o.targets]
-            poses.append(approximate_orientation(sensor, points, o.points, interior=interior)[1])
-            rows.append(k)
-    if not rows:
-        raise GeometryError("no pose explains the targets of any photograph")
-    chosen = [usable[k] for k in rows]
-    return rows, adjust_common_interior(sensor, testfield, chosen, interior, poses, settings)
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:

@@ -379,7 +379,7 @@ def _step(
 
 def _noise_sd(parameters: Array, noise: NoiseModel) -> Array:
     """Return the noise (n,) DN of the brighter of disc and background."""
-    return np.sqrt(noise.variance(parameters[:, 6] + np.maximum(parameters[:, 7], 0)))
+    return np.asarray(np.sqrt(noise.variance(parameters[:, 6] + np.maximum(parameters[:, 7], 0))))
 
 
 def _reasons(

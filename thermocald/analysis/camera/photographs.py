@@ -167,7 +167,7 @@ def calibrate_photographs(
                 raise ImageError(REPEATED.format(Path(same).name))
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
-            failures[k] = (word, str(error))
+            failures[k] = (word, str(error).removeprefix(f"{path}: "))
             measured.append(None)
         else:
             measured.append(found.observations)

@@ -39,7 +39,9 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
 
-_FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""Our camera axes to OpenCV's, whose camera looks along +Z with y down."""
+
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
 _TOLERANCE = 0.005  # of the image width, as the distortion is still unknown
 _MANY = 8  # so many pairs do not fit a pose of three of them by chance
@@ -203,7 +205,7 @@ def _residuals(
 
 
 def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
-    return ExteriorOrientation.from_rotation(R.T @ _FLIP, -R.T @ t)
+    return ExteriorOrientation.from_rotation(R.T @ FLIP, -R.T @ t)
 
 
 def resection(
@@ -270,8 +272,6 @@ class Orientation:
     @property
     def scatter(self) -> float:
         """Robust standard deviation of the residuals in px."""
-        if len(self.residuals) == 0:
-            return np.inf
         return float(mad_sd(self.residuals))
 
 

@@ -183,13 +183,6 @@ class Survey:
     field: TestField
     measured: dict[str, str]
 
-    @property
-    def unused(self) -> dict[str, str]:
-        """Why photographs and targets were left out, by name."""
-        stations = {s.photo for s in self.network.stations}
-        notes = {name: note for name, note in self.measured.items() if name not in stations}
-        return notes | self.network.unused
-
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `testfield survey` writes with `--json`."""
         n = self.network
@@ -226,7 +219,7 @@ class Survey:
             "targets": targets,
             "stations": stations,
             "rejected": n.rejected,
-            "unused": self.unused,
+            "unused": n.unused,
             "measured": self.measured,
             "advice": advice(n),
         }  # fmt: skip
@@ -247,7 +240,7 @@ class Survey:
                 f"shape is accurate to 1:{1 / n.relative_accuracy:.0f} of the field"
             ),
             f"  datum: {n.datum}",
-            *(f"  left out: {name}: {reason}" for name, reason in self.unused.items()),
+            *(f"  left out: {name}: {reason}" for name, reason in n.unused.items()),
             *(f"  better: {note}" for note in advice(n)),
         ]
 
@@ -297,6 +290,9 @@ def survey(
             nominal=of_field, free=free, places=expected.points,
         )  # fmt: skip
     template = expected if nominal is None else nominal
+    stations = {s.photo for s in network.stations}
+    left_out = {name: note for name, note in notes.items() if name not in stations}
+    network = replace(network, unused=left_out | network.unused)
     return Survey(network, surveyed_field(network, template), notes)
 
 

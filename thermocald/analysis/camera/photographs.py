@@ -126,7 +126,7 @@ class Photographs:
             return None
         free, values = self._estimated, self.interior.as_array()
         sds = np.sqrt(self.covariance.diagonal()[free])
-        return asdict(self.interior) | with_sds(_names(free), values[free], sds)
+        return asdict(self.interior) | with_sds([IOP_NAMES[i] for i in free], values[free], sds)
 
     @property
     def correlations(self) -> dict[str, Any] | None:
@@ -135,16 +135,12 @@ class Photographs:
             return None
         free = self._estimated
         matrix = correlation_matrix(self.covariance[np.ix_(free, free)])
-        return {"names": _names(free), "matrix": matrix}
+        return {"names": [IOP_NAMES[i] for i in free], "matrix": matrix}
 
     @property
     def _estimated(self) -> NDArray[np.int64]:
         """The indices of the estimated parameters of the interior orientation."""
         return np.flatnonzero((self.covariance.diagonal()[:10] > 0) & self.estimated)
-
-
-def _names(rows: NDArray[np.int64]) -> list[str]:
-    return [IOP_NAMES[i] for i in rows]
 
 
 def calibrate_photographs(
@@ -311,15 +307,12 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
 
     Its image size is that of most photographs. Raises ImageError if none can be read.
     """
-    errors: list[ImageError] = []
     sizes: Counter[tuple[int, ...]] = Counter()
     for path in images:
-        try:
+        with suppress(ImageError):
             sizes[decode_grey(path).shape] += 1
-        except ImageError as error:
-            errors.append(error)
     if not sizes:
-        raise errors[0]
+        decode_grey(images[0])
     height, width = sizes.most_common(1)[0][0]
     pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
     return CameraSpec("camera", Sensor(width, height, pitch))

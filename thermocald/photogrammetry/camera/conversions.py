@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,9 +94,7 @@ def convert(
         _directions(sensor, source, values, own, pixels) for pixels in (grid, check)
     )
 
-    def project_target(v: Array, d: Array) -> Array:
-        return target.project(sensor, v, d)
-
+    project_source, project_target = (partial(f.project, sensor) for f in (source, target))
     result = target.from_brown(sensor, own)
     residual = project_target(result, checked) - check
     exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
@@ -109,8 +108,10 @@ def convert(
     propagated = None
     if covariance is not None:
         G = _derivative(project_target, result, directions)
-        F = _derivative(lambda v, d: source.project(sensor, v, d), values, directions)
-        J = _least_squares(G, F)
+        F = _derivative(project_source, values, directions)
+        scales = np.linalg.norm(G, axis=0)
+        scales[scales == 0] = 1.0  # a parameter without effect is 0
+        J = np.linalg.lstsq(G / scales, F, rcond=1e-14)[0] / scales[:, None]
         propagated = J @ covariance @ J.T
     size = np.linalg.norm(residual, axis=1)
     return result, propagated, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
@@ -148,16 +149,6 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
         f"the {family.name} model has no rays for some of the image: its distortion folds back "
         "inside the picture; it was calibrated over a smaller area, or its parameters are wrong"
     )
-
-
-def _least_squares(G: Array, rhs: Array) -> Array:
-    """Solve G (n, u) for rhs (n, k); return (u, k), 0 for parameters whose column of G is 0."""
-    scales = np.linalg.norm(G, axis=0)
-    used = scales > 0
-    found = np.zeros((G.shape[1], rhs.shape[1]))
-    scaled = G[:, used] / scales[used]
-    found[used] = np.linalg.lstsq(scaled, rhs, rcond=1e-14)[0] / scales[used, None]
-    return found
 
 
 def _derivative(

@@ -341,10 +341,10 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
     is absent.
     """
     figures: dict[str, float] = {}
-    for name in ("contrast", "grey", "noise", "saturation"):
+    for name in ("contrast", "grey", "noise", "saturation", "blur"):
         values = observations.quality.get(name)
         if values is not None and np.isfinite(values).any():
-            figures[name] = float(np.nanmedian(values))
+            figures["blur_px" if name == "blur" else name] = float(np.nanmedian(values))
     blur = observations.quality.get("blur")
     if blur is not None and np.isfinite(blur).sum() >= _FEWEST_BLURS:
         values, sd = blur_trend(observations.points, blur, sensor)
@@ -352,8 +352,6 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
             ("blur_px", "blur_trend_x", "blur_trend_y", "blur_curvature"), values, sd, strict=True
         ):
             figures[name], figures[f"sd_{name}"] = float(value), float(s)
-    elif blur is not None and np.isfinite(blur).any():
-        figures["blur_px"] = float(np.nanmedian(blur))
     return figures
 
 

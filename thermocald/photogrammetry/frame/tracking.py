@@ -27,13 +27,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
-from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import Measurement, measure, predict_circles
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
-from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel, inspect_frame
+from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.photogrammetry.targets.outline import LocalMap, window_reach, windows
 from thermocald.photogrammetry.targets.ring_code import have_rings
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Image, Single
     from thermocald.photogrammetry.camera.camera_model import CameraSpec
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,11 +167,8 @@ class Tracker:
             image = image.whole()
         if self._shape is None:
             return self._search(image, "nothing is tracked yet")
-        if image.shape != self._shape:
-            status = inspect_frame(image, (self._shape[1], self._shape[0]))
-            return Measurement(Observations.none(), status)
-        if image.dtype != self._dtype:
-            return self._search(image, f"the frame is {image.dtype}, it was {self._dtype}")
+        if image.shape != self._shape or image.dtype != self._dtype:
+            return self._search(image, f"the frame is {image.shape} {image.dtype}")
         tracked = self._track(image)
         if tracked is None:
             return self._search(image, f"too many of {self._seen} targets were lost")

@@ -126,15 +126,18 @@ def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
 
 @pytest.fixture(scope="module", params=["aprilgrid", "charuco"])
 def board(request):
-    """Return a board and two photographs of it from one stand."""
+    """Return a board and photographs of it: two from one stand, one where a pattern repeats."""
     if request.param == "charuco":
         pattern = (11, 8, 30.0, 22.5, "DICT_5X5_250")
         field, sheet = charuco(*pattern), board_images.charuco_sheet(*pattern, legacy=False)
     else:
         field, sheet = aprilgrid(6, 6, 40.0, 0.3), board_images.aprilgrid_sheet(6, 6, 40.0, 0.3)
-    middle = field.points.mean(axis=0)
-    stand = looking_at(middle + np.array([150.0, -120.0, 380.0]), middle, 0.3)
-    return field, [photograph([sheet], SMALL_CAMERA, stand, seed=k) for k in range(2)]
+    frames, away = [], np.array([150.0, -120.0, 380.0])
+    for k, step in enumerate((0.0, 0.0, 60.0 if request.param == "charuco" else 52.0)):
+        middle = field.points.mean(axis=0) + np.array([step, 0, 0])
+        stand = looking_at(middle + away, middle, 0.3)
+        frames.append(photograph([sheet], SMALL_CAMERA, stand, seed=k))
+    return field, frames
 
 
 def test_all_corners_of_a_board_are_tracked(board, monkeypatch):
@@ -146,6 +149,16 @@ def test_all_corners_of_a_board_are_tracked(board, monkeypatch):
     second = tracker.measure(frames[1]).observations
     assert np.array_equal(second.targets, first.targets)
     assert 0 < rms(second.points - first.points) < 0.03
+
+
+def test_a_board_that_moves_by_whole_squares_keeps_its_numbers(board):
+    field, frames = board
+    tracker = Tracker(field, CameraSpec("", SMALL_SENSOR))
+    tracker.measure(frames[0])
+    moved = tracker.measure(frames[2]).observations
+    whole = Tracker(field, CameraSpec("", SMALL_SENSOR)).measure(frames[2]).observations
+    assert np.array_equal(moved.targets, whole.targets)
+    assert rms(moved.points - whole.points) < 0.01
 
 
 def test_what_was_hidden_in_the_first_frames_is_found(board, monkeypatch):

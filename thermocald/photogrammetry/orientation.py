@@ -252,7 +252,6 @@ def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float 
     return float(np.sqrt(f2) * size) if f2 > 0 else None
 
 
-_FEWEST_QUICK = 6
 _QUICK_VIEWS_DEG = (60.0, 40.0, 80.0, 25.0)
 _GOOD_START = 0.02  # of the image's width: the RMS of a resection without distortion
 _ITERATIONS = 12
@@ -290,7 +289,7 @@ def orient(
     lengths = _distances(sensor, _QUICK_VIEWS_DEG) if nominal_c is None else [nominal_c]
     candidates = [InteriorOrientation(c) for c in lengths] if interior is None else [interior]
     best = None
-    for candidate in candidates if len(points) >= _FEWEST_QUICK else ():
+    for candidate in candidates if len(points) >= 6 else ():
         with suppress(GeometryError, cv2.error, IndexError):
             rms, pose = resection(sensor, candidate, points, image_points)[0]
             if best is None or rms < best[0]:

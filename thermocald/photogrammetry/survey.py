@@ -289,11 +289,10 @@ def survey(
             sensor, photos, expected.names, distances, interior=network.camera.interior,
             nominal=of_field, free=free, places=expected.points,
         )  # fmt: skip
-    template = expected if nominal is None else nominal
     stations = {s.photo for s in network.stations}
     left_out = {name: note for name, note in notes.items() if name not in stations}
     network = replace(network, unused=left_out | network.unused)
-    return Survey(network, surveyed_field(network, template), notes)
+    return Survey(network, surveyed_field(network, nominal or expected), notes)
 
 
 def _first_distances(

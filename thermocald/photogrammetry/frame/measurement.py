@@ -250,10 +250,9 @@ class _Frame:
             and np.abs(new_maps.second - maps.second).max(initial=0.0) < _SETTLED_PX
         )
         if not settled:
-            start = None
+            start = fit.parameters if same and good.all() else None
             if same:
                 new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
-                start = fit.parameters if good.all() else None
             rows = new_rows
             fit = fit_circles(image, new_maps, have_rings(field, rows), blur, None, start)
         # a circle far from the predicted place is not the target

@@ -9,7 +9,8 @@ the parts around the targets are decoded, if its format allows it.
 
 A hidden circle is looked for at its predicted place. While markers that a search missed are not
 seen (somebody stood in front of them), the whole frame is searched again 1, 2, 4, 8 … frames later:
-they are found after twice the time at most.
+they are found after twice the time at most. If corners are suddenly lost, it is searched at once: a
+board that has moved by a whole square would be tracked with other numbers.
 
 Fixed gradient weights give the next epoch's centres as weighted sums of grey values: between epochs
 a centre moves by hundredths of a pixel, so that the blurred disc of the last fit is still right to
@@ -130,6 +131,7 @@ _ITERATIONS = 6
 _MISFIT = 1.5  # of the epoch's median; a target with more is fitted again
 _LOST_SHARE = 0.3
 _RENEW_SHARE = 0.1
+_SUDDEN_LOSS = 0.95  # share of the targets that remain
 _FEWEST = 4
 _MARGIN_PX = 3.0  # around the windows; if targets move farther, the whole frame is decoded
 
@@ -149,7 +151,8 @@ class Tracker:
         """Forget the tracked targets; the next frame is searched."""
         self._shape: tuple[int, ...] | None = None  # of the frames, while something is tracked
         self._missed: frozenset[int] = frozenset()  # targets that no frame has shown since a search
-        self._age = 0  # frames since the search
+        self._age = self._seen = 0  # frames since the search; targets in the last frame
+        self._corners = Corners.none()
 
     def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
         """Measure a frame (H, W), grey, 8 or 16 bit.
@@ -158,11 +161,12 @@ class Tracker:
         """
         self._age += 1
         due = bool(self._missed) and self._age & (self._age - 1) == 0  # a power of two
+        fewest = _SUDDEN_LOSS * self._seen if self._corners else 0.0
         if isinstance(image, EncodedImage):
             if self._shape is not None and self._dtype == np.uint8 and not due:
                 parts = image.around(_boxes(self._circles, self._corners), self._shape)
                 found = None if parts is None else self._track(parts, _MARGIN_PX)
-                if found is not None:
+                if found is not None and len(found.observations) >= fewest:
                     return found
             image = image.whole()
         if self._shape is None:
@@ -172,17 +176,21 @@ class Tracker:
         tracked = self._track(image)
         if tracked is None:
             return self._search(image, f"too many of {self._seen} targets were lost")
-        if due:
-            return self._search(image, "targets are seen that were hidden", tracked)
+        if due or len(tracked.observations) < fewest:
+            return self._search(image, "targets are seen that were hidden, or moved", tracked)
         return tracked
 
     def _search(
         self, image: NDArray[Any], why: str, tracked: Measurement | None = None
     ) -> Measurement:
-        """Search the whole frame; return `tracked` if that has as many targets."""
+        """Search the whole frame; return `tracked` if that has as many targets where they are."""
         found = measure(image, self._testfield, self._camera)
-        if tracked is not None and len(found.observations) <= len(tracked.observations):
-            return tracked
+        if tracked is not None:
+            a, b = found.observations, tracked.observations
+            _, i, j = np.intersect1d(a.targets, b.targets, return_indices=True)
+            off = np.abs(a.points[i] - b.points[j])
+            if len(a) <= len(b) and not (off.size and np.median(off) > _MARGIN_PX):
+                return tracked
         # after a bad frame the targets may still be at their last places
         if found.status.ok:
             self._shape, self._dtype, self._seen = image.shape, image.dtype, len(found.observations)

@@ -117,8 +117,7 @@ def adjust_common_interior(
         size = np.linalg.norm(robust.residuals(bundle), axis=1)
         left_out = _contradicting(in_pixels.residuals(bundle), size, rays.photo)
         if s.snooping_alpha > 0:
-            gross = _GROSS_OF_FEW if few else _GROSS
-            used = size <= gross * max(float(np.median(size)), 1.0)
+            used = size <= (_GROSS_OF_FEW if few else _GROSS) * max(float(np.median(size)), 1.0)
     if left_out:
         others = [i for i in range(len(photographs)) if i not in left_out]
         starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[others]]

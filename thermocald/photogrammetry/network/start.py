@@ -64,10 +64,9 @@ class _Start:
         known, image = self.points[self.rays.target[rows]], self.normalised[rows]
         fewest = max(_MIN_RESECTION, len(rows) // 3)
         found = majority_pose(known, image, self.threshold, fewest, seed=1)
-        if found is None:
-            return False
-        self.poses[photo] = found[:2]
-        return True
+        if found is not None:
+            self.poses[photo] = found[:2]
+        return found is not None
 
     def intersect(self) -> None:
         """Intersect every target that oriented photographs see at a sufficient angle."""

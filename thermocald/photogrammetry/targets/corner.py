@@ -43,6 +43,7 @@ _LARGEST_MOVE_PX = 1.5
 _LARGEST_MOVE_SHARE = 0.015  # of the side, in addition: reduced images cut outlines short
 _BLUR_LIMITS_PX = (0.3, 4.0)
 _SADDLE_REACH = 0.25  # of the marker's side
+_FAR = 40.0  # standard deviations of the blur; the series would overflow where a fit runs away
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
 
@@ -138,7 +139,7 @@ def _model(p: Array, x: Array, y: Array, saddle: NDArray[np.bool_]) -> tuple[Sin
     k: Single = ((c2 * dx + s2 * dy) / s).astype(np.float32, copy=False)
     rho = np.clip(c1 * c2 + s1 * s2, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
     root = np.sqrt(1 - rho * rho)
-    w = _wedge(h, k, rho)
+    w = _wedge(np.clip(h, -_FAR, _FAR), np.clip(k, -_FAR, _FAR), rho)
     norm = np.float32(1 / np.sqrt(2 * np.pi))
     wh = norm * np.exp(-0.5 * h * h) * normal_cdf((k - rho * h) / root)
     wk = norm * np.exp(-0.5 * k * k) * normal_cdf((h - rho * k) / root)

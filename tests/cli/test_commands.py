@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 
+import cv2
 import pytest
 
 import thermocald as tc
@@ -141,14 +142,18 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
                "--free", "none", "--json", "-")  # fmt: skip
     assert json.loads(done.stdout)["interior"]["c"] == c
 
-    # a copy of a photograph adds no information
+    # a copy of a photograph adds no information, and neither does another encoding of it
     (tmp_path / "camera.yaml").write_text(
         f"name: mock\nwidth: {sensor.width}\nheight: {sensor.height}\n"
         f"pixel_pitch: {sensor.pixel_pitch}\n"
     )
     copy = tmp_path / "copy.png"
     copy.write_bytes(images[0].read_bytes())
-    done = finish("calibrate", *images, copy, "--testfield", tmp_path / "field.csv",
+    smaller = tmp_path / "smaller.jpg"
+    cv2.imwrite(str(smaller), cv2.imread(str(images[1]), 0), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    (tmp_path / "broken.jpg").write_bytes(b"no image")
+    added = (copy, smaller, tmp_path / "broken.jpg")
+    done = finish("calibrate", *images, *added, "--testfield", tmp_path / "field.csv",
                "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
     document = json.loads(done.stdout)
     assert document["status"] == "ok"
@@ -160,6 +165,10 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
         assert sd == written["interior"][f"sd_{name}"]
     assert len(document["correlations"]["matrix"]) == 8
     assert document["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
+    again, broken = document["photographs"][4:]
+    assert again["status"] == broken["status"] == "bad_image"
+    assert again["reason"].startswith(f"shows the view of {images[1].name}, with the same errors")
+    assert broken["reason"].startswith("is not an image")
 
 
 def test_the_demo_finds_what_was_put_in(tmp_path):

@@ -72,12 +72,20 @@ def photographs(tmp_path_factory):
 def test_survey_writes_the_field_and_everything_about_it(photographs, tmp_path):
     folder, truth, model, scale = photographs
     out, camera_file = tmp_path / "surveyed.csv", tmp_path / "camera.json"
+    # what cannot be read, and what would count twice
+    broken, again = tmp_path / "broken.jpg", tmp_path / "again.jpg"
+    broken.write_bytes(b"no image")
+    smaller = [cv2.IMWRITE_JPEG_QUALITY, 85]
+    cv2.imwrite(str(again), cv2.imread(str(folder / "photos" / "3.jpg"), 0), smaller)
     result = succeed(
-        "testfield", "survey", folder / "photos", "--field", folder / "testfield.csv", "--scale",
-        *scale, "--scale-sd", 0.01, "--pixel-pitch", 0.00224, "--out", out, "--camera-out",
-        camera_file, "--json", tmp_path / "survey.json",
+        "testfield", "survey", folder / "photos", broken, again, "--field",
+        folder / "testfield.csv", "--scale", *scale, "--scale-sd", 0.01, "--pixel-pitch", 0.00224,
+        "--out", out, "--camera-out", camera_file, "--json", tmp_path / "survey.json",
     )  # fmt: skip
     assert "datum: inner constraints over" in result.stdout
+    printed = " ".join(result.stdout.split())
+    assert "again.jpg: shows the view of 3.jpg, with the same errors" in printed
+    assert "broken.jpg: is not an image" in printed
     surveyed = read_testfield(out)
     known = truth.points[[truth.index[name] for name in surveyed.names]]
     moved, _ = cases.onto(surveyed.points, known)

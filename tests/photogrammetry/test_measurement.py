@@ -153,6 +153,17 @@ def test_hidden_targets_are_missed_with_a_reason(clean):
     assert np.abs(_z(found.observations, _truth())).max() < 6
 
 
+@pytest.mark.parametrize("grey", [0, 255])
+def test_a_hand_or_a_glare_without_noise_hides_only_what_is_behind_it(frame, grey):
+    """The level of the noise was that of the covered half, 0, and all targets were disturbed."""
+    free = np.count_nonzero(measure(frame, FIELD).observations.points[:, 0] < 680)
+    frame[:, 700:] = grey
+    found = measure(frame, FIELD)
+    assert found.status.ok
+    assert free - 2 <= len(found.observations) <= free + 2
+    assert 0.85 <= np.sqrt(np.mean(_z(found.observations, _truth()) ** 2)) <= 1.15
+
+
 def test_an_invalid_code_is_refused(frame):
     wrong = TestField.build(["a"], [[0, 0, 0]], diameters=10, codes="RING14:1")
     with pytest.raises(TestFieldError, match="RING14:1"):

@@ -5,11 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.photogrammetry import board_images
 from tests.photogrammetry.exact_rendering import noisy, rms
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
+from tests.photogrammetry.network_cases import looking_at
+from tests.photogrammetry.printed_sheets import photograph
 from thermocald.photogrammetry.camera.camera_model import CameraModel, CameraSpec
+from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.frame import tracking
+from thermocald.photogrammetry.frame.measurement import Measurement
 from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.photogrammetry.targets.boards import aprilgrid, charuco
 
 FIELD, NORMALS = small_field()
 STATION = station(800.0)
@@ -86,14 +92,6 @@ def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     assert np.abs(z.mean(axis=(0, 1))).max() < 4 / np.sqrt(z.shape[0] * z.shape[1])
 
 
-def test_weights_are_renewed_after_movement(tracker, rng, no_search):
-    weights = []
-    for px in (0.0, 0.08, 0.4, 0.4):
-        tracker.measure(noisy(_render(_shifted(px)), rng))
-        weights.append(tracker._circles[1])
-    assert weights[0] is weights[1] is not weights[2] is weights[3]
-
-
 def test_light_and_noise_may_change(tracker, clean, rng, no_search):
     for factor in (0.9, 0.5, 1.1):
         measured = tracker.measure(noisy(clean * factor, rng))
@@ -124,6 +122,64 @@ def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
     back = tracker.measure(noisy(clean, rng))
     assert len(back.observations) == before
     assert np.abs(_z(back)).max() < 5
+
+
+@pytest.fixture(scope="module", params=["aprilgrid", "charuco"])
+def board(request):
+    """Return a board and photographs of it: two from one stand, one where a pattern repeats."""
+    if request.param == "charuco":
+        pattern = (11, 8, 30.0, 22.5, "DICT_5X5_250")
+        field, sheet = charuco(*pattern), board_images.charuco_sheet(*pattern, legacy=False)
+    else:
+        field, sheet = aprilgrid(6, 6, 40.0, 0.3), board_images.aprilgrid_sheet(6, 6, 40.0, 0.3)
+    frames, away = [], np.array([150.0, -120.0, 380.0])
+    for k, step in enumerate((0.0, 0.0, 60.0 if request.param == "charuco" else 52.0)):
+        middle = field.points.mean(axis=0) + np.array([step, 0, 0])
+        stand = looking_at(middle + away, middle, 0.3)
+        frames.append(photograph([sheet], SMALL_CAMERA, stand, seed=k))
+    return field, frames
+
+
+def test_all_corners_of_a_board_are_tracked(board, monkeypatch):
+    """The squares of a ChArUco board were measured in the first frame only."""
+    field, frames = board
+    tracker = Tracker(field, CameraSpec("", SMALL_SENSOR))
+    first = tracker.measure(frames[0]).observations
+    monkeypatch.setattr(tracking, "measure", lambda *_: Measurement(Observations.none()))
+    second = tracker.measure(frames[1]).observations
+    assert np.array_equal(second.targets, first.targets)
+    assert 0 < rms(second.points - first.points) < 0.03
+
+
+def test_a_board_that_moves_by_whole_squares_keeps_its_numbers(board):
+    field, frames = board
+    tracker = Tracker(field, CameraSpec("", SMALL_SENSOR))
+    tracker.measure(frames[0])
+    moved = tracker.measure(frames[2]).observations
+    whole = Tracker(field, CameraSpec("", SMALL_SENSOR)).measure(frames[2]).observations
+    assert np.array_equal(moved.targets, whole.targets)
+    assert rms(moved.points - whole.points) < 0.01
+
+
+def test_what_was_hidden_in_the_first_frames_is_found(board, monkeypatch):
+    """Searches end once everything is seen, or become rare."""
+    field, frames = board
+    tracker = Tracker(field, CameraSpec("", SMALL_SENSOR))
+    hand = frames[0].copy()
+    hand[:, :900] = 110
+    begin = [tracker.measure(hand) for _ in range(3)]
+    seen = [tracker.measure(frames[k % 2]) for k in range(2)]
+    whole = Tracker(field, CameraSpec("", SMALL_SENSOR)).measure(frames[1])
+    assert len(begin[2].observations) < 0.6 * len(whole.observations)
+    assert np.array_equal(seen[1].observations.targets, whole.observations.targets)
+    assert "hidden" in seen[1].searched
+    searches = []
+    monkeypatch.setattr(
+        tracking, "measure", lambda *_: searches.append(1) or Measurement(Observations.none())
+    )
+    for k in range(20):
+        assert len(tracker.measure(frames[k % 2]).observations) == len(whole.observations)
+    assert len(searches) <= 5
 
 
 def test_a_knock_leads_to_a_reported_search(tracker, rng):

@@ -48,14 +48,12 @@ _WRONG_START = 5.0  # times the last sigma0; more: the camera has been knocked
 class CalibratedEpoch:
     """An epoch with its observations and its adjustment.
 
-    extra: columns for the store, from `measurement.frame_figures`; searched: why the whole frame
-    was searched, empty if it was not.
+    extra: columns for the store, from `measurement.frame_figures`.
     """
 
     epoch: Epoch
     adjustment: Adjustment
     extra: dict[str, float]
-    searched: str = ""
 
 
 class EpochCalibrator:
@@ -179,21 +177,20 @@ class Calibrator(EpochCalibrator):
         Never raises for bad data: an epoch without a result has a status and a reason.
         """
         extra: dict[str, float] = {}
-        searched = ""
         try:
             image, fingerprint = self._look(epoch, image, fingerprint)
             if repeated := self._repeated(epoch, fingerprint):
                 return repeated
             if image is not None:
                 measured = self._tracker.measure(image)
-                searched, seen = measured.searched, measured.observations
+                seen = measured.observations
                 # a corner in a uniform area, as of a damaged JPEG, is none: it has no residuals
                 seen = seen.select(np.flatnonzero((seen.sigmas > 0).all(axis=1)))
                 epoch = replace(epoch, observations=seen)
                 extra = frame_figures(seen, self.sensor)
                 if not measured.status.ok:
                     bad = failed(measured.status.word, measured.status.reason, seen)
-                    return CalibratedEpoch(epoch, bad, extra, searched)
+                    return CalibratedEpoch(epoch, bad, extra)
         except ImageError as error:
             return CalibratedEpoch(epoch, failed("bad_frame", str(error)), extra)
         if epoch.observations is None:
@@ -201,9 +198,9 @@ class Calibrator(EpochCalibrator):
             return CalibratedEpoch(epoch, failed("no_frame", why), extra)
         if not len(epoch.observations):
             bad = failed("no_observations", "no target was measured", epoch.observations)
-            return CalibratedEpoch(epoch, bad, extra, searched)
+            return CalibratedEpoch(epoch, bad, extra)
         self._remember(epoch, fingerprint)
-        return CalibratedEpoch(epoch, self.adjust(epoch.observations), extra, searched)
+        return CalibratedEpoch(epoch, self.adjust(epoch.observations), extra)
 
     def weighed(self, observations: Observations) -> Observations:
         """Return the observations with the sigmas used in the adjustment."""

@@ -13,6 +13,7 @@ Source: Terzakis and Lourakis (2020), SQPnP; Abdel-Aziz and Karara (1971), DLT.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,9 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
 
-_FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""Our camera axes to OpenCV's, whose camera looks along +Z with y down."""
+
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
 _TOLERANCE = 0.005  # of the image width, as the distortion is still unknown
 _MANY = 8  # so many pairs do not fit a pose of three of them by chance
@@ -202,7 +205,7 @@ def _residuals(
 
 
 def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
-    return ExteriorOrientation.from_rotation(R.T @ _FLIP, -R.T @ t)
+    return ExteriorOrientation.from_rotation(R.T @ FLIP, -R.T @ t)
 
 
 def resection(
@@ -271,8 +274,6 @@ class Orientation:
     @property
     def scatter(self) -> float:
         """Robust standard deviation of the residuals in px."""
-        if len(self.residuals) == 0:
-            return np.inf
         return float(mad_sd(self.residuals))
 
 
@@ -288,39 +289,24 @@ def orient(
     Codes are hardly ever misread, so a plain resection is tried first. If it does not fit, the
     robust and slower `approximate_orientation` follows. Raises its GeometryError.
     """
-    start = None
-    if len(points) >= 6:
-        start = _quick_start(sensor, points, image_points, nominal_c, interior)
-    if start is not None:
-        found = refine(sensor, *start, points, image_points, known=interior is not None)
+    lengths = _distances(sensor, _QUICK_VIEWS_DEG) if nominal_c is None else [nominal_c]
+    candidates = [InteriorOrientation(c) for c in lengths] if interior is None else [interior]
+    best = None
+    for candidate in candidates if len(points) >= 6 else ():
+        with suppress(GeometryError, cv2.error, IndexError):
+            rms, pose = resection(sensor, candidate, points, image_points)[0]
+            if best is None or rms < best[0]:
+                best = (rms, candidate, pose)
+            if best[0] < _GOOD_START * sensor.width:
+                break
+    if best is not None:
+        found = refine(sensor, *best[1:], points, image_points, known=interior is not None)
         if found.scatter < 1.5 and np.mean(np.abs(found.residuals).max(axis=1) < 8.0) > 0.8:
             return found
     i, e, inliers = approximate_orientation(sensor, points, image_points, nominal_c, interior)
     part = refine(sensor, i, e, points[inliers], image_points[inliers], interior is not None)
     residuals = _residuals(sensor, part.camera.interior, part.exterior, points, image_points)
     return Orientation(part.camera, part.exterior, residuals)
-
-
-def _quick_start(
-    sensor: Sensor,
-    X: Array,
-    uv: Array,
-    nominal_c: float | None,
-    interior: InteriorOrientation | None,
-) -> tuple[InteriorOrientation, ExteriorOrientation] | None:
-    lengths = _distances(sensor, _QUICK_VIEWS_DEG) if nominal_c is None else [nominal_c]
-    candidates = [InteriorOrientation(c) for c in lengths] if interior is None else [interior]
-    best = None
-    for candidate in candidates:
-        try:
-            rms, pose = resection(sensor, candidate, X, uv)[0]
-        except (GeometryError, cv2.error, IndexError):
-            continue
-        if best is None or rms < best[0]:
-            best = (rms, candidate, pose)
-        if best[0] < _GOOD_START * sensor.width:
-            break
-    return None if best is None else best[1:]
 
 
 def refine(

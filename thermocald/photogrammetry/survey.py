@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,11 @@ from thermocald.photogrammetry.field.testfield import (
     sheet_normals,
     target_normals,
 )
-from thermocald.photogrammetry.frame.measurement import predict_circles
+from thermocald.photogrammetry.frame.measurement import (
+    REPEATED,
+    find_repeated,
+    predict_circles,
+)
 from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
@@ -284,8 +289,10 @@ def survey(
             sensor, photos, expected.names, distances, interior=network.camera.interior,
             nominal=of_field, free=free, places=expected.points,
         )  # fmt: skip
-    template = expected if nominal is None else nominal
-    return Survey(network, surveyed_field(network, template), notes)
+    stations = {s.photo for s in network.stations}
+    left_out = {name: note for name, note in notes.items() if name not in stations}
+    network = replace(network, unused=left_out | network.unused)
+    return Survey(network, surveyed_field(network, nominal or expected), notes)
 
 
 def _first_distances(
@@ -341,7 +348,7 @@ def _measure_first(
         try:
             image = load()
         except ImageError as error:
-            notes[name] = str(error)
+            notes[name] = str(error).removeprefix(f"{name}: ")
             continue
         expected = None if sensor is None else (sensor.width, sensor.height)
         status = inspect_frame(image, expected)
@@ -383,7 +390,7 @@ def _measure_again(
     normals (n, 3): NaN where unknown. Adds to `notes`. A circle more than some pixels from its
     predicted place is another one and is left out.
     """
-    stations, photos = {s.photo: s for s in network.stations}, {}
+    stations, photos = {s.photo: s for s in network.stations}, dict[str, Observations]()
     for name, load in pictures.items():
         if name not in stations:
             continue
@@ -395,6 +402,8 @@ def _measure_again(
         off = np.linalg.norm(fit.points - maps.centre, axis=1)
         seen = corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))
         notes[name] = f"{len(seen)} targets"
-        if len(seen):
+        if same := find_repeated(seen, photos):
+            notes[name] = REPEATED.format(Path(same).name)
+        elif len(seen):
             photos[name] = seen
     return photos

@@ -323,7 +323,7 @@ class CameraDifference(Result):
     @property
     def rms_px(self) -> float:
         """The RMS of the shifts' lengths, px."""
-        return _rms(self.shifts)
+        return float(np.sqrt(2 * np.mean(self.shifts**2)))
 
     @cached_property
     def turned_shifts(self) -> Array:
@@ -359,7 +359,7 @@ class CameraDifference(Result):
             "largest_at": self._grid[worst],
             "rms_px": self.rms_px,
             "largest_turned_px": turned.max(),
-            "rms_turned_px": _rms(self.turned_shifts),
+            "rms_turned_px": np.sqrt(2 * np.mean(self.turned_shifts**2)),
         }
         if sds is not None:
             largest, rms = self._image_sds(worst)
@@ -435,8 +435,3 @@ class CameraDifference(Result):
             largest += float(along @ covariance @ along)
             rms += float(total @ covariance @ total)
         return float(np.sqrt(largest)), float(np.sqrt(rms))
-
-
-def _rms(shifts: Array) -> float:
-    """Return the RMS length of shifts (n, 2)."""
-    return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1))))

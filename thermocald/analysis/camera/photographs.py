@@ -24,7 +24,8 @@ from thermocald.photogrammetry.epoch.adjustment import (
     cold_start,
     pose_only,
 )
-from thermocald.photogrammetry.frame.measurement import measure
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated, measure
 from thermocald.photogrammetry.linalg import correlation_matrix
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
@@ -33,12 +34,12 @@ from thermocald.result import with_sds
 from thermocald.store.logger.photographs import find_copies, known_photograph
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.field.testfield import TestField
 
 _IMAGES = frozenset(
     {".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"}
@@ -125,7 +126,7 @@ class Photographs:
             return None
         free, values = self._estimated, self.interior.as_array()
         sds = np.sqrt(self.covariance.diagonal()[free])
-        return asdict(self.interior) | with_sds(_names(free), values[free], sds)
+        return asdict(self.interior) | with_sds([IOP_NAMES[i] for i in free], values[free], sds)
 
     @property
     def correlations(self) -> dict[str, Any] | None:
@@ -134,16 +135,12 @@ class Photographs:
             return None
         free = self._estimated
         matrix = correlation_matrix(self.covariance[np.ix_(free, free)])
-        return {"names": _names(free), "matrix": matrix}
+        return {"names": [IOP_NAMES[i] for i in free], "matrix": matrix}
 
     @property
     def _estimated(self) -> NDArray[np.int64]:
         """The indices of the estimated parameters of the interior orientation."""
         return np.flatnonzero((self.covariance.diagonal()[:10] > 0) & self.estimated)
-
-
-def _names(rows: NDArray[np.int64]) -> list[str]:
-    return [IOP_NAMES[i] for i in rows]
 
 
 def calibrate_photographs(
@@ -156,18 +153,21 @@ def calibrate_photographs(
     """Measure and calibrate photographs; a file that is no image gets a status and a reason."""
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
-    copies = find_copies(paths)
+    copies, usable = find_copies(paths), dict[str, Observations]()
     for k, path in enumerate(paths):
         try:
             if k in copies:
                 raise ImageError(f"is a copy of {paths[copies[k]].name}")
             found = measure(decode_grey(path), testfield, camera)
+            if same := find_repeated(found.observations, usable):
+                raise ImageError(REPEATED.format(Path(same).name))
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
-            failures[k] = (word, str(error))
+            failures[k] = (word, str(error).removeprefix(f"{path}: "))
             measured.append(None)
         else:
             measured.append(found.observations)
+            usable[str(path)] = found.observations
             if not found.status.ok:
                 failures[k] = (found.status.word, found.status.reason)
         if advance is not None:
@@ -201,14 +201,25 @@ def calibrate_observations(
     elif usable:
         try:
             start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
-            rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            oriented = {}
+            for k, o in usable.items():
+                with suppress(GeometryError):
+                    points = testfield.points[o.targets]
+                    _, oriented[k], _ = approximate_orientation(
+                        sensor, points, o.points, interior=start
+                    )
+            if not oriented:
+                raise GeometryError("no pose explains the targets of any photograph")
+            rows, poses = list(oriented), list(oriented.values())
+            chosen = [usable[k] for k in rows]
+            together = adjust_common_interior(sensor, testfield, chosen, start, poses, settings)
             left_out = together.left_out
             failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
             rows = [k for i, k in enumerate(rows) if i not in left_out]
             reason = "; ".join(together.reasons)
         except GeometryError as error:
             reason = str(error)
-    poses: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
+    found: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
     if together is None or reason:
         # the given camera is held
         status, interior, estimated = "held", camera.interior, False
@@ -223,7 +234,7 @@ def calibrate_observations(
             pose = pose_only(sensor, testfield, seen[k], interior, settings)
             if pose.ok:
                 used = ~np.isin(pose.targets, pose.rejected)
-                poses[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
+                found[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
             else:
                 failures[k] = (pose.status, pose.reason)
     else:
@@ -231,16 +242,16 @@ def calibrate_observations(
         covariance, sigma0 = together.covariance, together.sigma0
         redundancy, disagreement = together.redundancy, together.disagreement
         sds = np.sqrt(np.diagonal(together.exterior_covariances, axis1=1, axis2=2))
-        found = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
-        poses = dict(zip(rows, found, strict=True))
+        each = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
+        found = dict(zip(rows, each, strict=True))
     results = []
     for k, name in enumerate(names):
         n = len(seen[k]) if k in seen else 0
-        if k not in poses:
+        if k not in found:
             word, why = failures.get(k, ("no_orientation", "no pose explains its targets"))
             results.append(PhotographResult(name, word, why, n))
             continue
-        o, (used, rest, exterior, sd) = seen[k], poses[k]
+        o, (used, rest, exterior, sd) = seen[k], found[k]
         rms = float(np.sqrt(np.mean(rest[used] ** 2)))
         rejected = tuple(testfield.names[t] for t in o.targets[~used])
         results.append(
@@ -266,23 +277,6 @@ def _first_camera(
         # distortion from a weak photograph is a bad initial value for the others
         start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
     return start
-
-
-def _adjust_together(
-    usable: Mapping[int, Observations], testfield: TestField, sensor: Sensor,
-    interior: InteriorOrientation, settings: AdjustmentSettings,
-) -> tuple[list[int], CommonInterior]:  # fmt: skip
-    """Adjust the photographs whose targets fit a pose; return their positions and the result."""
-    rows, poses = [], []
-    for k, o in usable.items():
-        with suppress(GeometryError):
-            points = testfield.points[o.targets]
-            poses.append(approximate_orientation(sensor, points, o.points, interior=interior)[1])
-            rows.append(k)
-    if not rows:
-        raise GeometryError("no pose explains the targets of any photograph")
-    chosen = [usable[k] for k in rows]
-    return rows, adjust_common_interior(sensor, testfield, chosen, interior, poses, settings)
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:
@@ -313,15 +307,12 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
 
     Its image size is that of most photographs. Raises ImageError if none can be read.
     """
-    errors: list[ImageError] = []
     sizes: Counter[tuple[int, ...]] = Counter()
     for path in images:
-        try:
+        with suppress(ImageError):
             sizes[decode_grey(path).shape] += 1
-        except ImageError as error:
-            errors.append(error)
     if not sizes:
-        raise errors[0]
+        decode_grey(images[0])
     height, width = sizes.most_common(1)[0][0]
     pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
     return CameraSpec("camera", Sensor(width, height, pitch))

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,6 +84,8 @@ def convert(
     the target's parameters to the pixels that the source's move. Raises GeometryError if the
     source's distortion folds back inside the image.
     """
+    from scipy.optimize import least_squares  # 20 MB that a live daemon does not need
+
     if source is target:
         return values, covariance, True, 0.0, 0.0
     own = source.to_brown(sensor, values)
@@ -91,20 +94,24 @@ def convert(
         _directions(sensor, source, values, own, pixels) for pixels in (grid, check)
     )
 
-    def project_target(v: Array, d: Array) -> Array:
-        return target.project(sensor, v, d)
-
+    project_source, project_target = (partial(f.project, sensor) for f in (source, target))
     result = target.from_brown(sensor, own)
     residual = project_target(result, checked) - check
     exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
     if not exact:
-        result = _fit(project_target, result, grid, directions)
+        result = least_squares(
+            lambda v: (project_target(v, directions) - grid).ravel(), result,
+            lambda v: _derivative(project_target, v, directions),
+            x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=None, max_nfev=50,
+        ).x  # fmt: skip
         residual = project_target(result, checked) - check
     propagated = None
     if covariance is not None:
         G = _derivative(project_target, result, directions)
-        F = _derivative(lambda v, d: source.project(sensor, v, d), values, directions)
-        J = _least_squares(G, F)
+        F = _derivative(project_source, values, directions)
+        scales = np.linalg.norm(G, axis=0)
+        scales[scales == 0] = 1.0  # a parameter without effect is 0
+        J = np.linalg.lstsq(G / scales, F, rcond=1e-14)[0] / scales[:, None]
         propagated = J @ covariance @ J.T
     size = np.linalg.norm(residual, axis=1)
     return result, propagated, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
@@ -142,44 +149,6 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
         f"the {family.name} model has no rays for some of the image: its distortion folds back "
         "inside the picture; it was calibrated over a smaller area, or its parameters are wrong"
     )
-
-
-def _fit(
-    target: Callable[[Array, Array], Array], start: Array, pixels: Array, directions: Array
-) -> Array:
-    """Fit a family's parameters over the image area by Gauss-Newton with step halving."""
-
-    def cost_of(values: Array) -> float:
-        r = pixels - target(values, directions)
-        return float(np.sum(r * r)) if np.all(np.isfinite(r)) else np.inf
-
-    values = start.astype(float)
-    cost = cost_of(values)
-    for _ in range(50):
-        G = _derivative(target, values, directions)
-        step = _least_squares(G, (pixels - target(values, directions)).reshape(-1, 1))[:, 0]
-        for _halving in range(20):
-            new = cost_of(values + step)
-            if new < cost:
-                break
-            step /= 2
-        else:
-            return values
-        values = values + step
-        if cost - new < 1e-12 * cost:
-            return values
-        cost = new
-    return values
-
-
-def _least_squares(G: Array, rhs: Array) -> Array:
-    """Solve G (n, u) for rhs (n, k); return (u, k), 0 for parameters whose column of G is 0."""
-    scales = np.linalg.norm(G, axis=0)
-    used = scales > 0
-    found = np.zeros((G.shape[1], rhs.shape[1]))
-    scaled = G[:, used] / scales[used]
-    found[used] = np.linalg.lstsq(scaled, rhs, rcond=1e-14)[0] / scales[used, None]
-    return found
 
 
 def _derivative(

@@ -92,9 +92,16 @@ def weaknesses(
                 f"the targets cover {coverage:.1%} of the image (at least {bounds.coverage:.0%} "
                 "are needed)"
             )
-    pair = _strongest_correlation(covariance, sd, bounds.correlation)
-    if pair:
-        reasons.append(pair)
+    # only pairs with an IOP: correlated EOP do no harm to the camera
+    scale = 1.0 / np.where(sd > 0, sd, np.inf)
+    inner = np.abs(covariance[: len(IOP_NAMES)] * scale) * scale[: len(IOP_NAMES), None]
+    inner.flat[:: len(sd) + 1] = 0.0
+    i, j = divmod(int(inner.argmax()), len(sd))
+    if inner[i, j] > bounds.correlation:
+        reasons.append(
+            f"{PARAMETER_NAMES[i]} and {PARAMETER_NAMES[j]} correlate at {inner[i, j]:.5f} "
+            f"(bound {bounds.correlation})"
+        )
     return reasons
 
 
@@ -125,19 +132,3 @@ def _has_depth(points: Array) -> bool:
     (a, b, c), (_, d, e), (_, _, f) = (points.T @ reduced).tolist()
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     return bool(determinant > 1e-4 * (a + d + f) ** 3)
-
-
-def _strongest_correlation(covariance: Array, sd: Array, bound: float) -> str:
-    # Only pairs with an IOP: correlated EOP do no harm to the camera.
-    n = len(IOP_NAMES)
-    scale = 1.0 / np.where(sd > 0, sd, np.inf)
-    inner = np.abs(covariance[:n] * scale)
-    inner *= scale[:n, None]
-    inner.flat[:: len(sd) + 1] = 0.0
-    i, j = divmod(int(inner.argmax()), len(sd))
-    if inner[i, j] <= bound:
-        return ""
-    return (
-        f"{PARAMETER_NAMES[i]} and {PARAMETER_NAMES[j]} correlate at {inner[i, j]:.5f} "
-        f"(bound {bound})"
-    )

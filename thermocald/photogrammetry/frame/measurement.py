@@ -27,7 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
-from thermocald.photogrammetry.targets.boards import find_chessboards, predict_corners
+from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, Word, inspect_frame
@@ -40,6 +40,8 @@ from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_ma
 from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
@@ -104,15 +106,15 @@ class Measurement:
 
     observations: none if the status is not ok; missed: {row: reason} for targets of the field that
     are in view and not measured; orientation: approximate, None if the targets do not determine
-    it; markers: places of the marker corners; searched: why a tracker searched the whole frame,
-    empty if it measured in windows only.
+    it; corners: where corners of markers and squares are, measured or not; searched: why a tracker
+    searched the whole frame, empty if it measured in windows only.
     """
 
     observations: Observations
     status: FrameStatus = OK
     missed: dict[int, str] = field(default_factory=dict)
     orientation: Orientation | None = None
-    markers: Corners | None = None
+    corners: Corners = field(default_factory=Corners.none)
     searched: str = ""
 
 
@@ -140,15 +142,16 @@ class _Frame:
     def __init__(self, image: Image, testfield: TestField, camera: CameraSpec) -> None:
         self._image, self._field, self._camera = image, testfield, camera
         self._missed: dict[int, str] = {}
-        self._markers = locate_markers(image, testfield, self._missed)
+        self._markers = self._places = locate_markers(image, testfield, self._missed)
 
     def measure(self) -> Measurement:
         """Measure markers and squares, then the circles."""
         if turned := corners_turned_deg(self._markers, self._field):
             return self._other_field(_TURNED.format(turned))
-        corners = measure_corners(self._image, self._markers, self._missed)
         if "chess_corner" in self._field.kinds:
-            corners = corners.joined(find_chessboards(self._image, self._field, self._missed))
+            boards = locate_chessboards(self._image, self._field, self._missed)
+            self._places = self._markers.joined(boards)
+        corners = measure_corners(self._image, self._places, self._missed)
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
             return self._finish(corners)
@@ -178,6 +181,7 @@ class _Frame:
         except GeometryError:
             return Observations.none()
         places = predict_corners(self._field, rows, orientation, self._markers)
+        self._places = self._places.joined(places)
         found = measure_corners(self._image, places, self._missed)
         for row in found.targets.tolist():
             self._missed.pop(row, None)
@@ -246,10 +250,9 @@ class _Frame:
             and np.abs(new_maps.second - maps.second).max(initial=0.0) < _SETTLED_PX
         )
         if not settled:
-            start = None
+            start = fit.parameters if same and good.all() else None
             if same:
                 new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
-                start = fit.parameters if good.all() else None
             rows = new_rows
             fit = fit_circles(image, new_maps, have_rings(field, rows), blur, None, start)
         # a circle far from the predicted place is not the target
@@ -283,11 +286,11 @@ class _Frame:
         elif n < _FEWEST:
             word, why = "too_few", f"only {n} targets are found in the frame"
         status = FrameStatus(word, why)
-        return Measurement(observations, status, self._missed, orientation, self._markers)
+        return Measurement(observations, status, self._missed, orientation, self._places)
 
     def _other_field(self, why: str) -> Measurement:
         status = FrameStatus("other_field", why)
-        return Measurement(Observations.none(), status, self._missed, None, self._markers)
+        return Measurement(Observations.none(), status, self._missed, None, self._places)
 
 
 def _why_nothing(missed: dict[int, str]) -> str:
@@ -300,6 +303,26 @@ def _why_nothing(missed: dict[int, str]) -> str:
     return f"{len(reasons)} targets are seen and none can be measured: {word} ({count})" + (
         f"; {remedy}" if remedy else ""
     )
+
+
+REPEATED = "shows the view of {}, with the same errors: a copy in another encoding? Counts once"
+_SAME_SHARE = 0.9
+_SAME_ERRORS = 0.5  # of the differences that independent errors would have
+
+
+def find_repeated(observations: Observations, earlier: Mapping[str, Observations]) -> str | None:
+    """Return the name of earlier observations of the same view with the same errors, or None.
+
+    So is a photograph in another encoding: it would count twice.
+    """
+    for name, other in earlier.items():
+        both, i, j = np.intersect1d(observations.targets, other.targets, return_indices=True)
+        if len(both) >= max(_SAME_SHARE * max(len(observations), len(other)), _FEWEST):
+            sigmas = np.hypot(observations.sigmas[i], other.sigmas[j])
+            z = (observations.points[i] - other.points[j]) / sigmas
+            if np.mean(z**2) < _SAME_ERRORS**2:
+                return name
+    return None
 
 
 _FEWEST_BLURS = 6
@@ -317,10 +340,10 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
     is absent.
     """
     figures: dict[str, float] = {}
-    for name in ("contrast", "grey", "noise", "saturation"):
+    for name in ("contrast", "grey", "noise", "saturation", "blur"):
         values = observations.quality.get(name)
         if values is not None and np.isfinite(values).any():
-            figures[name] = float(np.nanmedian(values))
+            figures["blur_px" if name == "blur" else name] = float(np.nanmedian(values))
     blur = observations.quality.get("blur")
     if blur is not None and np.isfinite(blur).sum() >= _FEWEST_BLURS:
         values, sd = blur_trend(observations.points, blur, sensor)
@@ -328,8 +351,6 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
             ("blur_px", "blur_trend_x", "blur_trend_y", "blur_curvature"), values, sd, strict=True
         ):
             figures[name], figures[f"sd_{name}"] = float(value), float(s)
-    elif blur is not None and np.isfinite(blur).any():
-        figures["blur_px"] = float(np.nanmedian(blur))
     return figures
 
 

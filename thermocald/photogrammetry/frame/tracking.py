@@ -7,6 +7,11 @@
 A tracker stores where the targets were in the last frame, and no image. Of an encoded image only
 the parts around the targets are decoded, if its format allows it.
 
+A hidden circle is looked for at its predicted place. While markers that a search missed are not
+seen (somebody stood in front of them), the whole frame is searched again 1, 2, 4, 8 … frames later:
+they are found after twice the time at most. If corners are suddenly lost, it is searched at once: a
+board that has moved by a whole square would be tracked with other numbers.
+
 Fixed gradient weights give the next epoch's centres as weighted sums of grey values: between epochs
 a centre moves by hundredths of a pixel, so that the blurred disc of the last fit is still right to
 first order. One step of Gauss-Newton from it is a sum over pixels with constant weights:
@@ -23,13 +28,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
-from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import Measurement, measure, predict_circles
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
-from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel, inspect_frame
+from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.photogrammetry.targets.outline import LocalMap, window_reach, windows
 from thermocald.photogrammetry.targets.ring_code import have_rings
@@ -39,6 +43,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Image, Single
     from thermocald.photogrammetry.camera.camera_model import CameraSpec
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +131,7 @@ _ITERATIONS = 6
 _MISFIT = 1.5  # of the epoch's median; a target with more is fitted again
 _LOST_SHARE = 0.3
 _RENEW_SHARE = 0.1
+_SUDDEN_LOSS = 0.95  # share of the targets that remain
 _FEWEST = 4
 _MARGIN_PX = 3.0  # around the windows; if targets move farther, the whole frame is decoded
 
@@ -144,36 +150,53 @@ class Tracker:
     def reset(self) -> None:
         """Forget the tracked targets; the next frame is searched."""
         self._shape: tuple[int, ...] | None = None  # of the frames, while something is tracked
+        self._missed: frozenset[int] = frozenset()  # targets that no frame has shown since a search
+        self._age = self._seen = 0  # frames since the search; targets in the last frame
+        self._corners = Corners.none()
 
     def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
         """Measure a frame (H, W), grey, 8 or 16 bit.
 
         Never raises for a bad frame, except ImageError if an encoded image cannot be decoded.
         """
+        self._age += 1
+        due = bool(self._missed) and self._age & (self._age - 1) == 0  # a power of two
+        fewest = _SUDDEN_LOSS * self._seen if self._corners else 0.0
         if isinstance(image, EncodedImage):
-            if self._shape is not None and self._dtype == np.uint8:
-                parts = image.around(_boxes(self._circles, self._markers), self._shape)
+            if self._shape is not None and self._dtype == np.uint8 and not due:
+                parts = image.around(_boxes(self._circles, self._corners), self._shape)
                 found = None if parts is None else self._track(parts, _MARGIN_PX)
-                if found is not None:
+                if found is not None and len(found.observations) >= fewest:
                     return found
             image = image.whole()
         if self._shape is None:
             return self._search(image, "nothing is tracked yet")
-        if image.shape != self._shape:
-            status = inspect_frame(image, (self._shape[1], self._shape[0]))
-            return Measurement(Observations.none(), status)
-        if image.dtype != self._dtype:
-            return self._search(image, f"the frame is {image.dtype}, it was {self._dtype}")
-        return self._track(image) or self._search(
-            image, f"too many of {self._seen} targets were lost"
-        )
+        if image.shape != self._shape or image.dtype != self._dtype:
+            return self._search(image, f"the frame is {image.shape} {image.dtype}")
+        tracked = self._track(image)
+        if tracked is None:
+            return self._search(image, f"too many of {self._seen} targets were lost")
+        if due or len(tracked.observations) < fewest:
+            return self._search(image, "targets are seen that were hidden, or moved", tracked)
+        return tracked
 
-    def _search(self, image: NDArray[Any], why: str) -> Measurement:
+    def _search(
+        self, image: NDArray[Any], why: str, tracked: Measurement | None = None
+    ) -> Measurement:
+        """Search the whole frame; return `tracked` if that has as many targets where they are."""
         found = measure(image, self._testfield, self._camera)
+        if tracked is not None:
+            a, b = found.observations, tracked.observations
+            _, i, j = np.intersect1d(a.targets, b.targets, return_indices=True)
+            off = np.abs(a.points[i] - b.points[j])
+            if len(a) <= len(b) and not (off.size and np.median(off) > _MARGIN_PX):
+                return tracked
         # after a bad frame the targets may still be at their last places
         if found.status.ok:
             self._shape, self._dtype, self._seen = image.shape, image.dtype, len(found.observations)
-            self._circles, self._markers = self._begin(image, found), found.markers or None
+            self._circles, self._corners = self._begin(image, found), found.corners
+            placed = () if self._circles is None else self._circles[0].tolist()
+            self._missed, self._age = frozenset(found.missed).difference(placed), 0
         return replace(found, searched=why)
 
     def _begin(self, image: Image, found: Measurement) -> _Circles | None:
@@ -204,11 +227,8 @@ class Tracker:
     def _track(self, image: Image, farthest: float = np.inf) -> Measurement | None:
         """Measure in windows; None if too many targets are lost or moved beyond `farthest` px."""
         missed: dict[int, str] = {}
-        found, circles = Observations.none(), self._circles
-        markers = self._markers
-        if markers is not None:
-            found = measure_corners(image, markers, missed)
-            markers = markers.moved(found)
+        circles = self._circles
+        found = measure_corners(image, self._corners, missed)
         if circles is not None:
             tracked = _track_circles(image, circles, missed, farthest)
             if tracked is None:
@@ -216,21 +236,20 @@ class Tracker:
             found, circles = found.joined(tracked[0]), tracked[1]
         if len(found) < max(_FEWEST, (1 - _LOST_SHARE) * self._seen):
             return None
-        self._seen, self._circles, self._markers = len(found), circles, markers
-        return Measurement(found, OK, missed, None, markers)
+        self._seen, self._circles = len(found), circles
+        self._corners = self._corners.moved(found)
+        self._missed = self._missed.difference(found.targets.tolist())
+        return Measurement(found, OK, missed, None, self._corners)
 
 
-def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int64]:
+def _boxes(circles: _Circles | None, corners: Corners) -> NDArray[np.int64]:
     """Return the boxes (n, 4) px used in the next frame: left, top, right, bottom (exclusive)."""
-    centres, halves = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    centres, halves = [corners.places], [np.full((len(corners), 2), CORNER_REACH_PX)]
     if circles is not None:
         weights = circles[1]
         centres.append(weights.parameters[:, :2])
         reach = window_reach(float(np.median(weights.parameters[:, 5])))
         halves.append(weights.maps.half_extent + reach)
-    if markers is not None:
-        centres.append(markers.places)
-        halves.append(np.full((len(markers), 2), CORNER_REACH_PX))
     centre, half = np.concatenate(centres), np.concatenate(halves) + _MARGIN_PX + 1.0
     low, high = np.floor(centre - half), np.ceil(centre + half) + 1.0
     return np.column_stack([low, high]).astype(np.int64)

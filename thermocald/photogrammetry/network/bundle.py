@@ -270,6 +270,16 @@ class BundleAdjustment:
             bundle = stage.solve(bundle, robust=True, iterations=iterations)
         return bundle
 
+    def with_held_targets(self, bundle: Bundle) -> BundleAdjustment:
+        """Return the adjustment that holds known targets and adds their covariance to the rays'."""
+        assert self.known is not None
+        by_target = self._linearised(bundle, np.ones(len(self.rays)))[2]
+        J = by_target / np.sqrt(self.known.weights)[self.rays.target, None]
+        root = np.linalg.cholesky(np.eye(2) + J @ np.swapaxes(J, 1, 2))
+        rays = replace(self.rays, whitening=np.linalg.solve(root, self.rays.whitening))
+        held = self.known._replace(uncertain=np.zeros_like(self.known.uncertain))
+        return replace(self, rays=rays, known=held)
+
     def cofactors(self, bundle: Bundle) -> Cofactors:
         """Return the cofactors at the solution. Raises GeometryError if it is undetermined."""
         normals = self._normal_equations(bundle, np.ones(len(self.rays)))

@@ -27,7 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
-from thermocald.photogrammetry.epoch.snooping import settle
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 _ITERATIONS = 200
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _GROSS = 20.0  # times the usual residual; an image point beyond it is left out at first
+_GROSS_OF_FEW = 5.0  # the same with the targets held
 _POOR = 4.0  # times the residuals of a typical photograph
 _FEWEST_TO_COMPARE = 4  # photographs
 _ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
@@ -106,14 +107,17 @@ def adjust_common_interior(
     bundle = Bundle(interior.as_array(), np.array(rotations), np.array(centres), places)
     every = BundleAdjustment(sensor, rays, free, known)
     in_pixels = replace(every, rays=rays.in_pixels())
-    start, left_out = bundle, dict[int, str]()
-    used = every_ray = np.ones(len(rays), dtype=bool)
+    used, left_out = np.ones(len(rays), dtype=bool), dict[int, str]()
+    # what the image points show of their noise; targets with sigmas absorb residuals
+    shown = 2 * len(rays) - len(free) - 6 * len(photographs) - 3 * int(uncertain.sum())
+    few = shown < TRUSTED_REDUNDANCY
+    robust = every.with_held_targets(bundle) if few else every
     with suppress(GeometryError):
-        bundle = every.approach(bundle, _ITERATIONS)
-        size = np.linalg.norm(every.residuals(bundle), axis=1)
+        bundle = robust.approach(bundle, _ITERATIONS)
+        size = np.linalg.norm(robust.residuals(bundle), axis=1)
         left_out = _contradicting(in_pixels.residuals(bundle), size, rays.photo)
         if s.snooping_alpha > 0:
-            used = size <= _GROSS * max(float(np.median(size)), 1.0)
+            used = size <= (_GROSS_OF_FEW if few else _GROSS) * max(float(np.median(size)), 1.0)
     if left_out:
         others = [i for i in range(len(photographs)) if i not in left_out]
         starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[others]]
@@ -122,13 +126,7 @@ def adjust_common_interior(
         rest = adjust_common_interior(sensor, testfield, chosen, interior, starts, s)
         more = {others[i]: reason for i, reason in rest.left_out.items()}
         return replace(rest, left_out=left_out | more)
-    try:
-        bundle, part, found, used, redundancy = _snooped(every, bundle, used, s)
-    except GeometryError:
-        if bundle is start:
-            raise
-        # few image points in a weak geometry: a robust adjustment may follow the wrong ones
-        bundle, part, found, used, redundancy = _snooped(every, start, every_ray, s)
+    bundle, part, found, used, redundancy = _snooped(every, bundle, used, few, s)
     variance = part.cost(bundle, part.residuals(bundle), np.ones(len(part.rays))) / redundancy
     f, eops = len(free), bundle.exteriors()
     # how weak the geometry is, whatever the photographs disagree in
@@ -154,11 +152,12 @@ def adjust_common_interior(
 
 
 def _snooped(
-    every: BundleAdjustment, bundle: Bundle, used: Mask, s: AdjustmentSettings
+    every: BundleAdjustment, bundle: Bundle, used: Mask, few: bool, s: AdjustmentSettings
 ) -> tuple[Bundle, BundleAdjustment, Cofactors, Mask, int]:
     """Adjust by turns with data snooping, first with the image points `used` (n,).
 
-    Returns the bundle, its adjustment with cofactors, the mask of image points and the redundancy.
+    few: see `snoop_rays`. Returns the bundle, its adjustment with cofactors, the mask of image
+    points and the redundancy.
     """
     rays = every.rays
     history = np.zeros(len(rays), dtype=np.int8)
@@ -179,7 +178,7 @@ def _snooped(
         # variance of a residual: less than the noise's if the ray was used, more if it was not
         signs = np.where(used, -1.0, 1.0)[:, None, None]
         tests = point_tests(v, np.eye(2) + signs * every.explained(bundle, found))
-        kept = settle(history, used, snoop_rays(tests, rays.target, used, s.snooping_alpha))
+        kept = settle(history, used, snoop_rays(tests, rays.target, used, s.snooping_alpha, few))
         if kept is used:
             break
         used = kept
@@ -220,14 +219,20 @@ def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
     return result
 
 
-def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
-    """Return the mask of image points to keep; only the worst ray of a target goes at a time."""
+def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float, few: bool) -> Mask:
+    """Return the mask of image points to keep; only the worst ray of a target goes at a time.
+
+    few: if the residuals cannot show the noise, the stated sigmas are the scale, and of all rays
+    only the worst goes, as a gross error distorts its neighbours.
+    """
     if alpha <= 0:
         return used
     # χ² with 2 degrees of freedom
-    limit = -2.0 * np.log(alpha) * median_variance(tests[used])
+    limit = -2.0 * np.log(alpha) * max(median_variance(tests[used]), float(few))
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])
+    if few:
+        worst[:] = worst.max()
     kept: Mask = (tests <= limit) | (used & (tests < worst[target]))
     return kept
 

@@ -22,13 +22,12 @@ from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 from thermocald.photogrammetry.network.bundle import Bundle, BundleAdjustment, ImageRays
-from thermocald.photogrammetry.orientation import majority_pose
+from thermocald.photogrammetry.orientation import FLIP, majority_pose
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
 
 
-_FLIP = np.diag([1.0, -1.0, -1.0])  # our camera axes to OpenCV's
 _INLIER_PX = 6.0
 _MIN_RESECTION = 6
 _MIN_PAIR = 8
@@ -46,7 +45,7 @@ class _Start:
 
     def __init__(self, sensor: Sensor, interior: Array, rays: ImageRays, n_targets: int) -> None:
         self.sensor, self.interior, self.rays = sensor, interior, rays
-        self.directions = camera_rays(sensor, interior, rays.points) @ _FLIP
+        self.directions = camera_rays(sensor, interior, rays.points) @ FLIP
         self.normalised: Array = self.directions[:, :2] / self.directions[:, 2:]
         self.threshold = _INLIER_PX * sensor.pixel_pitch / float(interior[0])
         self.poses: dict[int, tuple[Array, Array]] = {}  # OpenCV: x_camera = R x + t
@@ -65,10 +64,9 @@ class _Start:
         known, image = self.points[self.rays.target[rows]], self.normalised[rows]
         fewest = max(_MIN_RESECTION, len(rows) // 3)
         found = majority_pose(known, image, self.threshold, fewest, seed=1)
-        if found is None:
-            return False
-        self.poses[photo] = found[:2]
-        return True
+        if found is not None:
+            self.poses[photo] = found[:2]
+        return found is not None
 
     def intersect(self) -> None:
         """Intersect every target that oriented photographs see at a sufficient angle."""
@@ -101,14 +99,14 @@ class _Start:
         t = np.array([self.poses[p][1] for p in photos])
         centres = -np.einsum("nji,nj->ni", R, t)
         points = np.where(np.isfinite(self.points), self.points, 0.0)
-        return Bundle(self.interior, np.swapaxes(R, 1, 2) @ _FLIP, centres, points), photos, used
+        return Bundle(self.interior, np.swapaxes(R, 1, 2) @ FLIP, centres, points), photos, used
 
     def refine(self) -> None:
         """Adjust the bundle so far by a few robust iterations, the interior orientation held."""
         bundle, photos, used = self.bundle()
         held = BundleAdjustment(self.sensor, used, np.array([], dtype=int))
         bundle = held.solve(bundle, robust=True, iterations=4)
-        R = _FLIP @ np.swapaxes(bundle.rotations, 1, 2)
+        R = FLIP @ np.swapaxes(bundle.rotations, 1, 2)
         for i, photo in enumerate(photos):
             self.poses[photo] = (R[i], -R[i] @ bundle.centres[i])
         known = np.isfinite(self.points[:, 0])
@@ -205,12 +203,8 @@ def approximate(
     interior parameters to estimate. Returns the bundle, its photographs, and their rays,
     renumbered. Raises GeometryError if nothing can be oriented.
     """
-    width_mm = max(sensor.width, sensor.height) * sensor.pixel_pitch
-    trials = (
-        [InteriorOrientation(c=ratio * width_mm) for ratio in _TRIAL_DISTANCES]
-        if interior is None
-        else [interior]
-    )
+    width = max(sensor.width, sensor.height) * sensor.pixel_pitch
+    trials = [interior] if interior else [InteriorOrientation(k * width) for k in _TRIAL_DISTANCES]
     best: tuple[int, float, Bundle, list[int], ImageRays] | None = None
     for trial in trials:
         start = _Start(sensor, trial.as_array(), rays, n_targets)

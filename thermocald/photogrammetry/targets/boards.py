@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from thermocald.errors import TestFieldError
-from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.corner import Corners, measure_corners
+from thermocald.photogrammetry.targets.corner import Corners
 from thermocald.photogrammetry.targets.markers import (
     LARGE_PIXELS,
     SMALLEST_SIDE_PX,
@@ -219,16 +219,16 @@ def parse_chess(code: str) -> tuple[int, int, int]:
     return columns, rows, number
 
 
-def find_chessboards(
+def locate_chessboards(
     image: NDArray[Any], testfield: TestField, missed: dict[int, str]
-) -> Observations:
-    """Find and measure the plain chessboards of a field; `missed` receives {row: reason}."""
+) -> Corners:
+    """Find a field's plain chessboards; `missed` receives {row: reason} for corners not found."""
     boards: dict[tuple[int, int], dict[int, int]] = {}
     for row, code in enumerate(testfield.codes):
         if code.startswith("CHESS:"):
             columns, rows, number = parse_chess(code)
             boards.setdefault((columns, rows), {})[number] = row
-    found = Observations.none()
+    found = Corners.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():
         grid = _find_board(grey, columns, rows)
@@ -241,8 +241,7 @@ def find_chessboards(
         )
         size = np.minimum(np.linalg.norm(across, axis=1), np.linalg.norm(along, axis=1))
         places = np.array([row_of[n] for n in numbers], dtype=np.int64)
-        corners = Corners(places, at, at + across, at + along, _QUIET_SHARE * size)
-        found = found.joined(measure_corners(image, corners, missed))
+        found = found.joined(Corners(places, at, at + across, at + along, _QUIET_SHARE * size))
     return found
 
 

@@ -199,6 +199,7 @@ _CONVERGED_PX = 0.03
 _BLUR_SETTLED_PX = 0.1
 _FLAT = 0.003  # of the contrast per px of movement
 _FEWEST_FOR_LEVEL = 8
+_LEAST_CONTRAST = 6.0  # times the noise
 _ITERATIONS = 12
 _MISFIT = 2.0  # largest residual sd, in the frame's noise, of a target that is not covered
 _MISFIT_CONTRAST = 0.015
@@ -319,9 +320,11 @@ def fit_circles(
         cut[w.rows] = w.cut
     saturation /= np.maximum(pixels, 1)
     variance = square / np.maximum(pixels - 10, 1)
-    if not given and n >= _FEWEST_FOR_LEVEL:
-        # Its level is that of all residuals, since paper and compression cause noise at edges too.
-        level = float(np.median(variance))
+    shown = np.abs(parameters[:, 7]) > _LEAST_CONTRAST * _noise_sd(parameters, noise)
+    if not given and np.count_nonzero(shown) >= _FEWEST_FOR_LEVEL:
+        # Its level is that of all residuals, since paper and compression cause noise at edges too;
+        # but a hand or a glare of one grey value has no noise.
+        level = float(np.median(variance[shown]))
         noise, variance, normal = noise.scaled(level), variance / level, normal / level
     # A target that is significantly noisier than the frame has its own noise.
     own = np.where(variance > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), variance, 1.0)
@@ -374,13 +377,18 @@ def _step(
     return p, value + change, residual - change, N, step, settled, flat
 
 
+def _noise_sd(parameters: Array, noise: NoiseModel) -> Array:
+    """Return the noise (n,) DN of the brighter of disc and background."""
+    return np.asarray(np.sqrt(noise.variance(parameters[:, 6] + np.maximum(parameters[:, 7], 0))))
+
+
 def _reasons(
     fit: CircleFit, maps: LocalMap, cut: NDArray[np.bool_], pixels: Array, step: Array
 ) -> NDArray[Any]:
     minor = maps.semi_axes[:, 1]
     p = fit.parameters
     move = np.hypot(*(p[:, :2] - maps.centre).T)
-    noise_sd = np.sqrt(fit.noise.variance(np.maximum(p[:, 6], p[:, 6] + p[:, 7])))
+    noise_sd = _noise_sd(p, fit.noise)
     shape = np.abs(p[:, 2:5]).max(axis=1, initial=0.0)
     misfit_dn = fit.misfit * noise_sd
     sharpness = np.clip(1 - p[:, 5] / _ROUND_FROM_PX, 0, 1)
@@ -390,7 +398,10 @@ def _reasons(
         (cut, "cut off by the image's edge"),
         ((minor < _SMALLEST_SEMI_AXIS_PX) | (pixels < _FEWEST_PIXELS), "too small"),
         (fit.saturation > _LARGEST_SATURATION, "saturated"),
-        (~np.isfinite(p).all(axis=1) | (np.abs(p[:, 7]) < 6 * noise_sd), "too little contrast"),
+        (
+            ~np.isfinite(p).all(axis=1) | (np.abs(p[:, 7]) < _LEAST_CONTRAST * noise_sd),
+            "too little contrast",
+        ),
         (p[:, 5] > np.maximum(0.75 * minor, 1.2), "too blurred for its size"),
         (
             (move > np.maximum(_LARGEST_MOVE * minor, 2.0))

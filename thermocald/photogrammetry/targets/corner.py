@@ -29,7 +29,7 @@ from thermocald.photogrammetry.targets.circle import first_reasons, normal_cdf
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array, Image, Single
+    from thermocald.arrays import Array, Image, Mask, Single
 
 
 REACH_PX = 10.0
@@ -43,6 +43,7 @@ _LARGEST_MOVE_PX = 1.5
 _LARGEST_MOVE_SHARE = 0.015  # of the side, in addition: reduced images cut outlines short
 _BLUR_LIMITS_PX = (0.3, 4.0)
 _SADDLE_REACH = 0.25  # of the marker's side
+_FAR = 40.0  # standard deviations of the blur; the series would overflow where a fit runs away
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
 
@@ -64,9 +65,21 @@ class Corners:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def part(self, some: slice) -> Corners:
+    @classmethod
+    def none(cls) -> Corners:
+        """Return no corners."""
+        places = np.empty((0, 2))
+        return cls(np.empty(0, dtype=np.int64), places, places, places, np.empty(0))
+
+    def select(self, some: slice | Mask) -> Corners:
         """Return some of the corners."""
         return Corners(*(getattr(self, f.name)[some] for f in fields(self)))
+
+    def joined(self, other: Corners) -> Corners:
+        """Return these corners and others, whose places count if both have a corner."""
+        mine = self.select(~np.isin(self.rows, other.rows))
+        pairs = ((getattr(mine, f.name), getattr(other, f.name)) for f in fields(self))
+        return Corners(*(np.concatenate(pair) for pair in pairs))
 
     def moved(self, found: Observations) -> Corners:
         """Move places and neighbours to the observed corners, those not observed by the median."""
@@ -90,7 +103,7 @@ def measure_corners(
     """
     found = Observations.none()
     for i in range(0, len(corners), _CHUNK):
-        some, reasons = _fit(image, corners.part(slice(i, i + _CHUNK)))
+        some, reasons = _fit(image, corners.select(slice(i, i + _CHUNK)))
         if missed is not None:
             missed.update(reasons)
         found = found.joined(some)
@@ -126,7 +139,7 @@ def _model(p: Array, x: Array, y: Array, saddle: NDArray[np.bool_]) -> tuple[Sin
     k: Single = ((c2 * dx + s2 * dy) / s).astype(np.float32, copy=False)
     rho = np.clip(c1 * c2 + s1 * s2, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
     root = np.sqrt(1 - rho * rho)
-    w = _wedge(h, k, rho)
+    w = _wedge(np.clip(h, -_FAR, _FAR), np.clip(k, -_FAR, _FAR), rho)
     norm = np.float32(1 / np.sqrt(2 * np.pi))
     wh = norm * np.exp(-0.5 * h * h) * normal_cdf((k - rho * h) / root)
     wk = norm * np.exp(-0.5 * k * k) * normal_cdf((h - rho * k) / root)

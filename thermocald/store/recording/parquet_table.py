@@ -14,6 +14,7 @@ import hashlib
 import logging
 import os
 import shutil
+import tempfile
 import time
 from contextlib import suppress
 from itertools import chain
@@ -179,10 +180,18 @@ def parse_once(table: Table) -> Table:
 
 
 def _cache() -> Path:
-    """Return the folder of copies, made if needed; OSError or RuntimeError if it cannot be."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "thermocald"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    """Return the folder of copies, which must be this user's own; OSError if it is not."""
+    with suppress(OSError, RuntimeError):
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(base) / "thermocald"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    folder = Path(tempfile.gettempdir()) / f"thermocald-{os.geteuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    owner = folder.lstat()
+    if folder.is_symlink() or owner.st_uid != os.geteuid() or owner.st_mode & 0o077:
+        raise OSError(f"{folder} is not this user's own")
     return folder
 
 

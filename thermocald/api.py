@@ -7,7 +7,7 @@ Wrong input raises the errors of `thermocald.errors`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +16,12 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camer
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.physics.model import ThermalModel
 from thermocald.series import (
     COLDEST_C,
+    Progress,
+    Say,
     Series,
     check_exterior,
     free_names,
@@ -30,20 +34,22 @@ from thermocald.series import open as open_series
 if TYPE_CHECKING:
     from thermocald.analysis.study.series_study import StudySettings
     from thermocald.discovery.plan import Plan
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.physics.model import ModelEffect
     from thermocald.physics.presets import Catalogue
     from thermocald.results import Calibration, Discovery, Study
     from thermocald.thermal.series import ReducedSeries
 
-Progress = Callable[[int], None] | None
+Paths = Path | str | Sequence[Path | str]
+Field = TestField | Path | str
+Model = ThermalCamera | ThermalModel | Path | str
+Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str
 
 
 def import_photographs(
-    photographs: Path | str | Sequence[Path | str],
+    photographs: Paths,
     *,
     log: Path | str,
-    testfield: TestField | Path | str,
+    testfield: Field,
     timezone: str | None = None,
     pixel_pitch: float | None = None,
     camera: Path | str | None = None,
@@ -84,7 +90,7 @@ def import_photographs(
     return open_series(out)
 
 
-def read_testfield(source: TestField | Path | str) -> TestField:
+def read_testfield(source: Field) -> TestField:
     """Read a testfield.csv: the targets' names, coordinates and standard deviations, mm.
 
     Raises TestFieldError, which names the line and the column.
@@ -93,15 +99,14 @@ def read_testfield(source: TestField | Path | str) -> TestField:
     >>> len(field), field.points.shape
     (147, (147, 3))
     """
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.testfield_file import read_testfield as read
 
     return source if isinstance(source, TestField) else read(source_of(source))
 
 
 def calibrate(
-    images: Path | str | Sequence[Path | str],
-    testfield: TestField | Path | str,
+    images: Paths,
+    testfield: Field,
     *,
     camera: Path | str | None = None,
     pixel_pitch: float | None = None,
@@ -220,8 +225,8 @@ def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
 
 def fit(
     *series: Series,
-    effects: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str = (),
-    model: ThermalCamera | ThermalModel | Path | str | None = None,
+    effects: Effects = (),
+    model: Model | None = None,
     T0: float | None = None,
     kind: str | Path | ThermalModel | None = None,
     jobs: int = 1,
@@ -247,7 +252,6 @@ def fit(
         fit_with_type,
         require_type,
     )
-    from thermocald.physics.model import ThermalModel
     from thermocald.physics.model_file import read_model
     from thermocald.thermal.hypothesis import check_names
     from thermocald.thermal.reduce import reduce_series
@@ -288,9 +292,9 @@ def discover(
     series: Series,
     *,
     verify: Sequence[Series] = (),
-    model: ThermalCamera | ThermalModel | Path | str | None = None,
+    model: Model | None = None,
     jobs: int = 1,
-    say: Callable[[str], None] | None = None,
+    say: Say = None,
 ) -> Discovery:
     """Find where simulation and measurement disagree, and name and verify the missing effect.
 
@@ -310,7 +314,6 @@ def discover(
 
     require_within(jobs=(jobs, 1, 256))
     tell = say or (lambda _: None)
-    require_series(verify)
     every = (series, *verify)
     require_series(every)
     start = _model_of(model)
@@ -331,7 +334,7 @@ def plan(
     *,
     preset: str | None = None,
     model: Path | str | None = None,
-    testfield: str | None = None,
+    testfield: Path | str | None = None,
     programme: Path | str | None = None,
     strength_px: float = 0.1,
     seeds: int = 2,
@@ -352,11 +355,9 @@ def plan(
 
     require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
-    source = None
-    if series is not None:
-        require_series((series,))
-        source = series.observed()
-    inputs = set_ups(source, thermal, preset, testfield, course, seeds)
+    source = None if series is None else series.observed()
+    field = None if testfield is None else str(source_of(testfield))
+    inputs = set_ups(source, thermal, preset, field, course, seeds)
     return plan_power(inputs, strength_px, progress or (lambda _: None))
 
 
@@ -377,12 +378,12 @@ def simulate(
     model: Path | str | None = None,
     camera: Path | str | None = None,
     programme: Path | str | None = None,
-    effects: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str = (),
+    effects: Effects = (),
     own_effects: bool = True,
     lamp: Sequence[tuple[float, float]] | None = None,
     seed: int = 0,
     series: str = "M1",
-    testfield: TestField | Path | str | None = None,
+    testfield: Field | None = None,
     epochs: int | None = None,
     frames: bool = False,
     out: Path | str | None = None,
@@ -410,7 +411,6 @@ def simulate(
     import shutil
     import tempfile
 
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.heat import Course
     from thermocald.physics.model_file import write_model
     from thermocald.physics.presets import given_simulation
@@ -474,21 +474,17 @@ def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[
     ]
 
 
-def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
+def _paths(given: Paths) -> list[Path]:
     return [source_of(p) for p in ((given,) if isinstance(given, str | Path) else given)]
 
 
-def _model_of(model: ThermalCamera | ThermalModel | Path | str | None) -> ThermalModel | None:
-    from thermocald.physics.model import ThermalModel
-
+def _model_of(model: Model | None) -> ThermalModel | None:
     if model is None or isinstance(model, ThermalModel):
         return model
     return (model if isinstance(model, ThermalCamera) else load_camera(model)).model
 
 
-def _effects(
-    given: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str,
-) -> list[ModelEffect]:
+def _effects(given: Effects) -> list[ModelEffect]:
     from thermocald.physics.model_file import read_effects
     from thermocald.thermal.hypothesis import effect_with, parse_effect
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald.files import write_text
+from thermocald.names import checked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,8 +24,14 @@ if TYPE_CHECKING:
     Columns = dict[str, Column]
 
 
+@checked
 class Result(ABC):
     """The result of an analysis; `print` shows what the command prints."""
+
+    def __init_subclass__(cls) -> None:
+        """Let the public methods of every result check their arguments."""
+        super().__init_subclass__()
+        checked(cls)
 
     heading = "Results"
     caption = "The results over time, with their standard deviations."

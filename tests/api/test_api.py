@@ -322,7 +322,7 @@ OUT_OF_BOUNDS = {
     "timezone is 2; it must be text": lambda M1, field: tc.correct(
         "points.csv", "camera.yaml", log="M1", timezone=2
     ),
-    "log_options is ';'; it must be a mapping": lambda M1, field: tc.predict(
+    "log_options is ';'; it must be a LogOptions or a mapping": lambda M1, field: tc.predict(
         "camera.yaml", log="logger.csv", log_options=";"
     ),
     "calibrations is {'cold.json': '26'}": lambda M1, field: tc.fit_calibrations(
@@ -334,7 +334,13 @@ OUT_OF_BOUNDS = {
     "pixel_pitch is '1 µm'; it must be a number": lambda M1, field: tc.import_photographs(
         "photos", log="logger.csv", testfield=field, timezone="UTC", pixel_pitch="1 µm"
     ),
-    "the path of a model is 3": lambda M1, field: tc.fit(M1, model=3),
+    "model is 3; it must be a ThermalCamera .from fit. or a ThermalModel or a path or text": (
+        lambda M1, field: tc.fit(M1, model=3)
+    ),
+    "free is 3; it must be text or a list .each text.": lambda M1, field: M1.calibrate(free=3),
+    "free is \\['c', 0\\]": lambda M1, field: M1.calibrate(free=["c", 0]),
+    "store is 3; it must be a path or text": lambda M1, field: M1.calibrate(store=3),
+    "progress is 'x'": lambda M1, field: M1.calibrate(progress="x"),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
     "give finite": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(0, float("nan"))]),
@@ -343,9 +349,11 @@ OUT_OF_BOUNDS = {
     "height is 0": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1, field: tc.fit_calibrations({}),
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
-    "'M1' is not a series: open it": lambda M1, field: tc.fit("M1"),
-    "'M2' is not a series": lambda M1, field: tc.discover(M1, verify=["M2"]),
+    "series is 'M1'; it must be a Series .from open.": lambda M1, field: tc.fit("M1"),
+    "series is None": lambda M1, field: tc.discover(None),
+    "verify is \\['M2'\\]": lambda M1, field: tc.discover(M1, verify=["M2"]),
     "verify is <Series": lambda M1, field: tc.discover(M1, verify=M1),
+    "testfield is 3; it must be a path or text": lambda M1, field: tc.plan(M1, testfield=3),
     "test is <Series .*; it must be a list": lambda M1, field: tc.predict("camera.yaml", test=M1),
     "channels belong to a temperature": lambda M1, field: tc.predict(
         "camera.yaml", log="M1", channels={"temperature": 30.0}
@@ -353,8 +361,23 @@ OUT_OF_BOUNDS = {
 }
 HOT = [25.0, 30.0, 35.0]
 OF_A_CAMERA = {
-    "the temperature is 'warm'": lambda camera: camera.at("warm"),
-    "give one number": lambda camera: camera.at([30.0, 31.0]),
+    "temperature is 'warm'; it must be a number": lambda camera: camera.at("warm"),
+    "temperature is \\[30.0, 31.0\\]": lambda camera: camera.at([30.0, 31.0]),
+    "extrapolate is 'no'; it must be True or False": lambda camera: camera.at(
+        35.0, extrapolate="no"
+    ),
+    "width is '1640'; it must be a whole number": lambda camera: camera.for_images("1640", 1232),
+    "to is 'image'; it must be a InteriorOrientation": lambda camera: camera.at(35.0).undistort(
+        [[1, 2]], to="image"
+    ),
+    "other is 35.0; it must be a Camera": lambda camera: camera.at(35.0).object_distance(35.0, 1e4),
+    "path is None; it must be a path or text": lambda camera: camera.save(None),
+    "path is 3": lambda camera: camera.at(35.0).write(3),
+    "path is b'x'": lambda camera: camera.at(35.0).report(b"x"),
+    "path is 7": lambda camera: camera.load(7),
+    "size is \\(1640,\\)": lambda camera: camera.live(size=(1640,)),
+    "give one time": lambda camera: camera.live().update([0.0, 60.0], 30.0),
+    "distance_mm is 'far'": lambda camera: camera.at(35.0).object_error("far"),
     "distance_mm is -1": lambda camera: camera.at(35.0).object_error(-1),
     "image points: must be an array \\(n, 2\\)": lambda camera: camera.at(35.0).undistort(
         [1, 2, 3]
@@ -374,7 +397,10 @@ OF_A_CAMERA = {
     ),
     "a time is not known: give": lambda camera: camera.live().update(np.nan, 30.0),
     "a temperature is no number": lambda camera: camera.along([0.0, 60.0, 120.0], "hot"),
-    "give °C, NaN for a failed": lambda camera: camera.live().update(0.0, None),
+    "temperature is None; it must be a number or a mapping": (
+        lambda camera: camera.live().update(0.0, None)
+    ),
+    "temperature is {'board': '30'}": lambda camera: camera.live().update(0.0, {"board": "30"}),
 }
 
 

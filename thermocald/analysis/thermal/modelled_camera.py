@@ -19,6 +19,7 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
 from thermocald.figures import BAND
+from thermocald.names import checked
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
@@ -34,7 +35,6 @@ _REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
 _MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 _CHUNK = 20_000  # times predicted at once
 _STEP = 1e-3  # relative step of a parameter for its derivative
-NUMBER = (int, float, np.number)
 
 
 class ExtrapolationWarning(UserWarning):
@@ -173,7 +173,7 @@ def widened(covariance: Array, drift: Array | float) -> Array:
     return covariance
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Along:
     """The camera along a history; indexing gives a Camera.
 
@@ -187,6 +187,10 @@ class Along:
     covariance: Array
     extrapolated: Array
     camera: str = "camera"
+
+    def __repr__(self) -> str:
+        low, high = np.min(self.temperatures), np.max(self.temperatures)
+        return f"<Along {self.camera}: {len(self)} times, {low:.1f} to {high:.1f} °C>"
 
     def __len__(self) -> int:
         return len(self.times)
@@ -207,6 +211,7 @@ class Along:
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
+@checked
 class ModelledCamera:
     """The predictions of a thermal model, with their covariance."""
 
@@ -290,8 +295,6 @@ class ModelledCamera:
         ((3, 10), (3, 10))
         """
         require_sd(temperature_sd)
-        if not isinstance(relative_to, (*NUMBER, type(None))):
-            raise UsageError(f"relative_to is {relative_to!r}: give one number, °C")
         t = seconds(times)
         columns = (
             temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
@@ -417,7 +420,7 @@ def _require_known(log: Array, readings: Array, times: Array) -> None:
 
 
 def require_sd(temperature_sd: float) -> None:
-    if not isinstance(temperature_sd, NUMBER) or not 0.0 <= temperature_sd < math.inf:
+    if not 0.0 <= temperature_sd < math.inf:
         raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
 
 

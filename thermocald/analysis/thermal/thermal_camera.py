@@ -28,7 +28,6 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.modelled_camera import (
-    NUMBER,
     ModelledCamera,
     require_sd,
     steady_camera,
@@ -37,6 +36,7 @@ from thermocald.analysis.thermal.modelled_camera import (
 from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
+from thermocald.names import checked
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
@@ -146,10 +146,6 @@ class ThermalCamera(ModelledCamera, Result):
         >>> now.temperature
         25.0
         """
-        if size is not None and (
-            len(np.atleast_1d(size)) != 2 or not all(isinstance(n, NUMBER) for n in size)
-        ):
-            raise UsageError(f"size is {size!r}: give (width, height) px")
         return LiveCamera(self if size is None else self.for_images(*size))
 
     def for_images(self, width: int, height: int, camera: str | None = None) -> ThermalCamera:
@@ -223,12 +219,9 @@ class ThermalCamera(ModelledCamera, Result):
         a model that uses them. Warns outside the model's validity; raises UsageError far outside it
         (unless `extrapolate`), also for a temperature that looks like Fahrenheit.
         """
-        try:
-            T = float(temperature)
-        except (TypeError, ValueError):
-            T = math.nan
+        T = float(temperature)
         if math.isnan(T):
-            raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
+            raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
@@ -252,8 +245,6 @@ class ThermalCamera(ModelledCamera, Result):
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
-        if not isinstance(given, Mapping):
-            raise UsageError(f"channels is {given!r}: give {{channel: °C}}")
         known = list(dict.fromkeys([*self.model.validity, *self.channels]))
         for name, value in given.items():
             if name not in known:
@@ -296,6 +287,7 @@ def _push(followers: list[Any], time: float, value: float) -> Array:
     return np.array([value])
 
 
+@checked
 class LiveCamera:
     """A camera that follows its thermometer; made by `ThermalCamera.live`.
 
@@ -418,12 +410,11 @@ class LiveCamera:
         self, time: Any, temperature: float | Mapping[str, float]
     ) -> tuple[float, tuple[float, ...]]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
+        if np.ndim(time):
+            raise UsageError("time: give one time for a reading")
         t = float(seconds(time))
         given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
-        try:
-            names, row = tuple(given), tuple(float(v) for v in given.values())
-        except (TypeError, ValueError):
-            raise UsageError(f"{temperature!r}: give °C, NaN for a failed reading") from None
+        names, row = tuple(given), tuple(float(v) for v in given.values())
         if not row:
             raise UsageError("there is no reading: give a temperature, or {channel: °C}")
         if self._times:

@@ -11,6 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from thermocald.errors import UsageError
 from thermocald.files import write_text
 from thermocald.names import checked
 
@@ -48,9 +49,9 @@ class Result(ABC):
         """Return a report's first sentence, without its full stop."""
         return self.lines()[0]
 
-    @abstractmethod
     def plot(self) -> Figure:
-        """Draw the result with matplotlib (extra `report`)."""
+        """Draw the result with matplotlib (extra `report`). Raises UsageError without a drawing."""
+        raise UsageError(f"a {type(self).__name__} has no drawing: print it, or use as_dict()")
 
     def report(self, path: Path | str, title: str = "") -> Path:
         """Write the result as one HTML file that works offline; return its path.
@@ -67,7 +68,8 @@ class Result(ABC):
 
         answer = self.answer()
         others = [line for line in self.lines() if line != answer]
-        proof = Figure("proof", "Results", self.caption, drawing=self.plot())
+        drawn = type(self).plot is not Result.plot
+        proof = Figure("proof", "Results", self.caption, drawing=self.plot()) if drawn else None
         text = Section("What the command prints", printed="\n".join(others))
         return Chapter(title or self.heading, Answer(f"{answer}.", proof), (text,)).page()
 

@@ -11,6 +11,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ import thermocald as tc
 from tests.commands import call, finish
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
+from thermocald.discovery.plan import Plan
 from thermocald.errors import ConfigurationError, DataError, RecordingError, StoreError, UsageError
+from thermocald.result import jsonable
 
 DOCUMENTED = (
     "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
@@ -233,6 +236,45 @@ def test_a_camera_at_a_temperature(camera, tmp_path):
         assert (tmp_path / name).stat().st_size > 100
     with pytest.raises(UsageError, match="does not tell the format"):
         now.write(tmp_path / "camera.yaml")
+
+
+RESULTS = {
+    "Camera": lambda camera: camera.at(35.0),
+    "CameraDifference": lambda _: tc.compare_cameras("cold.json", "warm.json"),
+    "Catalogue": lambda _: tc.catalogue(),
+    "Conversion": lambda _: tc.convert_camera("cold.json", "cold.ior", "aicon"),
+    "Correction": lambda camera: tc.correct("points.csv", camera, log="M1"),
+    "FieldCheck": lambda _: tc.check_testfield("M1/testfield.csv"),
+    "Plan": lambda _: Plan({"thermal_lag": {"thermal_lag or time_offset": 1}}, 1, 0.1),
+    "Prediction": lambda camera: tc.predict(camera, log="M1"),
+    "ThermalCamera": lambda camera: camera,
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_is_shown_written_and_reported(inside, camera, tmp_path, name):
+    result = RESULTS[name](camera)
+    assert re.fullmatch(rf"<{name}: .{{4,200}}>", repr(result))
+    assert json.loads(json.dumps(jsonable(result.as_dict()), allow_nan=False))
+    assert str(result) == "\n".join(result.lines())
+    assert result._repr_html_().startswith("<pre>")
+    page = unescape(result.report(tmp_path / "r.html").read_text()).replace("\xa0", " ")
+    assert name == "FieldCheck" or result.answer()[:20] in page  # which has a page of its own
+    if name in ("Catalogue", "Conversion", "Correction", "Plan"):
+        with pytest.raises(UsageError, match="has no drawing"):
+            result.plot()
+
+
+def test_what_carries_data_says_what_it_is(M1, camera):
+    live = camera.live()
+    assert repr(M1.testfield) == "<TestField: 147 targets>"
+    assert repr(live) == "<LiveCamera rpi-v2.1: no reading yet>"
+    live.update(0.0, 35.5)
+    assert repr(live) == "<LiveCamera rpi-v2.1: 35.5 °C>"
+    assert repr(camera.along([0.0, 60.0], [30.0, 31.5])) == (
+        "<Along rpi-v2.1: 2 times, 30.0 to 31.5 °C>"
+    )
+    assert "⁻⁵ 1" not in str(camera.at(35.0))
 
 
 def test_two_cameras_are_converted_and_compared(camera, world, tmp_path):

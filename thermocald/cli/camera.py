@@ -264,9 +264,9 @@ def correct(
             with progress(None, "correcting images") as advance:
                 done.write(out, advance)
         elif json == "-":
-            collections.deque(done.lines(), 0)
+            collections.deque(done.rows(), 0)
         else:
-            write_parts(done.lines(), "-")
+            write_parts(done.rows(), "-")
     write_json(done, json)
     if json != "-" and out is not None:
         typer.echo(f"{out}: {done}")

@@ -109,8 +109,7 @@ def simulate(
     Example: thermocald simulate --preset rpi-v2.1-heating --out rpi-M1 --seed 1
     """
     if list_:
-        known = tc.catalogue()
-        show(known, json)
+        show(tc.catalogue(), json)
         return
     if out is None:
         raise UsageError("--out is missing: the folder of the recording to write")

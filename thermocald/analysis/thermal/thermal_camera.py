@@ -324,6 +324,10 @@ class LiveCamera:
             if name.split(".")[0] in drives
         }
 
+    def __repr__(self) -> str:
+        now = "no reading yet" if self._now is None else f"{self._now.temperature:g} °C"
+        return f"<LiveCamera {self.thermal.model.camera}: {now}>"
+
     def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
         """Take a reading and return the camera now, equal to `along` over the history so far.
 

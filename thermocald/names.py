@@ -189,11 +189,11 @@ _UNIONS = (Union, UnionType)
 def checked(public: Public) -> Public:
     """Return a function that raises UsageError for an argument that its annotations exclude.
 
-    A class is returned with all its public methods checked.
+    A class is returned with its constructor and its public methods checked.
     """
     if isinstance(public, type):
         for name, member in vars(public).copy().items():
-            if isinstance(member, FunctionType) and not name.startswith("_"):
+            if isinstance(member, FunctionType) and (name == "__init__" or name[0] != "_"):
                 setattr(public, name, checked(member))
             elif isinstance(member, classmethod):
                 setattr(public, name, classmethod(checked(member.__func__)))
@@ -228,7 +228,8 @@ def _in_words(kind: Any) -> str:
         return f"a {origin.__name__}" + _MADE_BY.get(origin.__name__, "")
     word = _KINDS[origin][1]
     if origin in (tuple, Iterable, Sequence):
-        word += f" ({'' if origin is tuple else 'each '}{', '.join(map(_in_words, inner))})"
+        each = "" if origin is tuple else "each "
+        word += f" ({each}{', '.join(map(_in_words, inner))})"
     return word
 
 
@@ -251,6 +252,6 @@ def _accepts(kind: Any, value: Any) -> bool:
         return False
     if isinstance(value, Mapping):
         return all(_accepts(inner[1], one) for one in value.values())
-    if origin is tuple:
+    if origin is tuple and Ellipsis not in inner:
         return len(inner) == len(value) and all(map(_accepts, inner, value))
     return all(_accepts(inner[0], one) for one in value)

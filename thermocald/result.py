@@ -147,17 +147,13 @@ def csv_text(
 ) -> Iterator[str]:
     """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
     for number, columns in enumerate(parts):
-        yield _csv_part(columns, not number, separator, decimal)
-
-
-def _csv_part(columns: Mapping[str, Column], first: bool, separator: str, decimal: str) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, delimiter=separator, lineterminator="\n")
-    if first:
-        writer.writerow(columns)
-    cells = [_cells(name, values, decimal) for name, values in columns.items()]
-    writer.writerows(zip(*cells, strict=True))
-    return text.getvalue()
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+        if number == 0:
+            writer.writerow(columns)
+        cells = [_cells(name, values, decimal) for name, values in columns.items()]
+        writer.writerows(zip(*cells, strict=True))
+        yield text.getvalue()
 
 
 def _cells(name: str, values: Column, decimal: str) -> Iterable[str]:

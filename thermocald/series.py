@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -343,18 +342,10 @@ def require_series(series: Sequence[Series]) -> None:
 
 
 def require_within(**bounds: tuple[Any, float] | tuple[Any, float, float]) -> None:
-    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes.
-
-    If `least` is a whole number, so must the value be.
-    """
+    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes."""
     for name, (value, least, *rest) in bounds.items():
         if value is None:
             continue
-        whole = isinstance(least, int)
-        is_number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-        if not is_number:
-            kind = "a whole number" if whole else "a number"
-            raise UsageError(f"{name} is {value!r}; it must be {kind}")
         if not (least <= value <= (rest[0] if rest else sys.float_info.max)):
             bound = f"from {least:g} to {rest[0]:g}" if rest else f"at least {least:g}"
             raise UsageError(f"{name} is {value}; it must be {bound}")

@@ -47,9 +47,10 @@ def demo(
     if json != "-":
         _print_drift(document)
     if discovery:
-        document["discovery"] = discover_hidden_effect(out, seed, say)
+        found, document["discovery"] = discover_hidden_effect(out, seed, say)
         if json != "-":
-            _print_discovery(document["discovery"])
+            typer.echo(f"\nhidden: {_HIDDEN}, tau {_TAU_S:.0f} s\n{found}")
+            typer.echo(f"model: {document['discovery']['model']}")
     write_json(document, json)
 
 
@@ -67,22 +68,6 @@ def _print_drift(document: dict[str, Any]) -> None:
         typer.echo(f"{row['name']:<2} {drifts}  {scatter}")
     typer.echo(f"store:     {document['store']}")
     typer.echo(f"recording: {document['recording']}")
-
-
-def _print_discovery(document: dict[str, Any]) -> None:
-    hidden = document["hidden"]
-    typer.echo(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s")
-    for effect in document["effects"]:
-        typer.echo(f"found:     {effect['effect']}: {effect['statement']}")
-    for label, key in (("on M1", "fit"), ("on M2", "verify")):
-        gap = document["gap"][key]
-        if gap is not None:
-            typer.echo(
-                f"gap {label}: {gap['before']['rms_px']:.3f} → {gap['after']['rms_px']:.3f} px, "
-                f"reduced χ² {gap['before']['chi2_reduced']:.2f} → "
-                f"{gap['after']['chi2_reduced']:.2f}"
-            )
-    typer.echo(f"model:     {document['model']}")
 
 
 def simulate(
@@ -220,8 +205,10 @@ def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any
     return rows
 
 
-def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Simulate a hidden lag, discover it in M1, verify it in M2; return the JSON document."""
+def discover_hidden_effect(
+    out: Path, seed: int, say: Callable[[str], None]
+) -> tuple[tc.Discovery, dict[str, Any]]:
+    """Simulate a hidden lag, discover it in M1, verify it in M2; also return the JSON document."""
     say(
         "simulating a hidden effect: the camera follows the thermometer with a lag of "
         f"{_TAU_S:.0f} s"
@@ -240,4 +227,4 @@ def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> 
     document = found.as_dict()
     document["model"] = str(found.save(folder / "camera.thermal.yaml"))
     document["hidden"] = {"effect": _HIDDEN, "tau_s": _TAU_S}
-    return document
+    return found, document

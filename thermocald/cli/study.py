@@ -135,15 +135,16 @@ def export(
     if format_ not in ("csv", "json", "parquet"):
         raise UsageError(f"--format {format_}: must be one of csv, json, parquet")
     style = series_export.style_of(units, time_, separator, decimal)
+    plain = style == series_export.ExportStyle()
     if format_ == "parquet" and output == "-":
         raise UsageError("--format parquet needs a file: -o FILE")
-    if format_ == "json" and not style.is_plain:
+    if format_ == "json" and not plain:
         raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     opened = tc.open(source, series)
     with progress(len(opened) if folder else None, "calibrating") as advance:
         table = opened.calibrate(exterior=exterior, free=free, jobs=jobs, progress=advance)
     known = None
-    if extra or format_ == "parquet" or not style.is_plain:
+    if extra or format_ == "parquet" or not plain:
         known = opened.besides(table.number, extra=extra)
     pitch = opened.head.camera.sensor.pixel_pitch
     parts = series_export.column_parts(table, style, pitch, known)

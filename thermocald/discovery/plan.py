@@ -17,6 +17,7 @@ import numpy as np
 from thermocald.discovery.examination import examine_series
 from thermocald.discovery.search import list_candidates
 from thermocald.errors import UsageError
+from thermocald.numbers import counted
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
 from thermocald.result import Result
@@ -75,7 +76,7 @@ class Plan(Result):
 
     def lines(self) -> list[str]:
         """Return what `discover --plan` prints."""
-        each = "1 recording" if self.repetitions == 1 else f"{self.repetitions} recordings"
+        each = counted(self.repetitions, "recording")
         out = [f"effects of {self.strength_px:g} px RMS, {each} each:"]
         for name, verdicts in self.found.items():
             counts = ", ".join(f"{k} × {n}" for k, n in sorted(verdicts.items()))

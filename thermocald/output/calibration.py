@@ -16,7 +16,16 @@ from thermocald.analysis.field import CELLS, FieldCheck
 from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
-from thermocald.numbers import UNITS, coefficient, listed, parameter_label, percent, plain, with_sd
+from thermocald.numbers import (
+    UNITS,
+    coefficient,
+    enumerated,
+    listed,
+    parameter_label,
+    percent,
+    plain,
+    with_sd,
+)
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 from thermocald.store.recording.sense import doubt_lines
@@ -117,7 +126,7 @@ def _estimates(result: Photographs, sensor: Sensor) -> str:
         for name, value, sd in found
         if sd > 0
     ]
-    return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
+    return enumerated(parts)
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:

@@ -20,6 +20,7 @@ from thermocald.analysis.thermal.correction import (
 )
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
+from thermocald.numbers import counted
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
 from thermocald.result import Result, document_of
 from thermocald.store.logger.clock import iso
@@ -84,7 +85,7 @@ class Correction(Result):
         if self.images:
             worst = max(d["rms_left_over_px"] for d in self.images)
             most = max(d["largest_correction_px"] for d in self.images)
-            images = "1 image" if len(self.images) == 1 else f"{len(self.images)} images"
+            images = counted(len(self.images), "image")
             return [
                 f"{images} corrected by up to {most:.3f} px; {left} {worst:.3f} px at most (RMS)"
             ]

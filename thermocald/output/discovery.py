@@ -370,7 +370,11 @@ def _gap_table(d: Discovery) -> Table:
 
 
 def _effect(effect: EffectFound) -> Section:
-    rows = [(_parameter(name), _value(e)) for name, e in effect.estimates.items()]
+    labels = [
+        f"amplitude of {parameter_label(n[2:])}" if n.startswith("a_") else n.replace("_", " ")
+        for n in effect.estimates
+    ]
+    rows = list(zip(labels, map(_value, effect.estimates.values()), strict=True))
     text = []
     if proposal := effect.evidence.get("proposal"):
         test = proposal["surrogates"]
@@ -399,13 +403,6 @@ def _effect(effect: EffectFound) -> Section:
         )  # fmt: skip
     table = Table("Estimates", ("parameter", "value ± sd"), tuple(rows))
     return Section(f"Effect found: {effect.effect}", tuple(text), (), (table,), tuple(items))
-
-
-def _parameter(name: str) -> str:
-    """Return the label of an effect's parameter: a_c is the amplitude of c."""
-    return f"amplitude of {parameter_label(name[2:])}" if name.startswith("a_") else (
-        name.replace("_", " ")
-    )  # fmt: skip
 
 
 def _value(estimate: dict[str, Any]) -> str:

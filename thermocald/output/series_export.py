@@ -59,11 +59,6 @@ class ExportStyle:
     separator: str = ","
     decimal: str = "."
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether it is the default style, which other commands read."""
-        return self == ExportStyle()
-
 
 def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle:
     """Return the style that options describe; UsageError for unknown values."""

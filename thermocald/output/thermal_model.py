@@ -41,6 +41,7 @@ def render_certificate(camera: ThermalCamera) -> str:
     values = np.array([state.interior.as_array() for state in states])
     sds = np.array([[state.sd.get(name, 0.0) for name in IOP_NAMES] for state in states])
     missing = bool(document.get("effect_missing"))
+    series = ", ".join(str(s["name"]) for s in document.get("series", ()))
     return Chapter(
         f"Thermal model of {document['camera']}",
         Answer(
@@ -59,19 +60,13 @@ def render_certificate(camera: ThermalCamera) -> str:
             _section("The model", _values(document), _effects(document)),
             _section("Evidence", *_evidence(document)),
         ),
-        about=(_about(camera, document),),
+        about=(f"{camera.model.sensor}{f'; fitted to {series}' if series else ''}.",),
         notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
     ).page()  # fmt: skip
 
 
 def _section(title: str, *tables: Table) -> Section:
     return Section(title, tables=tuple(table for table in tables if table.rows))
-
-
-def _about(camera: ThermalCamera, document: Mapping[str, Any]) -> str:
-    text = camera.model.sensor
-    series = ", ".join(str(s["name"]) for s in document.get("series", ()))
-    return f"{text}; fitted to {series}." if series else f"{text}."
 
 
 def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:
@@ -88,7 +83,7 @@ def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float
     if name != "c":
         c = document["interior"]["c"]["value"]
         per_rate = (high - low) / c * _DISTANCE_MM
-        text += f"; at 10 m that is {with_sd(abs(rate) * per_rate, sd * per_rate, 'mm')}"
+        text += f", in all {with_sd(abs(rate) * per_rate, sd * per_rate, 'mm')} at 10 m"
     return f"{text}."
 
 

@@ -178,7 +178,6 @@ def study(
     >>> found.cameras[0].label
     'rpi-v2.1'
     """
-    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import study as run
     from thermocald.results import Study
     from thermocald.thermal.source import refuse_copies
@@ -191,12 +190,11 @@ def study(
         )
     require_series(series)
     check_exterior(exterior)
-    settings = StudySettings(
+    settings = _study_settings(
         window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
         thermometer_sd=thermometer_sd, jobs=jobs,
     )  # fmt: skip
-    _check_settings(settings)
     named = [*labels, *[None] * (len(series) - len(labels))]
     measured = [
         one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
@@ -214,11 +212,9 @@ def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
     series done. Source: Elias et al. 2020, Sensors 20, 643, section 4.
     """
     from thermocald.analysis.study.reference import compare, reference_studies
-    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.results import Study
 
-    chosen = StudySettings(**settings)
-    _check_settings(chosen)
+    chosen = _study_settings(**settings)
     cameras = tuple(reference_studies(chosen, progress or (lambda _: None)))
     return Study(chosen, cameras, tuple(c for camera in cameras for c in compare(camera)))
 
@@ -261,7 +257,7 @@ def fit(
         raise UsageError("give at least one series to fit a model to")
     require_series(series)
     require_within(T0=(T0, COLDEST_C), jobs=(jobs, 1, 256))
-    if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
+    if isinstance(kind, str | Path) and _is_file(kind):
         kind = read_model(source_of(kind))
     if isinstance(kind, ThermalModel):
         require_type(kind)
@@ -282,7 +278,7 @@ def fit(
     if isinstance(kind, ThermalModel):
         camera = fit_with_type(reduced, kind)
     elif kind is not None:
-        camera = fit_type(reduced, listed, T0, kind)
+        camera = fit_type(reduced, listed, T0, str(kind))
     else:
         camera = fit_camera(reduced, listed, T0)
     return replace(camera, fitted={**(camera.fitted or {}), "doubts": _doubts(series, reduced)})
@@ -452,7 +448,10 @@ def simulate(
     return made
 
 
-def _check_settings(s: StudySettings) -> None:
+def _study_settings(**given: Any) -> StudySettings:
+    from thermocald.analysis.study.series_study import StudySettings
+
+    s = StudySettings(**given)
     require_within(
         window=(s.window, 3), alpha=(s.alpha, 1e-6, 0.5), sets=(s.sets, 2), seed=(s.seed, 0),
         distance_mm=(s.distance_mm, 10.0), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10.0),
@@ -461,6 +460,7 @@ def _check_settings(s: StudySettings) -> None:
     )  # fmt: skip
     if s.window % 2 == 0:
         raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")
+    return s
 
 
 def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[str]:
@@ -484,6 +484,10 @@ def _model_of(model: Model | None) -> ThermalModel | None:
     return (model if isinstance(model, ThermalCamera) else load_camera(model)).model
 
 
+def _is_file(given: Path | str) -> bool:
+    return isinstance(given, Path) or Path(given).suffix in (".yaml", ".yml")
+
+
 def _effects(given: Effects) -> list[ModelEffect]:
     from thermocald.physics.model_file import read_effects
     from thermocald.thermal.hypothesis import effect_with, parse_effect
@@ -492,5 +496,5 @@ def _effects(given: Effects) -> list[ModelEffect]:
         return [effect_with(name, values) for name, values in given.items()]
     found: list[ModelEffect] = []
     for one in (given,) if isinstance(given, str | Path) else given:
-        found += read_effects(source_of(one)) if isinstance(one, Path) else [parse_effect(one)]
+        found += read_effects(source_of(one)) if _is_file(one) else [parse_effect(str(one))]
     return found

@@ -344,10 +344,8 @@ def fit(
         raise UsageError("--log is for calibrations; a recording has its own temperatures")
     else:
         kind: str | Path | None = type_name
-        if type_name is not None and Path(type_name).is_file():
+        if type_name is not None and ("/" in type_name or Path(type_name).is_file()):
             kind = Path(type_name)
-        elif type_name is not None and (Path(type_name).suffix == ".yaml" or "/" in type_name):
-            raise UsageError(f"--type {type_name}: there is no such file")
         series = [one for source in inputs for one in tc.open_all(source)]
         with progress(None, "reading and measuring") as advance:
             camera = tc.fit(

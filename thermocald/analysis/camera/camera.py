@@ -194,7 +194,11 @@ class Camera(Result):
         """
         from thermocald.photogrammetry.camera.conversions import BROWN, convert, opencv
 
-        found = convert(self.sensor, BROWN, self.values, opencv(5))[0]
+        family = opencv(5)
+        if self.values[8:].any():
+            found = convert(self.sensor, BROWN, self.values, family)[0]
+        else:  # exact, also if the distortion folds back in the corners of the image
+            found = family.from_brown(self.sensor, self.values)
         fx, fy, cx, cy = found[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
 

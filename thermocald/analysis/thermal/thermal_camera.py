@@ -275,8 +275,6 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
-    if not isinstance(path, (str, Path)):
-        raise UsageError(f"the path of a model is {path!r}: give a text or a Path")
     return ThermalCamera.load(Path(path).expanduser())
 
 

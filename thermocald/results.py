@@ -179,11 +179,6 @@ class Calibration(Result):
         return self.photographs.status
 
     @property
-    def posed(self) -> bool:
-        """Whether the camera was calibrated or a photograph has a pose."""
-        return self.status == "ok" or any(p.status == "ok" for p in self.photographs.photographs)
-
-    @property
     def sigma0(self) -> float:
         """Standard deviation of unit weight, NaN if nothing was estimated."""
         return self.photographs.sigma0

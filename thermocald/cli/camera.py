@@ -70,7 +70,7 @@ def calibrate(
     if report is not None:
         written.append(f"written: {result.report(report)}")
     show(result, json, result, *written)
-    if not result.posed:
+    if not (result.status == "ok" or result.poses):
         raise DataError(f"no photograph has a result: {result.photographs.reason}")
 
 

@@ -65,7 +65,7 @@ class Correction(Result):
         """Return the result as the document that `--json` writes."""
         head = {
             "format": "thermocald-correction/1",
-            "corrected_to": self.corrected_to,
+            "corrected_to": self.thermal.model.T0 if self.to is None else self.to,
             "temperature_sd": self.temperature_sd,
         }
         if self.images:
@@ -93,11 +93,6 @@ class Correction(Result):
             return [f"{self.path}: not corrected yet; write(path) does it"]
         moved, rest = self._rms(self._moved), self._rms(self._left_over)
         return [f"{self.points} points corrected by {moved:.3f} px (RMS); {left} {rest:.3f} px"]
-
-    @property
-    def corrected_to(self) -> float:
-        """The temperature that is corrected to, °C."""
-        return self.thermal.model.T0 if self.to is None else self.to
 
     def write(self, out: Path | str, advance: Callable[[int], None] | None = None) -> None:
         """Write the corrected CSV, or the corrected images into a folder.

@@ -280,23 +280,26 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
     """Return the report as HTML text."""
     field, model = result.field, result.camera
     sds = result.sds_px
-    expected = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
+    expected, stated = (
+        ", ".join(f"{parameter_label(n)} to ± {_sd(row[k])}" for n, row in sds.items())
+        for k in (0, -1)
+    )
+    surveyed = f"gives {expected}, for image points of ± {result.sigma_px:g} px."
+    dominated = max(field / one for one, _, field in sds.values()) > _FIELD_DOMINATES
     if result.weak:
         sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
+    elif dominated:
+        sentence = f"With the stated errors of the targets' coordinates one image gives {stated}."
     else:
-        sentence = f"One image gives {expected}, for image points of ± {result.sigma_px:g} px."
+        sentence = f"One image {surveyed}"
     X, Y, Z = result.station.centre
     more = (
         f"{len(result.visible)} of {len(field)} targets are visible from ({X:.0f}, {Y:.0f}, "
         f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
         f"image, and their depth spans {percent(result.depth_relief)} of the distance."
     )
-    worse = max(field / one for one, _, field in sds.values())
-    if worse > _FIELD_DOMINATES and not result.weak:
-        stated = ", ".join(
-            f"{parameter_label(n)} to ± {_sd(field)}" for n, (*_, field) in sds.items()
-        )
-        more += f" With the stated errors of the targets' coordinates it gives {stated}."
+    if dominated and not result.weak:
+        more += f" With exact coordinates one image {surveyed}"
     rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
     return Chapter(

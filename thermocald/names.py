@@ -225,7 +225,8 @@ def _in_words(kind: Any) -> str:
         return " or ".join(_in_words(one) for one in get_args(kind) if one is not NoneType)
     origin, inner = get_origin(kind) or kind, get_args(kind)
     if origin not in _KINDS:
-        return f"a {origin.__name__}" + _MADE_BY.get(origin.__name__, "")
+        name = origin.__name__
+        return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{_MADE_BY.get(name, '')}"
     word = _KINDS[origin][1]
     if origin in (tuple, Iterable, Sequence):
         each = "" if origin is tuple else "each "

@@ -256,7 +256,9 @@ def test_what_carries_data_says_what_it_is(M1, camera):
     assert repr(camera.along([0.0, 60.0], [30.0, 31.5])) == (
         "<Along rpi-v2.1: 2 times, 30.0 to 31.5 °C>"
     )
-    assert "⁻⁵ 1" not in str(camera.at(35.0))
+    with pytest.warns(match="are widened") as told:
+        assert "⁻⁵ 1" not in str(camera.at(52.0))
+    assert told[0].filename == __file__  # the user's line
 
 
 def test_two_cameras_are_converted_and_compared(camera, world, tmp_path):

@@ -85,7 +85,7 @@ class Validity:
                 )
             raise UsageError(f"{place}; set `extrapolate` to predict there nevertheless")
         warnings.warn(
-            f"{place}; standard deviations are widened", ExtrapolationWarning, stacklevel=3
+            f"{place}; standard deviations are widened", ExtrapolationWarning, stacklevel=4
         )
         return outside
 

@@ -149,8 +149,8 @@ class Calibration(Result):
     @property
     def head(self) -> dict[str, Any]:
         """The camera's part of the document."""
-        assumed = {"pixel_pitch_assumed": self.pitch_assumed}
-        return {"name": self.file.name, **document_of(self.file.sensor), **assumed}
+        sensor = document_of(self.file.sensor)
+        return {"name": self.file.name, **sensor, "pixel_pitch_assumed": self.pitch_assumed}
 
     @property
     def doubts(self) -> list[str]:

@@ -92,8 +92,7 @@ def convert(
 
     Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
     """
-    found = tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch)
-    show(found, json)
+    show(tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch), json)
 
 
 def at(

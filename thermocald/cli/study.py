@@ -25,7 +25,6 @@ from thermocald.cli.common import (
     write_parts,
 )
 from thermocald.errors import DataError, UsageError
-from thermocald.files import write_text
 from thermocald.store.server.connection import is_server
 
 if TYPE_CHECKING:
@@ -358,9 +357,7 @@ def fit(
 
         document["code"] = [str(file) for file in write_code(camera, code)]
     if report is not None:
-        from thermocald.output.thermal_model import render_certificate
-
-        write_text(report, render_certificate(camera))
+        camera.report(report)
     show(document, json, f"{output}: {camera}")
 
 

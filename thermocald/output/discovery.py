@@ -143,14 +143,12 @@ def _names(d: Discovery) -> list[str]:
 
 
 def _origin(d: Discovery) -> list[str]:
-    lines = []
-    for name, e in zip(_names(d), d.examination.fitter.series, strict=True):
-        source = e.source
-        lines.append(
-            f"{source.camera}, {source.sensor}; {name} measured "
-            f"{day(float(source.frame_times[0]))}, {int(source.per_row.sum())} epochs."
-        )
-    return lines
+    sources = [e.source for e in d.examination.fitter.series]
+    return [
+        f"{one.camera}, {one.sensor}; {name} measured {day(float(one.frame_times[0]))}, "
+        f"{int(one.per_row.sum())} epochs."
+        for name, one in zip(_names(d), sources, strict=True)
+    ]
 
 
 def _sections(d: Discovery) -> list[Section]:

@@ -26,6 +26,7 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
+from thermocald.analysis.thermal.certificate import render_certificate
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.modelled_camera import (
     ModelledCamera,
@@ -107,14 +108,24 @@ class ThermalCamera(ModelledCamera, Result):
         """Return what `thermocald fit` prints."""
         return model_lines(self.as_dict())
 
+    @property
+    def _limits(self) -> tuple[float, float]:
+        """The temperatures of the fit, °C; 15 K about T0 for a model that does not state them."""
+        T0 = self.model.T0
+        return next(iter(self.model.validity.values()), (T0 - 15.0, T0 + 15.0))
+
+    def page(self, title: str = "") -> str:
+        """Return the model's certificate as HTML text; title: by default the camera's name."""
+        states = [self.at(float(t)) for t in np.linspace(*self._limits, 41)]
+        return render_certificate(self.as_dict(), states, title)
+
     def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
         Covers the range that the model was fitted on, with 95 % bands of these changes; other
         thermometers are taken to be as warm.
         """
-        limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
-        T = np.linspace(*limits, 60)
+        T = np.linspace(*self._limits, 60)
 
         def at(t: float) -> tuple[Array, Array, Array]:
             alike = dict.fromkeys(self.channels, t)

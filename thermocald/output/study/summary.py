@@ -303,10 +303,8 @@ def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
 def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
     covariance = study.displacement_covariance
-    moved = {"points": study.grid, "displacement": study.displacement}
-    moved["sd_displacement"] = (
-        None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    )
+    sd = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    moved = {"points": study.grid, "displacement": study.displacement, "sd_displacement": sd}
     return {name: getattr(s, name) for name in _OF_SERIES} | {
         **{name: getattr(study, name) for name in _OF_STUDY},
         "epochs": len(s),

@@ -165,11 +165,7 @@ _KINDS: dict[Any, tuple[Any, str]] = {
     Callable: (Callable, "a function"),
 }
 # of a class: the function that returns it
-_MADE_BY = {
-    "Series": " (from open)",
-    "ThermalCamera": " (from fit)",
-    "TestField": " (from read_testfield)",
-}
+_MADE_BY = {"Series": "open", "ThermalCamera": "fit", "TestField": "read_testfield"}
 
 
 class _Unknown(type):
@@ -212,8 +208,8 @@ def checked(public: Public) -> Public:
         names = chain(in_order, cycle(in_order[-1:]))  # the last may stand for several: *series
         for name, value in (*zip(names, given, strict=False), *named.items()):
             if not _accepts(kinds.get(name, Any), value):
-                shown, wanted = repr(value)[:80], _in_words(kinds[name])
-                raise UsageError(f"{name} is {shown}; it must be {wanted}")
+                wanted = _in_words(kinds[name])
+                raise UsageError(f"{name} is {repr(value)[:80]}; it must be {wanted}")
         return public(*given, **named)
 
     return cast("Public", called)
@@ -226,12 +222,11 @@ def _in_words(kind: Any) -> str:
     origin, inner = get_origin(kind) or kind, get_args(kind)
     if origin not in _KINDS:
         name = origin.__name__
-        return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{_MADE_BY.get(name, '')}"
-    word = _KINDS[origin][1]
-    if origin in (tuple, Iterable, Sequence):
-        each = "" if origin is tuple else "each "
-        word += f" ({each}{', '.join(map(_in_words, inner))})"
-    return word
+        made = f" (from {_MADE_BY[name]})" if name in _MADE_BY else ""
+        return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{made}"
+    each = {tuple: "", Iterable: "each ", Sequence: "each "}.get(origin)
+    of = "" if each is None else f" ({each}{', '.join(map(_in_words, inner))})"
+    return f"{_KINDS[origin][1]}{of}"
 
 
 def _accepts(kind: Any, value: Any) -> bool:

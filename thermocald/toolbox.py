@@ -447,6 +447,4 @@ def _thermal(model: Model) -> ThermalCamera:
 
 
 def _log_options(given: LogRead) -> LogOptions:
-    if isinstance(given, LogOptions):
-        return given
-    return log_options(**(given or {}))
+    return given if isinstance(given, LogOptions) else log_options(**(given or {}))

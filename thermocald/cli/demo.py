@@ -64,8 +64,8 @@ def demo(
     if discovery:
         found = _discover_hidden_effect(out / "discovery", seed)
         model = found.save(out / "discovery" / "camera.thermal.yaml")
-        hidden = {"effect": _HIDDEN, "tau_s": _TAU_S}
-        document["discovery"] = {**found.as_dict(), "model": str(model), "hidden": hidden}
+        document["discovery"] = {**found.as_dict(), "model": str(model)}
+        document["discovery"]["hidden"] = {"effect": _HIDDEN, "tau_s": _TAU_S}
         if json != "-":
             typer.echo(f"\nhidden: {_HIDDEN}, tau {_TAU_S:.0f} s\n{found}\nmodel: {model}")
     write_json(document, json)

@@ -189,8 +189,8 @@ class Along:
     camera: str = "camera"
 
     def __repr__(self) -> str:
-        low, high = np.min(self.temperatures), np.max(self.temperatures)
-        return f"<Along {self.camera}: {len(self)} times, {low:.1f} to {high:.1f} °C>"
+        T = self.temperatures
+        return f"<Along {self.camera}: {len(self)} times, {T.min():.1f} to {T.max():.1f} °C>"
 
     def __len__(self) -> int:
         return len(self.times)

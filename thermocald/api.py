@@ -7,7 +7,7 @@ Wrong input raises the errors of `thermocald.errors`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +16,12 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camer
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.physics.model import ThermalModel
 from thermocald.series import (
     COLDEST_C,
+    Progress,
+    Say,
     Series,
     check_exterior,
     free_names,
@@ -30,20 +34,22 @@ from thermocald.series import open as open_series
 if TYPE_CHECKING:
     from thermocald.analysis.study.series_study import StudySettings
     from thermocald.discovery.plan import Plan
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.physics.model import ModelEffect
     from thermocald.physics.presets import Catalogue
     from thermocald.results import Calibration, Discovery, Study
     from thermocald.thermal.series import ReducedSeries
 
-Progress = Callable[[int], None] | None
+Paths = Path | str | Sequence[Path | str]
+Field = TestField | Path | str
+Model = ThermalCamera | ThermalModel | Path | str
+Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str
 
 
 def import_photographs(
-    photographs: Path | str | Sequence[Path | str],
+    photographs: Paths,
     *,
     log: Path | str,
-    testfield: TestField | Path | str,
+    testfield: Field,
     timezone: str | None = None,
     pixel_pitch: float | None = None,
     camera: Path | str | None = None,
@@ -84,7 +90,7 @@ def import_photographs(
     return open_series(out)
 
 
-def read_testfield(source: TestField | Path | str) -> TestField:
+def read_testfield(source: Field) -> TestField:
     """Read a testfield.csv: the targets' names, coordinates and standard deviations, mm.
 
     Raises TestFieldError, which names the line and the column.
@@ -93,15 +99,14 @@ def read_testfield(source: TestField | Path | str) -> TestField:
     >>> len(field), field.points.shape
     (147, (147, 3))
     """
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.testfield_file import read_testfield as read
 
     return source if isinstance(source, TestField) else read(source_of(source))
 
 
 def calibrate(
-    images: Path | str | Sequence[Path | str],
-    testfield: TestField | Path | str,
+    images: Paths,
+    testfield: Field,
     *,
     camera: Path | str | None = None,
     pixel_pitch: float | None = None,
@@ -173,7 +178,6 @@ def study(
     >>> found.cameras[0].label
     'rpi-v2.1'
     """
-    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import study as run
     from thermocald.results import Study
     from thermocald.thermal.source import refuse_copies
@@ -186,12 +190,11 @@ def study(
         )
     require_series(series)
     check_exterior(exterior)
-    settings = StudySettings(
+    settings = _study_settings(
         window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
         thermometer_sd=thermometer_sd, jobs=jobs,
     )  # fmt: skip
-    _check_settings(settings)
     named = [*labels, *[None] * (len(series) - len(labels))]
     measured = [
         one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
@@ -209,19 +212,17 @@ def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
     series done. Source: Elias et al. 2020, Sensors 20, 643, section 4.
     """
     from thermocald.analysis.study.reference import compare, reference_studies
-    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.results import Study
 
-    chosen = StudySettings(**settings)
-    _check_settings(chosen)
+    chosen = _study_settings(**settings)
     cameras = tuple(reference_studies(chosen, progress or (lambda _: None)))
     return Study(chosen, cameras, tuple(c for camera in cameras for c in compare(camera)))
 
 
 def fit(
     *series: Series,
-    effects: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str = (),
-    model: ThermalCamera | ThermalModel | Path | str | None = None,
+    effects: Effects = (),
+    model: Model | None = None,
     T0: float | None = None,
     kind: str | Path | ThermalModel | None = None,
     jobs: int = 1,
@@ -247,7 +248,6 @@ def fit(
         fit_with_type,
         require_type,
     )
-    from thermocald.physics.model import ThermalModel
     from thermocald.physics.model_file import read_model
     from thermocald.thermal.hypothesis import check_names
     from thermocald.thermal.reduce import reduce_series
@@ -257,7 +257,7 @@ def fit(
         raise UsageError("give at least one series to fit a model to")
     require_series(series)
     require_within(T0=(T0, COLDEST_C), jobs=(jobs, 1, 256))
-    if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
+    if isinstance(kind, str | Path) and _is_file(kind):
         kind = read_model(source_of(kind))
     if isinstance(kind, ThermalModel):
         require_type(kind)
@@ -278,7 +278,7 @@ def fit(
     if isinstance(kind, ThermalModel):
         camera = fit_with_type(reduced, kind)
     elif kind is not None:
-        camera = fit_type(reduced, listed, T0, kind)
+        camera = fit_type(reduced, listed, T0, str(kind))
     else:
         camera = fit_camera(reduced, listed, T0)
     return replace(camera, fitted={**(camera.fitted or {}), "doubts": _doubts(series, reduced)})
@@ -288,9 +288,9 @@ def discover(
     series: Series,
     *,
     verify: Sequence[Series] = (),
-    model: ThermalCamera | ThermalModel | Path | str | None = None,
+    model: Model | None = None,
     jobs: int = 1,
-    say: Callable[[str], None] | None = None,
+    say: Say = None,
 ) -> Discovery:
     """Find where simulation and measurement disagree, and name and verify the missing effect.
 
@@ -310,7 +310,6 @@ def discover(
 
     require_within(jobs=(jobs, 1, 256))
     tell = say or (lambda _: None)
-    require_series(verify)
     every = (series, *verify)
     require_series(every)
     start = _model_of(model)
@@ -331,7 +330,7 @@ def plan(
     *,
     preset: str | None = None,
     model: Path | str | None = None,
-    testfield: str | None = None,
+    testfield: Path | str | None = None,
     programme: Path | str | None = None,
     strength_px: float = 0.1,
     seeds: int = 2,
@@ -352,11 +351,9 @@ def plan(
 
     require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
-    source = None
-    if series is not None:
-        require_series((series,))
-        source = series.observed()
-    inputs = set_ups(source, thermal, preset, testfield, course, seeds)
+    source = None if series is None else series.observed()
+    field = None if testfield is None else str(source_of(testfield))
+    inputs = set_ups(source, thermal, preset, field, course, seeds)
     return plan_power(inputs, strength_px, progress or (lambda _: None))
 
 
@@ -377,12 +374,12 @@ def simulate(
     model: Path | str | None = None,
     camera: Path | str | None = None,
     programme: Path | str | None = None,
-    effects: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str = (),
+    effects: Effects = (),
     own_effects: bool = True,
     lamp: Sequence[tuple[float, float]] | None = None,
     seed: int = 0,
     series: str = "M1",
-    testfield: TestField | Path | str | None = None,
+    testfield: Field | None = None,
     epochs: int | None = None,
     frames: bool = False,
     out: Path | str | None = None,
@@ -410,7 +407,6 @@ def simulate(
     import shutil
     import tempfile
 
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.heat import Course
     from thermocald.physics.model_file import write_model
     from thermocald.physics.presets import given_simulation
@@ -452,7 +448,10 @@ def simulate(
     return made
 
 
-def _check_settings(s: StudySettings) -> None:
+def _study_settings(**given: Any) -> StudySettings:
+    from thermocald.analysis.study.series_study import StudySettings
+
+    s = StudySettings(**given)
     require_within(
         window=(s.window, 3), alpha=(s.alpha, 1e-6, 0.5), sets=(s.sets, 2), seed=(s.seed, 0),
         distance_mm=(s.distance_mm, 10.0), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10.0),
@@ -461,6 +460,7 @@ def _check_settings(s: StudySettings) -> None:
     )  # fmt: skip
     if s.window % 2 == 0:
         raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")
+    return s
 
 
 def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[str]:
@@ -474,21 +474,21 @@ def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[
     ]
 
 
-def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
+def _paths(given: Paths) -> list[Path]:
     return [source_of(p) for p in ((given,) if isinstance(given, str | Path) else given)]
 
 
-def _model_of(model: ThermalCamera | ThermalModel | Path | str | None) -> ThermalModel | None:
-    from thermocald.physics.model import ThermalModel
-
+def _model_of(model: Model | None) -> ThermalModel | None:
     if model is None or isinstance(model, ThermalModel):
         return model
     return (model if isinstance(model, ThermalCamera) else load_camera(model)).model
 
 
-def _effects(
-    given: Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str,
-) -> list[ModelEffect]:
+def _is_file(given: Path | str) -> bool:
+    return isinstance(given, Path) or Path(given).suffix in (".yaml", ".yml")
+
+
+def _effects(given: Effects) -> list[ModelEffect]:
     from thermocald.physics.model_file import read_effects
     from thermocald.thermal.hypothesis import effect_with, parse_effect
 
@@ -496,5 +496,5 @@ def _effects(
         return [effect_with(name, values) for name, values in given.items()]
     found: list[ModelEffect] = []
     for one in (given,) if isinstance(given, str | Path) else given:
-        found += read_effects(source_of(one)) if isinstance(one, Path) else [parse_effect(one)]
+        found += read_effects(source_of(one)) if _is_file(one) else [parse_effect(str(one))]
     return found

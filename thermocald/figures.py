@@ -245,12 +245,10 @@ def _scales(drawing: Any) -> str:
 def save(drawing: Any, folder: Path, name: str) -> list[Path]:
     """Write a drawing as <name>.svg and <name>.png (200 dpi); return the files."""
     paths = [folder / f"{name}.svg", folder / f"{name}.png"]
-    with drawing_style():
-        with new_file(paths[0]) as partial:
-            about = {"Date": None, "Creator": "thermocald"}
-            drawing.savefig(partial, format="svg", metadata=about)
-        with new_file(paths[1]) as partial:
-            drawing.savefig(partial, format="png", dpi=200)
+    svg: dict[str, Any] = {"metadata": {"Date": None, "Creator": "thermocald"}}
+    for path, settings in zip(paths, (svg, {"dpi": 200}), strict=True):
+        with drawing_style(), new_file(path) as partial:
+            drawing.savefig(partial, format=path.suffix[1:], **settings)
     return paths
 
 

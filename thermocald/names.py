@@ -10,20 +10,25 @@ a file's name holds no separator and no control character.
 
 from __future__ import annotations
 
+import builtins
 import functools
 import inspect
 import os
-import re
 import stat
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import chain, cycle
 from numbers import Integral, Real
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from types import FunctionType, NoneType, UnionType
+from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origin
 
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from thermocald.errors import ThermocaldError
+
+Public = TypeVar("Public", bound=Callable[..., Any])
 
 WITH_VALUES = ("ok", "predicted", "resected", "last_pose")
 """Statuses of epochs without a fault: calibrated, or predicted and posed with a thermal model."""
@@ -147,65 +152,105 @@ class FileFolder:
 
 
 # of an annotation: the type that a value must have, and what a message calls it
-_KINDS: dict[str, tuple[type, str]] = {
-    "str": (str, "text"),
-    "Path": (Path, "a path"),
-    "float": (Real, "a number"),
-    "int": (Integral, "a whole number"),
-    "None": (type(None), "None"),
-    "tuple": (Collection, "a tuple"),
-    "Iterable": (Iterable, "a list"),
-    "Sequence": (Iterable, "a list"),
-    "Mapping": (Mapping, "a mapping"),
+_KINDS: dict[Any, tuple[Any, str]] = {
+    str: (str, "text"),
+    Path: (os.PathLike, "a path"),
+    bool: (bool, "True or False"),
+    float: (Real, "a number"),
+    int: (Integral, "a whole number"),
+    tuple: (Collection, "a tuple"),
+    Iterable: (Iterable, "a list"),
+    Sequence: (Iterable, "a list"),
+    Mapping: (Mapping, "a mapping"),
+    Callable: (Callable, "a function"),
 }
+# of a class: the function that returns it
+_MADE_BY = {"Series": "open", "ThermalCamera": "fit", "TestField": "read_testfield"}
 
 
-def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a public function that raises UsageError for an argument of a wrong type.
+class _Unknown(type):
+    """The type of a name that only type checkers import; with all its parts, it is any type."""
 
-    Its annotations are read as text; a type that is not listed in `_KINDS` accepts anything.
+    def __getattr__(cls, _: str) -> _Unknown:
+        return cls
+
+    __getitem__ = __getattr__
+
+
+_ANYTHING = _Unknown("_ANYTHING", (), {})
+_UNKNOWN = (_ANYTHING, Any, inspect.Parameter.empty)
+_UNIONS = (Union, UnionType)
+
+
+def checked(public: Public) -> Public:
+    """Return a function that raises UsageError for an argument that its annotations exclude.
+
+    A class is returned with its constructor and its public methods checked.
     """
-    signature = inspect.signature(function)
-    kinds = {name: str(p.annotation) for name, p in signature.parameters.items()}
+    if isinstance(public, type):
+        for name, member in vars(public).copy().items():
+            if isinstance(member, FunctionType) and (name == "__init__" or name[0] != "_"):
+                setattr(public, name, checked(member))
+            elif isinstance(member, classmethod):
+                setattr(public, name, classmethod(checked(member.__func__)))
+        return public
 
-    @functools.wraps(function)
+    @functools.cache
+    def annotations() -> tuple[list[str], dict[str, Any]]:  # when its module is imported whole
+        names = defaultdict(lambda: _ANYTHING, vars(builtins) | public.__globals__)
+        found = inspect.signature(public, locals=names, eval_str=True).parameters.values()
+        in_order = [p.name for p in found if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
+        return in_order, {p.name: p.annotation for p in found}
+
+    @functools.wraps(public)
     def called(*given: Any, **named: Any) -> Any:
-        for name, value in signature.bind(*given, **named).arguments.items():
-            if not _accepts(kinds[name], value):
-                words = [_KINDS[kind.split("[")[0]][1] for kind in _alternatives(kinds[name])]
-                wanted = " or ".join(word for word in words if word != "None")
+        in_order, kinds = annotations()
+        names = chain(in_order, cycle(in_order[-1:]))  # the last may stand for several: *series
+        for name, value in (*zip(names, given, strict=False), *named.items()):
+            if not _accepts(kinds.get(name, Any), value):
+                wanted = _in_words(kinds[name])
                 wanted += " without a NUL character" * ("\\x00" in repr(value))
                 raise UsageError(f"{name} is {repr(value)[:80]}; it must be {wanted}")
-        return function(*given, **named)
+        return public(*given, **named)
 
-    return called
-
-
-def _alternatives(annotation: str) -> list[str]:
-    """Return the types between the outermost bars of an annotation."""
-    return re.split(r" \| (?![^\[]*\])", annotation)
+    return cast("Public", called)
 
 
-def _accepts(annotation: str, value: Any) -> bool:
-    """Return whether a value and its elements have one of the types of an annotation."""
-    return any(_is_of(kind, value) for kind in _alternatives(annotation))
+def _in_words(kind: Any) -> str:
+    """Return what a message calls the values of an annotation: `a list (each a number)`."""
+    if get_origin(kind) in _UNIONS:
+        return " or ".join(_in_words(one) for one in get_args(kind) if one is not NoneType)
+    origin, inner = get_origin(kind) or kind, get_args(kind)
+    if origin not in _KINDS:
+        name = origin.__name__
+        made = f" (from {_MADE_BY[name]})" if name in _MADE_BY else ""
+        return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{made}"
+    each = {tuple: "", Iterable: "each ", Sequence: "each "}.get(origin)
+    of = "" if each is None else f" ({each}{', '.join(map(_in_words, inner))})"
+    return f"{_KINDS[origin][1]}{of}"
 
 
-def _is_of(kind: str, value: Any) -> bool:
-    outer, _, inner = kind.removesuffix("]").partition("[")
-    if outer not in _KINDS:
-        return True
-    if isinstance(value, bool) or not isinstance(value, _KINDS[outer][0]):
+def _accepts(kind: Any, value: Any) -> bool:
+    """Return whether a value and its elements are what an annotation says."""
+    if get_origin(kind) in _UNIONS:
+        return any(_accepts(one, value) for one in get_args(kind))
+    origin, inner = get_origin(kind) or kind, get_args(kind)
+    if origin in (int, float) and isinstance(value, bool):
         return False
-    if isinstance(value, str | Path) and "\0" in str(value):
+    if isinstance(value, str | os.PathLike) and "\0" in str(value):
         return False
-    if not inner or not isinstance(value, Collection):  # an iterator can be read only once
+    if origin in _UNKNOWN or not isinstance(origin, type):
         return True
+    if origin in (bool, float) and getattr(value, "ndim", None) == 0:  # of NumPy, xarray, …
+        return not isinstance(value, str)
+    if not isinstance(value, _KINDS.get(origin, (origin,))[0]):
+        return False
+    if origin not in _KINDS or not inner or not isinstance(value, Collection):
+        return True  # an iterator can be read only once
     if isinstance(value, str):  # a list of its letters is never meant
         return False
     if isinstance(value, Mapping):
-        return all(_accepts(inner.partition(", ")[2], one) for one in value.values())
-    if outer == "tuple":
-        kinds = inner.split(", ")
-        return len(kinds) == len(value) and all(map(_accepts, kinds, value))
-    return all(_accepts(inner, one) for one in value)
+        return all(_accepts(inner[1], one) for one in value.values())
+    if origin is tuple and Ellipsis not in inner:
+        return len(inner) == len(value) and all(map(_accepts, inner, value))
+    return all(_accepts(inner[0], one) for one in value)

@@ -126,6 +126,11 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
+def enumerated(parts: Sequence[str]) -> str:
+    """Write `a`, `a and b`, `a, b and c`; empty for none."""
+    return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
+
+
 def listed(names: Sequence[str], most: int) -> str:
     """Write `a, b, c`, or `a, b and 3 more` if there are more than `most`."""
     more = f" and {len(names) - most} more" if len(names) > most else ""

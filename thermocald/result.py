@@ -11,7 +11,9 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from thermocald.errors import UsageError
 from thermocald.files import write_text
+from thermocald.names import checked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,8 +25,14 @@ if TYPE_CHECKING:
     Columns = dict[str, Column]
 
 
+@checked
 class Result(ABC):
     """The result of an analysis; `print` shows what the command prints."""
+
+    def __init_subclass__(cls) -> None:
+        """Let the public methods of every result check their arguments."""
+        super().__init_subclass__()
+        checked(cls)
 
     heading = "Results"
     caption = "The results over time, with their standard deviations."
@@ -41,9 +49,9 @@ class Result(ABC):
         """Return a report's first sentence, without its full stop."""
         return self.lines()[0]
 
-    @abstractmethod
     def plot(self) -> Figure:
-        """Draw the result with matplotlib (extra `report`)."""
+        """Draw the result with matplotlib (extra `report`). Raises UsageError without a drawing."""
+        raise UsageError(f"a {type(self).__name__} has no drawing: print it, or use as_dict()")
 
     def report(self, path: Path | str, title: str = "") -> Path:
         """Write the result as one HTML file that works offline; return its path.
@@ -60,7 +68,8 @@ class Result(ABC):
 
         answer = self.answer()
         others = [line for line in self.lines() if line != answer]
-        proof = Figure("proof", "Results", self.caption, drawing=self.plot())
+        drawn = type(self).plot is not Result.plot
+        proof = Figure("proof", "Results", self.caption, drawing=self.plot()) if drawn else None
         text = Section("What the command prints", printed="\n".join(others))
         return Chapter(title or self.heading, Answer(f"{answer}.", proof), (text,)).page()
 
@@ -138,17 +147,13 @@ def csv_text(
 ) -> Iterator[str]:
     """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
     for number, columns in enumerate(parts):
-        yield _csv_part(columns, not number, separator, decimal)
-
-
-def _csv_part(columns: Mapping[str, Column], first: bool, separator: str, decimal: str) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, delimiter=separator, lineterminator="\n")
-    if first:
-        writer.writerow(columns)
-    cells = [_cells(name, values, decimal) for name, values in columns.items()]
-    writer.writerows(zip(*cells, strict=True))
-    return text.getvalue()
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+        if number == 0:
+            writer.writerow(columns)
+        cells = [_cells(name, values, decimal) for name, values in columns.items()]
+        writer.writerows(zip(*cells, strict=True))
+        yield text.getvalue()
 
 
 def _cells(name: str, values: Column, decimal: str) -> Iterable[str]:

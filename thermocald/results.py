@@ -149,8 +149,8 @@ class Calibration(Result):
     @property
     def head(self) -> dict[str, Any]:
         """The camera's part of the document."""
-        assumed = {"pixel_pitch_assumed": self.pitch_assumed}
-        return {"name": self.file.name, **document_of(self.file.sensor), **assumed}
+        sensor = document_of(self.file.sensor)
+        return {"name": self.file.name, **sensor, "pixel_pitch_assumed": self.pitch_assumed}
 
     @property
     def doubts(self) -> list[str]:
@@ -178,11 +178,6 @@ class Calibration(Result):
     def status(self) -> str:
         """`ok` if the interior orientation was estimated."""
         return self.photographs.status
-
-    @property
-    def posed(self) -> bool:
-        """Whether the camera was calibrated or a photograph has a pose."""
-        return self.status == "ok" or any(p.status == "ok" for p in self.photographs.photographs)
 
     @property
     def sigma0(self) -> float:

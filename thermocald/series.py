@@ -6,10 +6,10 @@ It is read from a recording's folder, a store or a server; callers need not know
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from thermocald.analysis.series.recorded import (
 from thermocald.analysis.study.measured import measured_series
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
+from thermocald.names import checked
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE
@@ -36,8 +37,6 @@ from thermocald.store.sources import StoredRecording, open_source, require_sourc
 from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.epochs import Epochs
@@ -50,13 +49,13 @@ if TYPE_CHECKING:
     from thermocald.store.series import StoredSeries
     from thermocald.thermal.series import SeriesInput
 
-    Progress = Callable[[int], None] | None
-    Say = Callable[[str], None] | None
-
+Progress = Callable[[int], None] | None
+Say = Callable[[str], None] | None
 COLDEST_C = -273.15
 _LOOKED_AT = 25  # epochs in which the targets are compared with the field
 
 
+@checked
 class Series:
     """A measured series of one camera.
 
@@ -332,12 +331,8 @@ def check_exterior(exterior: str) -> None:
 
 
 def require_series(series: Sequence[Series]) -> None:
-    """Raise UsageError for what is not a series, and for a series that is given twice."""
-    if isinstance(series, Series):
-        raise UsageError(f"{series.source}: give a list of series, [series], not one series")
+    """Raise UsageError for a series that is given twice."""
     for i, one in enumerate(series):
-        if not isinstance(one, Series):
-            raise UsageError(f"{str(one)[:80]!r} is not a series: open it with thermocald.open")
         for other in series[:i]:
             if one is other or one.place == other.place:
                 raise UsageError(
@@ -347,18 +342,10 @@ def require_series(series: Sequence[Series]) -> None:
 
 
 def require_within(**bounds: tuple[Any, float] | tuple[Any, float, float]) -> None:
-    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes.
-
-    If `least` is a whole number, so must the value be.
-    """
+    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes."""
     for name, (value, least, *rest) in bounds.items():
         if value is None:
             continue
-        whole = isinstance(least, int)
-        is_number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-        if not is_number:
-            kind = "a whole number" if whole else "a number"
-            raise UsageError(f"{name} is {value!r}; it must be {kind}")
         if not (least <= value <= (rest[0] if rest else sys.float_info.max)):
             bound = f"from {least:g} to {rest[0]:g}" if rest else f"at least {least:g}"
             raise UsageError(f"{name} is {value}; it must be {bound}")
@@ -384,7 +371,5 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
 
 def source_of(text: Path | str) -> Path:
     """Return a path with `~` expanded, or a server's address, as the readers take it."""
-    if not isinstance(text, str | Path):
-        raise UsageError(f"{text!r} is not a path: give a text or a Path")
     path = Path(text)
     return path if is_server(path) else path.expanduser()

@@ -5,36 +5,43 @@ Each does what a command does; units and errors are those of `thermocald.api`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
+from thermocald.api import Field, read_testfield
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry import camera_files
-from thermocald.series import COLDEST_C, Series, require_series, require_within, source_of
+from thermocald.series import (
+    COLDEST_C,
+    Progress,
+    Say,
+    Series,
+    require_series,
+    require_within,
+    source_of,
+)
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.columns import LogOptions, log_options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from thermocald.analysis.camera.camera import Camera, CameraDifference
+    from thermocald.analysis.camera.camera import CameraDifference
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
     from thermocald.analysis.thermal.scene import SceneCourse
     from thermocald.output.corrected import Correction
     from thermocald.photogrammetry.camera_files import Conversion
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.survey import Survey
     from thermocald.results import FieldCheck
 
-    Model = ThermalCamera | Path | str
-    LogRead = LogOptions | Mapping[str, Any] | None
+Model = ThermalCamera | Path | str
+LogRead = LogOptions | Mapping[str, Any] | None
 
 
 def convert_camera(
@@ -91,7 +98,7 @@ def predict(
     distance_m: float = 10.0,
     wanted_mm: float = 5.0,
     extrapolate: bool = False,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress = None,
 ) -> Prediction:
     """Predict a camera at a temperature (°C), along a log, for series, or during a programme.
 
@@ -144,7 +151,7 @@ def correct(
     timezone: str | None = None,
     ambiguous: str = "order",
     extrapolate: bool = False,
-    say: Callable[[str], None] | None = None,
+    say: Say = None,
 ) -> Correction:
     """Correct image points or images for the camera's temperature when they were taken.
 
@@ -193,7 +200,7 @@ def measure(
     timezone: str | None = None,
     ambiguous: str = "order",
     extrapolate: bool = False,
-    say: Callable[[str], None] | None = None,
+    say: Say = None,
 ) -> Places:
     """Measure image points on a water surface, a plane, a staff or a cross-section.
 
@@ -246,7 +253,7 @@ def follow_scene(
     log_options: LogRead = None,
     times: str = "exif",
     timezone: str | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress = None,
     recording: Path | str | None = None,
 ) -> SceneCourse:
     """Compare the image motion of static points in a scene with the thermal model's prediction.
@@ -285,7 +292,7 @@ def fit_calibrations(
     ambiguous: str = "order",
     T0: float | None = None,
     temperature_sd: float = 0.1,
-    say: Callable[[str], None] | None = None,
+    say: Say = None,
 ) -> ThermalCamera:
     """Fit a thermal model to calibrations from photographs at two or more temperatures.
 
@@ -327,13 +334,13 @@ def survey_testfield(
     scale: tuple[str, str, float] | None = None,
     scale_sd: float = 0.1,
     distances: Path | str | None = None,
-    field: TestField | Path | str | None = None,
+    field: Field | None = None,
     camera: Path | str | None = None,
     hold_camera: bool = False,
     pixel_pitch: float | None = None,
     out: Path | str | None = None,
     camera_out: Path | str | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Say = None,
 ) -> Survey:
     """Measure a test field's coordinates and their standard deviations from photographs of it.
 
@@ -350,7 +357,6 @@ def survey_testfield(
     thermocald.errors.UsageError: the scale is missing: --scale A B MM, or --distances FILE
     """
     from thermocald.analysis.camera.photographs import images_of
-    from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
     from thermocald.photogrammetry.field.testfield import Distance
     from thermocald.photogrammetry.survey import survey
@@ -401,7 +407,7 @@ def survey_testfield(
 
 
 def check_testfield(
-    field: TestField | Path | str,
+    field: Field,
     *,
     camera: Camera | Path | str | None = None,
     pixel_pitch: float | None = None,
@@ -421,9 +427,7 @@ def check_testfield(
     >>> tc.check_testfield("M1/testfield.csv").as_dict()["calibrates"]
     True
     """
-    from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.field import assess_field
-    from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
     from thermocald.results import FieldCheck
 
@@ -443,8 +447,4 @@ def _thermal(model: Model) -> ThermalCamera:
 
 
 def _log_options(given: LogRead) -> LogOptions:
-    if isinstance(given, LogOptions):
-        return given
-    if not isinstance(given, Mapping | None):
-        raise UsageError(f"log_options is {repr(given)[:80]}; it must be a mapping")
-    return log_options(**(given or {}))
+    return given if isinstance(given, LogOptions) else log_options(**(given or {}))

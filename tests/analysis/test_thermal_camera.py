@@ -118,7 +118,7 @@ def test_outside_the_validity_it_warns_or_refuses():
 
 def test_missing_readings_are_refused():
     camera = ThermalCamera(thermal_model(*LISTED))
-    with pytest.raises(UsageError, match="temperature is nan: give one number"):
+    with pytest.raises(UsageError, match="temperature is NaN: give °C"):
         camera.at(float("nan"))
     for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
         with pytest.raises(UsageError, match="for each of its times"):

@@ -181,8 +181,8 @@ def test_a_wrong_type_is_refused(tmp_path):
     def error(*arguments):
         return answer("fit", tmp_path / "M1", "-o", "m", *arguments)
 
-    assert "no such file" in str(error("--type", tmp_path / "type.yaml").exception)
     preset_simulation("rpi-v2.1-heating", 3).write(tmp_path / "M1")
+    assert "No such file" in str(error("--type", tmp_path / "type.yaml").exception)
     rng = np.random.default_rng(1)
     sensor = preset_simulation("rpi-v2.1-heating", 3).model.sensor
     write_model(tmp_path / "one.yaml", specimen(rng, sensor, "one"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import inspect
 import json
 import pickle
 import re
@@ -20,7 +21,9 @@ import thermocald as tc
 from tests.commands import call, finish
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
+from thermocald.discovery.plan import Plan
 from thermocald.errors import ConfigurationError, DataError, RecordingError, StoreError, UsageError
+from thermocald.result import jsonable
 
 DOCUMENTED = (
     "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
@@ -172,30 +175,40 @@ def test_epochs_as_a_dataset_written_and_read(epochs, tmp_path):
 
 
 RESULTS = {
-    "epochs": lambda epochs, camera, M1, M2: epochs,
-    "study": lambda epochs, camera, M1, M2: tc.study(M1, sets=200, f_number=2.0),
-    "camera": lambda epochs, camera, M1, M2: camera,
-    "camera_at": lambda epochs, camera, M1, M2: camera.at(35.0),
-    "discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
-    "field": lambda epochs, camera, M1, M2: tc.check_testfield(M1.testfield),
+    "Epochs": lambda epochs, camera, M1, M2: epochs,
+    "Study": lambda epochs, camera, M1, M2: tc.study(M1, sets=200, f_number=2.0),
+    "ThermalCamera": lambda epochs, camera, M1, M2: camera,
+    "Camera": lambda epochs, camera, M1, M2: camera.at(35.0),
+    "CameraDifference": lambda *_: tc.compare_cameras("cold.json", "warm.json"),
+    "Catalogue": lambda *_: tc.catalogue(),
+    "Conversion": lambda *_: tc.convert_camera("cold.json", "cold.ior", "aicon"),
+    "Correction": lambda epochs, camera, M1, M2: tc.correct("points.csv", camera, log="M1"),
+    "Discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
+    "FieldCheck": lambda epochs, camera, M1, M2: tc.check_testfield(M1.testfield),
+    "Plan": lambda *_: Plan({"thermal_lag": {"thermal_lag or time_offset": 1}}, 1, 0.1),
+    "Prediction": lambda epochs, camera, M1, M2: tc.predict(camera, log="M1"),
 }
 
 
-@pytest.mark.parametrize("name", mostly_slow(RESULTS, *(set(RESULTS) - {"discovery"})))
+@pytest.mark.parametrize("name", mostly_slow(RESULTS, *(set(RESULTS) - {"Discovery"})))
 def test_one_result_prints_documents_draws_and_reports(
-    name, epochs, camera, M1, M2, tmp_path, request
+    name, inside, epochs, camera, M1, M2, tmp_path, request
 ):
-    if name == "study":  # tests/output looks at its many drawings
+    if name == "Study":  # tests/output looks at its many drawings
         request.getfixturevalue("undrawn")
     result = RESULTS[name](epochs, camera, M1, M2)
-    assert str(result).count("\n") >= 3
-    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))
+    assert re.fullmatch(rf"<{name}: (?!.*at 0x).{{4,200}}>", repr(result))
+    assert str(result) == "\n".join(result.lines())
+    assert json.loads(json.dumps(jsonable(result.as_dict()), allow_nan=False))
     assert result._repr_html_().startswith("<pre>")
-    assert "at 0x" not in repr(result)
-    assert len(repr(result)) < 200
-    result.plot().savefig(tmp_path / "drawn.png")
-    assert result.report(tmp_path / "report.html").stat().st_size > 1000
-    if name == "discovery":
+    page = result.report(tmp_path / "report.html").read_text()
+    assert ("Interior orientation" in page) is (name == "ThermalCamera")  # its certificate
+    if name in ("Catalogue", "Conversion", "Correction", "Plan"):
+        with pytest.raises(UsageError, match="has no drawing"):
+            result.plot()
+    else:
+        result.plot().savefig(tmp_path / "drawn.png")
+    if name == "Discovery":
         assert result.verdict == "effects_found"
         result.save(tmp_path / "found.yaml")
         assert tc.load_camera(tmp_path / "found.yaml").model.effects
@@ -233,6 +246,20 @@ def test_a_camera_at_a_temperature(camera, tmp_path):
         assert (tmp_path / name).stat().st_size > 100
     with pytest.raises(UsageError, match="does not tell the format"):
         now.write(tmp_path / "camera.yaml")
+
+
+def test_what_carries_data_says_what_it_is(M1, camera):
+    live = camera.live()
+    assert repr(M1.testfield) == "<TestField: 147 targets>"
+    assert repr(live) == "<LiveCamera rpi-v2.1: no reading yet>"
+    live.update(0.0, 35.5)
+    assert repr(live) == "<LiveCamera rpi-v2.1: 35.5 °C>"
+    assert repr(camera.along([0.0, 60.0], [30.0, 31.5])) == (
+        "<Along rpi-v2.1: 2 times, 30.0 to 31.5 °C>"
+    )
+    with pytest.warns(match="are widened") as told:
+        assert "⁻⁵ 1" not in str(camera.at(52.0))
+    assert told[0].filename == __file__  # the user's line
 
 
 def test_two_cameras_are_converted_and_compared(camera, world, tmp_path):
@@ -286,8 +313,6 @@ def test_a_model_and_a_programme_are_simulated(inside, tmp_path):
 
 
 def test_what_is_wrong_is_said(M1, camera):
-    with pytest.raises(UsageError, match="is the same series as"):
-        tc.study(M1, M1)
     with pytest.raises(UsageError, match="must be one of per_epoch"):
         M1.calibrate(exterior="still")
     with pytest.raises(UsageError, match="fahrenheit"):
@@ -305,36 +330,19 @@ OUT_OF_BOUNDS = {
     "2 labels for 1 series": lambda M1, field: tc.study(M1, labels=["a", "b"]),
     "is the same series as": lambda M1, field: tc.fit(M1, M1),
     "T0 is nan": lambda M1, field: tc.fit(M1, T0=np.nan),
-    "T0 is 'warm'; it must be a number": lambda M1, field: tc.fit(M1, T0="warm"),
-    "seed is 1.5; it must be a whole": lambda M1, field: tc.simulate("nexus5-cold", seed=1.5),
     "jobs is 999; it must be from 1 to 256": lambda M1, field: M1.calibrate(jobs=999),
     "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
-    "jobs is '2'; it must be a whole number": lambda M1, field: tc.study(M1, jobs="2"),
-    "source is None; it must be a path": lambda M1, field: tc.open(None),
-    "images is 3; it must be a path or text or a list": lambda M1, field: tc.calibrate(3, field),
-    "effects is None": lambda M1, field: tc.fit(M1, effects=None),
-    "labels is 'M1'; it must be a list": lambda M1, field: tc.study(M1, labels="M1"),
-    "verify is None": lambda M1, field: tc.discover(M1, verify=None),
-    "size is 3; it must be a tuple": lambda M1, field: tc.correct(
-        "points.csv", "camera.yaml", log="M1", size=3
-    ),
-    "size is '3x'": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size="3x"),
-    "timezone is 2; it must be text": lambda M1, field: tc.correct(
-        "points.csv", "camera.yaml", log="M1", timezone=2
-    ),
-    "log_options is ';'; it must be a mapping": lambda M1, field: tc.predict(
-        "camera.yaml", log="logger.csv", log_options=";"
-    ),
     "calibrations is {'cold.json': '26'}": lambda M1, field: tc.fit_calibrations(
         {"cold.json": "26"}
     ),
     "place is \\(1, 2\\); it must be a tuple": lambda M1, field: tc.check_testfield(
         field, place=(1, 2)
     ),
-    "pixel_pitch is '1 µm'; it must be a number": lambda M1, field: tc.import_photographs(
-        "photos", log="logger.csv", testfield=field, timezone="UTC", pixel_pitch="1 µm"
+    "model is 3; it must be a ThermalCamera .from fit. or a ThermalModel or a path or text": (
+        lambda M1, field: tc.fit(M1, model=3)
     ),
-    "the path of a model is 3": lambda M1, field: tc.fit(M1, model=3),
+    "free is 3; it must be text or a list .each text.": lambda M1, field: M1.calibrate(free=3),
+    "free is \\['c', 0\\]": lambda M1, field: M1.calibrate(free=["c", 0]),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
     "give finite": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(0, float("nan"))]),
@@ -343,18 +351,18 @@ OUT_OF_BOUNDS = {
     "height is 0": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1, field: tc.fit_calibrations({}),
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
-    "'M1' is not a series: open it": lambda M1, field: tc.fit("M1"),
-    "'M2' is not a series": lambda M1, field: tc.discover(M1, verify=["M2"]),
+    "series is 'M1'; it must be a Series .from open.": lambda M1, field: tc.fit("M1"),
     "verify is <Series": lambda M1, field: tc.discover(M1, verify=M1),
-    "test is <Series .*; it must be a list": lambda M1, field: tc.predict("camera.yaml", test=M1),
     "channels belong to a temperature": lambda M1, field: tc.predict(
         "camera.yaml", log="M1", channels={"temperature": 30.0}
     ),
 }
 HOT = [25.0, 30.0, 35.0]
 OF_A_CAMERA = {
-    "the temperature is 'warm'": lambda camera: camera.at("warm"),
-    "give one number": lambda camera: camera.at([30.0, 31.0]),
+    "to is 'image'; it must be an InteriorOrientation": lambda camera: camera.at(35.0).undistort(
+        [[1, 2]], to="image"
+    ),
+    "give one time": lambda camera: camera.live().update([0.0, 60.0], 30.0),
     "distance_mm is -1": lambda camera: camera.at(35.0).object_error(-1),
     "image points: must be an array \\(n, 2\\)": lambda camera: camera.at(35.0).undistort(
         [1, 2, 3]
@@ -374,8 +382,31 @@ OF_A_CAMERA = {
     ),
     "a time is not known: give": lambda camera: camera.live().update(np.nan, 30.0),
     "a temperature is no number": lambda camera: camera.along([0.0, 60.0, 120.0], "hot"),
-    "give °C, NaN for a failed": lambda camera: camera.live().update(0.0, None),
+    "temperature is {'board': '30'}": lambda camera: camera.live().update(0.0, {"board": "30"}),
 }
+
+
+# arrays and times, whose content is checked where they are used
+ANY = {
+    "at", "centre", "changes", "codes", "control", "diameters", "epochs", "frame", "image_points",
+    "interior", "kinds", "names", "numbers", "offsets", "plane", "points", "pose", "R", "rows",
+    "seen", "settings", "sigma", "sigmas", "temperatures", "time", "times", "values",
+}  # fmt: skip
+
+
+def test_every_argument_is_checked():
+    """Of every public function and method, but for arrays and times."""
+    named = {name: getattr(tc, name) for name in tc.__all__}
+    for name, one in list(named.items()):
+        if isinstance(one, type):
+            named |= {f"{name}.{m}": getattr(one, m) for m in dir(one) if m[0] != "_"}
+    found = set()
+    for function in filter(lambda f: inspect.isfunction(f) or inspect.ismethod(f), named.values()):
+        for argument in inspect.signature(function).parameters.keys() - {"self"} - ANY:
+            found.add(argument)
+            with pytest.raises(UsageError, match=f"^{argument} is <object .*; it must be "):
+                function(**{argument: object()})
+    assert len(found) > 60
 
 
 @pytest.mark.parametrize("message", OUT_OF_BOUNDS)

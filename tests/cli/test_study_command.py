@@ -2,14 +2,13 @@
 
 import json
 import re
-import shutil
 from functools import partial
 
 import pytest
 
 import thermocald as tc
 from tests.commands import succeed
-from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
+from thermocald.errors import DataError, OutputError, UsageError
 
 
 def written(path, seed):
@@ -89,6 +88,7 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
     [
         ([], UsageError, "give recordings or stores"),
         (["nowhere"], DataError, "nowhere: does not exist"),
+        (["RECORDING", "RECORDING"], UsageError, "is the same series as"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
         (["RECORDING", "--report", "RECORDING/epochs.csv/r.html"], OutputError, "written"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
@@ -98,20 +98,6 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
 def test_wrong_usage_is_one_error(run, recording, arguments, error, words):
     with pytest.raises(error, match=words):
         run(*[a.replace("RECORDING", str(recording)) for a in arguments])
-
-
-def test_the_same_series_twice_is_refused(run, recording, tmp_path):
-    with pytest.raises(UsageError, match="is the same series as"):
-        run(recording, recording)
-    shutil.copytree(recording, tmp_path / "copy")
-    with pytest.raises(DataError, match="has the same epochs as"):
-        run(recording, tmp_path / "copy")
-
-
-def test_a_file_that_is_no_store_is_one_error(run, tmp_path):
-    (tmp_path / "notes.txt").write_text("no store", encoding="utf-8")
-    with pytest.raises(ThermocaldError, match=r"notes\.txt"):
-        run(tmp_path / "notes.txt")
 
 
 @pytest.mark.slow

@@ -11,10 +11,11 @@ import pytest
 import thermocald as tc
 from tests.store.small import write_recording
 from thermocald.epoch import Epoch
+from thermocald.store.database import archive
 from thermocald.store.database.archive import archive_series, archive_store
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.series import clock_corrections
+from thermocald.store.series import clock_corrections, series_times
 
 
 def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
@@ -28,6 +29,19 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
         assert (epoch.number, epoch.temperatures) == (made.number, made.temperatures)
         assert epoch.frame_time == pytest.approx(made.frame_time, abs=1e-6)
         assert np.array_equal(epoch.observations.points, made.observations.points)
+
+
+def test_an_epoch_that_a_daemon_stores_in_the_meantime(filled, tmp_path, make_epoch, monkeypatch):
+    store, series = filled
+
+    def times_and_one_more(*given):
+        times = series_times(*given)
+        store.append(series, make_epoch(21))
+        return times
+
+    monkeypatch.setattr(archive, "series_times", times_and_one_more)
+    archive_series(store, series, tmp_path / "M1")
+    assert read_recording(tmp_path / "M1").columns.frame_time[-1] == make_epoch(21).frame_time
 
 
 def test_frames_that_are_left_are_taken_along(filled, tmp_path, make_epoch):

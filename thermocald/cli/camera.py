@@ -17,6 +17,7 @@ from thermocald.cli.common import (
     JsonOption,
     LogOption,
     ModelOption,
+    PhotosArgument,
     PixelPitchOption,
     TimezoneOption,
     progress,
@@ -32,21 +33,14 @@ from thermocald.errors import DataError, UsageError
 
 
 def calibrate(
-    images: list[Path] = typer.Argument(
-        ..., metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of photographs."
-    ),
+    images: PhotosArgument,
     testfield: Path = typer.Option(..., help="The test field, testfield.csv, in mm."),
     camera: Path | None = typer.Option(
         None,
         help="Camera file with initial values: width, height, pixel_pitch, principal_distance, "
         "interior; or a file of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON.",
     ),
-    pixel_pitch: float | None = typer.Option(
-        None,
-        min=1e-5,
-        max=1.0,
-        help="Pixel pitch, mm, if there is no --camera or its file does not give it.",
-    ),
+    pixel_pitch: PixelPitchOption = None,
     camera_out: Path | None = typer.Option(
         None, help="Write the camera: .json with covariance (every --camera reads it), or .yaml."
     ),
@@ -76,7 +70,7 @@ def calibrate(
     if report is not None:
         written.append(f"written: {result.report(report)}")
     show(result, json, result, *written)
-    if not result.posed:
+    if not (result.status == "ok" or result.poses):
         raise DataError(f"no photograph has a result: {result.photographs.reason}")
 
 
@@ -88,7 +82,7 @@ def convert(
     to: str = typer.Option(..., help=f"Format to write: {_FORMATS}."),
     out: Path = typer.Option(..., "--out", "-o", help="The file to write."),
     from_: str | None = expert(None, "--from", help="Format of FILE; default: by its content."),
-    pixel_pitch: float | None = typer.Option(None, help="Pixel pitch, mm, if FILE gives none."),
+    pixel_pitch: PixelPitchOption = None,
     json: JsonOption = None,
 ) -> None:
     """Convert a camera file to another format.
@@ -98,8 +92,7 @@ def convert(
 
     Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
     """
-    found = tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch)
-    show(found, json)
+    show(tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch), json)
 
 
 def at(
@@ -264,9 +257,9 @@ def correct(
             with progress(None, "correcting images") as advance:
                 done.write(out, advance)
         elif json == "-":
-            collections.deque(done.lines(), 0)
+            collections.deque(done.rows(), 0)
         else:
-            write_parts(done.lines(), "-")
+            write_parts(done.rows(), "-")
     write_json(done, json)
     if json != "-" and out is not None:
         typer.echo(f"{out}: {done}")

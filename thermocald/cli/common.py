@@ -42,7 +42,8 @@ PhotosArgument = Annotated[
     list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of photographs.")
 ]
 PixelPitchOption = Annotated[
-    float | None, typer.Option("--pixel-pitch", help="Pixel pitch, mm.", min=1e-5, max=1.0)
+    float | None,
+    typer.Option(help="Pixel pitch, mm, if no camera file gives it.", min=1e-5, max=1.0),
 ]
 LogOption = Annotated[Path, typer.Option("--log", help="Temperatures: log file, recording, store.")]
 ModelOption = Annotated[Path, typer.Option("--model", help="Thermal model (YAML).")]
@@ -226,7 +227,8 @@ def require_config(given: Path | None, instead: str) -> Path:
 def write_json(document: Any, destination: str | None) -> None:
     """Write a JSON document to a file, to standard output for `-`, or not at all for None."""
     if destination is not None:
-        write_text(json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n", destination)
+        text = json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n"
+        write_parts((text,), destination)
 
 
 def show(result: Any, json: str | None, *lines: object) -> None:
@@ -254,16 +256,11 @@ def warned(camera: ThermalCamera) -> ThermalCamera:
     return camera
 
 
-def write_text(text: str, destination: str | Path) -> None:
-    """Write text to a file, whole or not at all, or to standard output for `-`.
+def write_parts(parts: Iterable[str], destination: str | Path) -> None:
+    """Write a text in parts to a file, whole or not at all, or to standard output for `-`.
 
     Missing folders are created.
     """
-    write_parts((text,), destination)
-
-
-def write_parts(parts: Iterable[str], destination: str | Path) -> None:
-    """Write a text that comes in parts, in the same way as `write_text`."""
     if str(destination) == "-":
         for part in parts:
             sys.stdout.write(part)

@@ -41,15 +41,33 @@ def demo(
 
     Example: thermocald demo --out /tmp/demo
     """
+    if out.exists() and any(out.iterdir()):
+        raise DataError(f"{out}: exists and is not empty; give another folder with --out")
     say(f"a rendered camera (3280 × 2464 px) takes {epochs} epochs of 10 s of a corner field")
     with progress(epochs, "epochs") as advance:
-        document = run_demo(out, epochs, seed, advance)
+        series, truth = _acquire(out, epochs, seed, advance)
+    table = series.calibrate(exterior="series")
+    ok, temperature = table.ok, table.temperature
+    document: dict[str, Any] = {
+        "format": "thermocald-demo/1",
+        "epochs": epochs,
+        "ok": int(ok.sum()),
+        "targets": len(series.testfield),
+        "sigma0": float(np.median(table.sigma0[ok])),
+        "temperature": [float(np.nanmin(temperature)), float(np.nanmax(temperature))],
+        "parameters": _compare(table, truth, series.head.camera.sensor.pixel_pitch),
+        "store": out / "demo.db",
+        "recording": out / "M1",
+    }
     if json != "-":
         _print_drift(document)
     if discovery:
-        document["discovery"] = discover_hidden_effect(out, seed, say)
+        found = _discover_hidden_effect(out / "discovery", seed)
+        model = found.save(out / "discovery" / "camera.thermal.yaml")
+        document["discovery"] = {**found.as_dict(), "model": str(model)}
+        document["discovery"]["hidden"] = {"effect": _HIDDEN, "tau_s": _TAU_S}
         if json != "-":
-            _print_discovery(document["discovery"])
+            typer.echo(f"\nhidden: {_HIDDEN}, tau {_TAU_S:.0f} s\n{found}\nmodel: {model}")
     write_json(document, json)
 
 
@@ -67,22 +85,6 @@ def _print_drift(document: dict[str, Any]) -> None:
         typer.echo(f"{row['name']:<2} {drifts}  {scatter}")
     typer.echo(f"store:     {document['store']}")
     typer.echo(f"recording: {document['recording']}")
-
-
-def _print_discovery(document: dict[str, Any]) -> None:
-    hidden = document["hidden"]
-    typer.echo(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s")
-    for effect in document["effects"]:
-        typer.echo(f"found:     {effect['effect']}: {effect['statement']}")
-    for label, key in (("on M1", "fit"), ("on M2", "verify")):
-        gap = document["gap"][key]
-        if gap is not None:
-            typer.echo(
-                f"gap {label}: {gap['before']['rms_px']:.3f} → {gap['after']['rms_px']:.3f} px, "
-                f"reduced χ² {gap['before']['chi2_reduced']:.2f} → "
-                f"{gap['after']['chi2_reduced']:.2f}"
-            )
-    typer.echo(f"model:     {document['model']}")
 
 
 def simulate(
@@ -109,8 +111,7 @@ def simulate(
     Example: thermocald simulate --preset rpi-v2.1-heating --out rpi-M1 --seed 1
     """
     if list_:
-        known = tc.catalogue()
-        show(known, json)
+        show(tc.catalogue(), json)
         return
     if out is None:
         raise UsageError("--out is missing: the folder of the recording to write")
@@ -128,29 +129,6 @@ def simulate(
 _NAMES = ("c", "x0", "y0")  # the first parameters of the interior orientation
 _HIDDEN = "thermal_lag"
 _TAU_S = 75.0
-
-
-def run_demo(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) -> dict[str, Any]:
-    """Take epochs of a rendered camera into a store and a recording; return the JSON document.
-
-    advance: receives the number of new epochs. Raises DataError if the folder is not empty.
-    """
-    if out.exists() and any(out.iterdir()):
-        raise DataError(f"{out}: exists and is not empty; give another folder with --out")
-    series, truth = _acquire(out, epochs, seed, advance)
-    table = series.calibrate(exterior="series")
-    ok, temperature = table.ok, table.temperature
-    return {
-        "format": "thermocald-demo/1",
-        "epochs": epochs,
-        "ok": int(ok.sum()),
-        "targets": len(series.testfield),
-        "sigma0": float(np.median(table.sigma0[ok])),
-        "temperature": [float(np.nanmin(temperature)), float(np.nanmax(temperature))],
-        "parameters": _compare(table, truth, series.head.camera.sensor.pixel_pitch),
-        "store": out / "demo.db",
-        "recording": out / "M1",
-    }
 
 
 def _acquire(
@@ -221,13 +199,12 @@ def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any
     return rows
 
 
-def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Simulate a hidden lag, discover it in M1, verify it in M2; return the JSON document."""
+def _discover_hidden_effect(folder: Path, seed: int) -> tc.Discovery:
+    """Simulate a hidden lag in two series, discover it in M1 and verify it in M2."""
     say(
         "simulating a hidden effect: the camera follows the thermometer with a lag of "
         f"{_TAU_S:.0f} s"
     )
-    folder = out / "discovery"
     make_folder(folder)
     M1, M2 = (
         tc.simulate(
@@ -237,8 +214,4 @@ def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> 
         for number, name in enumerate(("M1", "M2"))
     )  # fmt: skip
     say("discovering where simulation and measurement disagree, and why")
-    found = tc.discover(M1, verify=[M2], say=say)
-    document = found.as_dict()
-    document["model"] = str(found.save(folder / "camera.thermal.yaml"))
-    document["hidden"] = {"effect": _HIDDEN, "tau_s": _TAU_S}
-    return document
+    return tc.discover(M1, verify=[M2], say=say)

@@ -12,7 +12,6 @@ import select
 import signal
 import sys
 import textwrap
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,6 +36,8 @@ from thermocald.numbers import counted, duration, with_sd
 
 if TYPE_CHECKING:
     from thermocald.config import Config
+
+StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's store.")]
 
 
 def run(
@@ -105,7 +106,7 @@ def run(
 
 
 def dashboard(
-    store: Path | None = typer.Option(None, help="The daemon's store."),
+    store: StoreOption = None,
     live: Path | None = expert(None, help="Folder of the daemon's live state."),
     host: str = expert("127.0.0.1", help="Address; other than loopback needs --token-file."),
     port: int = expert(8437, min=1, max=65535, help="Port to listen on."),
@@ -143,15 +144,7 @@ def dashboard(
     serve(store, live or find_state(store), host, port, token_file, names)
 
 
-_DaemonConfig = Annotated[
-    Path | None, typer.Option("--config", "-c", help="The daemon's configuration.")
-]
-StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's store.")]
-
-
-def status(
-    config: _DaemonConfig = None, store: StoreOption = None, json: JsonOption = None
-) -> None:
+def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOption = None) -> None:
     """Report the state of the daemon: cameras, thermometers, store.
 
     The exit status is 1 if the daemon does not run, if its store cannot be written, or if an epoch
@@ -169,7 +162,7 @@ def status(
 
 
 def top(
-    config: _DaemonConfig = None,
+    config: ConfigOption = None,
     store: StoreOption = None,
     interval: float = typer.Option(1.0, min=0.2, help="Seconds between two updates."),
 ) -> None:
@@ -190,7 +183,7 @@ def top(
     before = signal.signal(signal.SIGINT, lambda *_: ended.set())
     console = Console()
     try:
-        if not console.is_terminal:
+        if not (console.is_terminal and sys.stdin.isatty()):
             while not ended.is_set():
                 typer.echo("\n".join(status_lines(read_status(config, store))) + "\n")
                 ended.wait(interval)
@@ -206,16 +199,8 @@ def top(
 def keys() -> Iterator[Callable[[float], str]]:
     """Yield a function that waits for a key, at most the given s, and returns it or "".
 
-    If standard input is not a terminal, the function only waits. The terminal's mode is restored.
+    Standard input is a terminal, whose mode is restored.
     """
-    if not sys.stdin.isatty():
-
-        def waited(seconds: float) -> str:
-            time.sleep(seconds)
-            return ""
-
-        yield waited
-        return
     import termios
     import tty
 

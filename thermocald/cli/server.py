@@ -27,7 +27,7 @@ from thermocald.cli.common import (
     say,
     show,
     write_json,
-    write_text,
+    write_parts,
 )
 from thermocald.config import load_config
 from thermocald.errors import DataError, OutputError, UsageError
@@ -81,7 +81,7 @@ def dashboard(
     Example: thermocald server dashboard -o fleet.json
     """
     text = (files("thermocald.output") / "templates" / "grafana.json").read_text(encoding="utf-8")
-    write_text(text, output)
+    write_parts((text,), output)
 
 
 group = subcommands(init=init, grant=grant, dashboard=dashboard)
@@ -154,7 +154,7 @@ def fleet(
 
     document = fleet_document([Path(server) for server in servers])
     if report is not None:
-        write_text(render_fleet(document), report)
+        write_parts((render_fleet(document),), report)
     show(document, json, *fleet_lines(document))
 
 

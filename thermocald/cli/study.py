@@ -25,7 +25,6 @@ from thermocald.cli.common import (
     write_parts,
 )
 from thermocald.errors import DataError, UsageError
-from thermocald.files import write_text
 from thermocald.store.server.connection import is_server
 
 if TYPE_CHECKING:
@@ -135,15 +134,16 @@ def export(
     if format_ not in ("csv", "json", "parquet"):
         raise UsageError(f"--format {format_}: must be one of csv, json, parquet")
     style = series_export.style_of(units, time_, separator, decimal)
+    plain = style == series_export.ExportStyle()
     if format_ == "parquet" and output == "-":
         raise UsageError("--format parquet needs a file: -o FILE")
-    if format_ == "json" and not style.is_plain:
+    if format_ == "json" and not plain:
         raise UsageError("--units, --time, --separator and --decimal are for csv and parquet")
     opened = tc.open(source, series)
     with progress(len(opened) if folder else None, "calibrating") as advance:
         table = opened.calibrate(exterior=exterior, free=free, jobs=jobs, progress=advance)
     known = None
-    if extra or format_ == "parquet" or not style.is_plain:
+    if extra or format_ == "parquet" or not plain:
         known = opened.besides(table.number, extra=extra)
     pitch = opened.head.camera.sensor.pixel_pitch
     parts = series_export.column_parts(table, style, pitch, known)
@@ -343,10 +343,8 @@ def fit(
         raise UsageError("--log is for calibrations; a recording has its own temperatures")
     else:
         kind: str | Path | None = type_name
-        if type_name is not None and Path(type_name).is_file():
+        if type_name is not None and ("/" in type_name or Path(type_name).is_file()):
             kind = Path(type_name)
-        elif type_name is not None and (Path(type_name).suffix == ".yaml" or "/" in type_name):
-            raise UsageError(f"--type {type_name}: there is no such file")
         series = [one for source in inputs for one in tc.open_all(source)]
         with progress(None, "reading and measuring") as advance:
             camera = tc.fit(
@@ -359,9 +357,7 @@ def fit(
 
         document["code"] = [str(file) for file in write_code(camera, code)]
     if report is not None:
-        from thermocald.output.thermal_model import render_certificate
-
-        write_text(report, render_certificate(camera))
+        camera.report(report)
     show(document, json, f"{output}: {camera}")
 
 

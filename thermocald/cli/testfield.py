@@ -222,8 +222,7 @@ def survey(
         photos, scale=scale, scale_sd=scale_sd, distances=distances, field=field, camera=camera,
         hold_camera=hold_camera, pixel_pitch=pixel_pitch, out=out, camera_out=camera_out, say=say,
     )  # fmt: skip
-    lines = "\n".join(result.lines())
-    show({**result.as_dict(), "testfield": out}, json, f"{out}: {lines}")
+    show({**result.as_dict(), "testfield": out}, json, f"{out}: {result}")
 
 
 def check(
@@ -274,7 +273,7 @@ def check(
     )  # fmt: skip
     if report is not None:
         found.report(report)
-    show(found, json, *found.lines())
+    show(found, json)
 
 
 def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | None) -> Design:

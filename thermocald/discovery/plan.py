@@ -17,8 +17,10 @@ import numpy as np
 from thermocald.discovery.examination import examine_series
 from thermocald.discovery.search import list_candidates
 from thermocald.errors import UsageError
+from thermocald.numbers import counted
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
+from thermocald.result import Result
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.reduce import reduce_series
@@ -33,8 +35,8 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Candidate
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, repr=False)
+class Plan(Result):
     """The predicted power of a set-up; found: {effect: {verdict: count}}."""
 
     found: dict[str, dict[str, int]]
@@ -72,13 +74,15 @@ class Plan:
             ],
         }
 
-    def __str__(self) -> str:
-        out = [f"effects of {self.strength_px:g} px RMS, {self.repetitions} recordings each:"]
+    def lines(self) -> list[str]:
+        """Return what `discover --plan` prints."""
+        each = counted(self.repetitions, "recording")
+        out = [f"effects of {self.strength_px:g} px RMS, {each} each:"]
         for name, verdicts in self.found.items():
             counts = ", ".join(f"{k} × {n}" for k, n in sorted(verdicts.items()))
             out.append(f"  {name:26s} found {self.power(name):4.0%}   verdicts: {counts}")
         out += [f"  ambiguous: {a} and {b}; {e}" for a, b, e in self.ambiguous()]
-        return "\n".join(out)
+        return out
 
 
 def set_ups(

@@ -16,7 +16,16 @@ from thermocald.analysis.field import CELLS, FieldCheck
 from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
-from thermocald.numbers import UNITS, coefficient, listed, parameter_label, percent, plain, with_sd
+from thermocald.numbers import (
+    UNITS,
+    coefficient,
+    enumerated,
+    listed,
+    parameter_label,
+    percent,
+    plain,
+    with_sd,
+)
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 from thermocald.store.recording.sense import doubt_lines
@@ -117,7 +126,7 @@ def _estimates(result: Photographs, sensor: Sensor) -> str:
         for name, value, sd in found
         if sd > 0
     ]
-    return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
+    return enumerated(parts)
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
@@ -271,23 +280,26 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
     """Return the report as HTML text."""
     field, model = result.field, result.camera
     sds = result.sds_px
-    expected = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
+    expected, stated = (
+        ", ".join(f"{parameter_label(n)} to ± {_sd(row[k])}" for n, row in sds.items())
+        for k in (0, -1)
+    )
+    surveyed = f"gives {expected}, for image points of ± {result.sigma_px:g} px."
+    dominated = max(field / one for one, _, field in sds.values()) > _FIELD_DOMINATES
     if result.weak:
         sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
+    elif dominated:
+        sentence = f"With the stated errors of the targets' coordinates one image gives {stated}."
     else:
-        sentence = f"One image gives {expected}, for image points of ± {result.sigma_px:g} px."
+        sentence = f"One image {surveyed}"
     X, Y, Z = result.station.centre
     more = (
         f"{len(result.visible)} of {len(field)} targets are visible from ({X:.0f}, {Y:.0f}, "
         f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
         f"image, and their depth spans {percent(result.depth_relief)} of the distance."
     )
-    worse = max(field / one for one, _, field in sds.values())
-    if worse > _FIELD_DOMINATES and not result.weak:
-        stated = ", ".join(
-            f"{parameter_label(n)} to ± {_sd(field)}" for n, (*_, field) in sds.items()
-        )
-        more += f" With the stated errors of the targets' coordinates it gives {stated}."
+    if dominated and not result.weak:
+        more += f" With exact coordinates one image {surveyed}"
     rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
     return Chapter(

@@ -19,7 +19,9 @@ from thermocald.analysis.thermal.correction import (
 )
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
+from thermocald.numbers import counted
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
+from thermocald.result import Result
 from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
@@ -35,9 +37,9 @@ _ADDED = ("dx", "dy", "sd_x", "sd_y", "temperature", "extrapolated_K")
 _MOST_NAMED = 20  # refused rows that are reported by line
 
 
-@dataclass
-class Correction:
-    """A correction with a thermal model and a log, and its result.
+@dataclass(repr=False)
+class Correction(Result):
+    """A correction with a thermal model and a log; `write` computes it.
 
     path: the CSV, `-` is standard input; of_images: whether it lists images, not points; to: °C to
     correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say: receives a
@@ -64,7 +66,7 @@ class Correction:
         """Return the result as the document that `--json` writes."""
         head = {
             "format": "thermocald-correction/1",
-            "corrected_to": self.corrected_to,
+            "corrected_to": self.thermal.model.T0 if self.to is None else self.to,
             "temperature_sd": self.temperature_sd,
         }
         if self.images:
@@ -78,24 +80,20 @@ class Correction:
             "refused": self.refused,
         }
 
-    def __str__(self) -> str:
+    def lines(self) -> list[str]:
+        """Return what `correct` prints."""
+        left = "remaining error ±"
         if self.images:
             worst = max(d["rms_left_over_px"] for d in self.images)
             most = max(d["largest_correction_px"] for d in self.images)
-            images = "1 image" if len(self.images) == 1 else f"{len(self.images)} images"
-            return (
-                f"{images} corrected by up to {most:.3f} px; remaining error ± {worst:.3f} px at "
-                "most (RMS)"
-            )
-        return (
-            f"{self.points} points corrected by {self._rms(self._moved):.3f} px (RMS); remaining "
-            f"error ± {self._rms(self._left_over):.3f} px"
-        )
-
-    @property
-    def corrected_to(self) -> float:
-        """The temperature that is corrected to, °C."""
-        return self.thermal.model.T0 if self.to is None else self.to
+            images = counted(len(self.images), "image")
+            return [
+                f"{images} corrected by up to {most:.3f} px; {left} {worst:.3f} px at most (RMS)"
+            ]
+        if not self.points:
+            return [f"{self.path}: not corrected yet; write(path) does it"]
+        moved, rest = self._rms(self._moved), self._rms(self._left_over)
+        return [f"{self.points} points corrected by {moved:.3f} px (RMS); {left} {rest:.3f} px"]
 
     def write(self, out: Path | str, advance: Callable[[int], None] | None = None) -> None:
         """Write the corrected CSV, or the corrected images into a folder.
@@ -105,9 +103,9 @@ class Correction:
         if self.of_images:
             self._write_images(Path(out), advance or (lambda _: None))
         else:
-            write_parts(Path(out), self.lines())
+            write_parts(Path(out), self.rows())
 
-    def lines(self) -> Iterator[str]:
+    def rows(self) -> Iterator[str]:
         """Yield the corrected CSV of points, a block of rows at a time.
 
         Rows of standard input are corrected as they arrive. Rows that cannot be corrected are added
@@ -224,7 +222,7 @@ class Correction:
             )
 
     def _rms(self, squares: float) -> float:
-        return float((squares / (2 * self.points)) ** 0.5)
+        return float((squares / (2 * self.points)) ** 0.5) if self.points else float("nan")
 
 
 def _write_corrected(source: Path, written: Path, maps: Maps, values: Array) -> None:

@@ -143,14 +143,12 @@ def _names(d: Discovery) -> list[str]:
 
 
 def _origin(d: Discovery) -> list[str]:
-    lines = []
-    for name, e in zip(_names(d), d.examination.fitter.series, strict=True):
-        source = e.source
-        lines.append(
-            f"{source.camera}, {source.sensor}; {name} measured "
-            f"{day(float(source.frame_times[0]))}, {int(source.per_row.sum())} epochs."
-        )
-    return lines
+    sources = [e.source for e in d.examination.fitter.series]
+    return [
+        f"{one.camera}, {one.sensor}; {name} measured {day(float(one.frame_times[0]))}, "
+        f"{int(one.per_row.sum())} epochs."
+        for name, one in zip(_names(d), sources, strict=True)
+    ]
 
 
 def _sections(d: Discovery) -> list[Section]:
@@ -370,7 +368,11 @@ def _gap_table(d: Discovery) -> Table:
 
 
 def _effect(effect: EffectFound) -> Section:
-    rows = [(_parameter(name), _value(e)) for name, e in effect.estimates.items()]
+    labels = [
+        f"amplitude of {parameter_label(n[2:])}" if n.startswith("a_") else n.replace("_", " ")
+        for n in effect.estimates
+    ]
+    rows = list(zip(labels, map(_value, effect.estimates.values()), strict=True))
     text = []
     if proposal := effect.evidence.get("proposal"):
         test = proposal["surrogates"]
@@ -399,13 +401,6 @@ def _effect(effect: EffectFound) -> Section:
         )  # fmt: skip
     table = Table("Estimates", ("parameter", "value ± sd"), tuple(rows))
     return Section(f"Effect found: {effect.effect}", tuple(text), (), (table,), tuple(items))
-
-
-def _parameter(name: str) -> str:
-    """Return the label of an effect's parameter: a_c is the amplitude of c."""
-    return f"amplitude of {parameter_label(name[2:])}" if name.startswith("a_") else (
-        name.replace("_", " ")
-    )  # fmt: skip
 
 
 def _value(estimate: dict[str, Any]) -> str:

@@ -26,7 +26,6 @@ from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError, UsageError
 from thermocald.files import write_text
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, ExteriorOrientation
-from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.photogrammetry.frame.templates import Templates
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import jsonable
@@ -58,11 +57,6 @@ class ExportStyle:
     time: str = "seconds"
     separator: str = ","
     decimal: str = "."
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether it is the default style, which other commands read."""
-        return self == ExportStyle()
 
 
 def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle:
@@ -192,7 +186,7 @@ def renew_configuration(
     assert pose.exterior is not None
     # pose and camera are correlated: write the camera that was estimated together with the pose
     now = replace(camera, values=pose.values[IOP], covariance=pose.covariance[IOP, IOP])
-    K, distortion = _opencv(now)
+    K, distortion = now.opencv()
     rvec, tvec = opencv_pose(pose.exterior, control.origin)
     # pyorc solves for the pose again when it reads the file: with the points as this camera
     # projects them it obtains this pose
@@ -206,19 +200,6 @@ def renew_configuration(
         "lens_position": ((control.origin + six[3:]) / 1000.0).tolist(),
     }
     return RenewedConfiguration(document, now, control, pose)
-
-
-def _opencv(camera: Camera) -> tuple[Array, Array]:
-    """Return OpenCV's matrix and distortion, in closed form if that is exact, which also works if
-    a distortion of few terms folds back in the corners of the image.
-    """
-    terms = opencv_terms(camera.sensor, camera.values, camera.covariance)
-    if not terms["exact"]:
-        return camera.opencv()
-    K = np.array(
-        [[terms["fx"], 0.0, terms["cx"]], [0.0, terms["fy"], terms["cy"]], [0.0, 0.0, 1.0]]
-    )
-    return K, np.array([terms[name] for name in ("k1", "k2", "p1", "p2", "k3")])
 
 
 def opencv_pose(pose: ExteriorOrientation, origin: Array) -> tuple[Array, Array]:

@@ -44,7 +44,7 @@ from thermocald.photogrammetry.targets.frame_status import inspect_frame
 from thermocald.photogrammetry.targets.markers import locate_markers, to_8_bit
 from thermocald.photogrammetry.targets.outline import LocalMap, find_circles, local_maps
 from thermocald.photogrammetry.targets.ring_code import SEARCHES, have_rings, is_ring, read_codes
-from thermocald.result import with_sds
+from thermocald.result import Result, with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -173,8 +173,8 @@ Pictures = Mapping[str, "Callable[[], Image]"]
 """Functions by photograph name that load its grey values (H, W), 8 or 16 bit."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Survey:
+@dataclass(frozen=True, eq=False, repr=False)
+class Survey(Result):
     """The network, the field with surveyed coordinates and sigmas, and for each photograph what was
     measured in it or why nothing was.
     """

@@ -43,6 +43,7 @@ from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.physics.model_file import read_model
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import RPI_INTERIOR, corner_field, corner_view, load_field
+from thermocald.result import Result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -252,7 +253,7 @@ def given_simulation(
     return Simulation(thermal, device, chosen, read_programme(programme), seed)
 
 
-class Catalogue:
+class Catalogue(Result):
     """The list of the presets, and of the effects for model files."""
 
     def as_dict(self) -> dict[str, list[dict[str, Any]]]:
@@ -266,7 +267,8 @@ class Catalogue:
             ],
         }
 
-    def __str__(self) -> str:
+    def lines(self) -> list[str]:
+        """Return what `simulate --list` prints."""
         lines = ["presets", *(f"  {p.name:<18} {p.about}" for p in PRESETS.values())]
         lines.append("effects (for model files)")
         for name in catalogue.names():
@@ -274,4 +276,4 @@ class Catalogue:
             searched = ", ".join(f"{k} [{p.unit}]" for k, p in effect.nonlinear.items())
             linear = ", ".join(f"{k} [{effect.linear[k]}]" for k in effect.usual)
             lines.append(f"  {name:<24} {'; '.join(t for t in (searched, linear) if t)}")
-        return "\n".join(lines)
+        return lines

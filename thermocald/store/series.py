@@ -276,8 +276,10 @@ class SeriesTimes:
     corrections: Array
 
     def correct(self, stored: StoredEpoch) -> StoredEpoch:
-        """Return an epoch with its corrected times."""
+        """Return an epoch with its corrected times; one stored since they were read is correct."""
         row = int(np.searchsorted(self.numbers, stored.epoch.number))
+        if row == len(self.numbers):
+            return stored
         frame_time, temperature_time = float(self.frame[row]), float(self.reading[row])
         epoch = replace(stored.epoch, frame_time=frame_time, temperature_time=temperature_time)
         return replace(stored, epoch=epoch)

@@ -18,7 +18,7 @@ import numpy as np
 from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
 from thermocald.arrays import floats
 from thermocald.errors import ConfigurationError, UsageError
-from thermocald.numbers import plain, with_sd
+from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
@@ -194,7 +194,11 @@ class Camera(Result):
         """
         from thermocald.photogrammetry.camera.conversions import BROWN, convert, opencv
 
-        found = convert(self.sensor, BROWN, self.values, opencv(5))[0]
+        family = opencv(5)
+        if self.values[8:].any():
+            found = convert(self.sensor, BROWN, self.values, family)[0]
+        else:  # exact, also if the distortion folds back in the corners of the image
+            found = family.from_brown(self.sensor, self.values)
         fx, fy, cx, cy = found[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
 
@@ -234,7 +238,7 @@ class Camera(Result):
         """Return the camera as readable lines."""
         at = "" if np.isnan(self.temperature) else f" at {self.temperature:g} °C"
         return [self.name + at] + [
-            f"  {name:>3} = {with_sd(value, self.sd[name], PARAMETER_UNITS[name])}"
+            f"  {name:>3} = {with_sd(value, self.sd[name], UNITS.get(name, ''))}"
             for name, value in zip(IOP_NAMES, self.values.tolist(), strict=True)
             if value or self.sd[name]
         ]
@@ -284,7 +288,7 @@ _GRID = 25  # points per side
 _IN_PX = ("c", "x0", "y0")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CameraDifference(Result):
     """The difference of two cameras, second minus first.
 
@@ -362,8 +366,9 @@ class CameraDifference(Result):
             "rms_turned_px": np.sqrt(2 * np.mean(self.turned_shifts**2)),
         }
         if sds is not None:
-            largest, rms = self._image_sds(worst)
-            document |= {"sd_largest_px": largest, "sd_rms_px": rms}
+            for suffix, shifts in (("", self.shifts), ("_turned", self.turned_shifts)):
+                largest, rms = self._image_sds(shifts, free_rotation=bool(suffix))
+                document |= {f"sd_largest{suffix}_px": largest, f"sd_rms{suffix}_px": rms}
         return document
 
     def lines(self) -> list[str]:
@@ -375,7 +380,7 @@ class CameraDifference(Result):
             if not row["first"] and not row["second"]:
                 continue
             sd = row.get("sd_difference", np.nan)
-            text = with_sd(row["difference"], sd, row["unit"])
+            text = with_sd(row["difference"], sd, UNITS[row["name"]])
             if row["name"] in _IN_PX:
                 text += f"  ({with_sd(row['difference'] / pitch, sd / pitch, 'px')})"
             lines.append(f"  {row['name']:>3}  {text}")
@@ -420,17 +425,26 @@ class CameraDifference(Result):
         values = self.second.interior.as_array()
         return project(self.second.sensor, values, np.zeros(6), seen) - self._grid
 
-    def _image_sds(self, worst: int) -> tuple[float, float]:
-        """Return the standard deviations px of the largest shift's length and of the RMS."""
-        along_shifts = self.shifts / np.linalg.norm(self.shifts, axis=1)[:, None].clip(1e-300)
-        weights = self.shifts / (len(self.shifts) * max(self.rms_px, 1e-300))
+    def _image_sds(self, shifts: Array, *, free_rotation: bool) -> tuple[float, float]:
+        """Return the standard deviations px of the largest shift's length and of the RMS.
+
+        free_rotation: whether the shifts are those after the rotation that minimises them.
+        """
+        lengths = np.linalg.norm(shifts, axis=1)
+        worst = int(np.argmax(lengths))
+        along_worst = shifts[worst] / max(lengths[worst], 1e-300)
+        weights = shifts / (len(shifts) * max(_rms(shifts), 1e-300))
         largest = rms = 0.0
         cameras = (self.first, self.second)
         for camera, covariance in zip(cameras, self.covariances, strict=True):
             assert covariance is not None
             values = camera.interior.as_array()
-            J = partials(camera.sensor, values, np.zeros(6), self._directions)[1][..., :10]
-            along = along_shifts[worst] @ J[worst]
+            by = partials(camera.sensor, values, np.zeros(6), self._directions)[1]
+            J, turns = by[..., :10], by[..., 10:13].reshape(-1, 3)
+            if free_rotation:
+                taken = np.linalg.lstsq(turns, J.reshape(-1, 10), rcond=None)[0]
+                J = J - (turns @ taken).reshape(J.shape)
+            along = along_worst @ J[worst]
             total = np.einsum("nc,ncp->p", weights, J)
             largest += float(along @ covariance @ along)
             rms += float(total @ covariance @ total)

@@ -29,6 +29,7 @@ from thermocald.analysis.statistics.dependence import (
 )
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.errors import GeometryError
+from thermocald.names import checked
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
 
@@ -144,7 +145,8 @@ _GAP_IN_INTERVALS = 1.5
 _LEAST_DEPENDENCE = 4
 
 
-@dataclass(frozen=True, slots=True)
+@checked
+@dataclass(frozen=True)
 class StudySettings:
     """The options of a study; lengths in mm, temperatures in K.
 

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
-NUMBER = (int, float, np.number)
 _REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
 _MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 
@@ -94,7 +93,7 @@ class Validity:
             warnings.warn(
                 f"{self.place(T)}; standard deviations are widened",
                 ExtrapolationWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
         return outside
 
@@ -182,7 +181,7 @@ def widened(covariance: Array, variance: Array) -> Array:
     return covariance
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Along:
     """The camera along a history; indexing gives a Camera.
 
@@ -196,6 +195,10 @@ class Along:
     covariance: Array
     extrapolated: Array
     camera: str = "camera"
+
+    def __repr__(self) -> str:
+        T = self.temperatures
+        return f"<Along {self.camera}: {len(self)} times, {T.min():.1f} to {T.max():.1f} °C>"
 
     def __len__(self) -> int:
         return len(self.times)
@@ -232,7 +235,7 @@ def require_known(log: Array, readings: Array, times: Array) -> None:
 
 
 def require_sd(temperature_sd: float) -> None:
-    if not isinstance(temperature_sd, NUMBER) or not 0.0 <= temperature_sd < math.inf:
+    if not 0.0 <= temperature_sd < math.inf:
         raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
 
 

@@ -27,9 +27,9 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
+from thermocald.analysis.thermal.certificate import render_certificate
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.modelled_camera import (
-    NUMBER,
     Along,
     Validity,
     noise_share,
@@ -41,6 +41,7 @@ from thermocald.analysis.thermal.modelled_camera import (
 from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
+from thermocald.names import checked
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
@@ -109,14 +110,24 @@ class ThermalCamera(Result):
         """Return what `thermocald fit` prints."""
         return model_lines(self.as_dict())
 
+    @property
+    def _limits(self) -> tuple[float, float]:
+        """The temperatures of the fit, °C; 15 K about T0 for a model that does not state them."""
+        T0 = self.model.T0
+        return next(iter(self.model.validity.values()), (T0 - 15.0, T0 + 15.0))
+
+    def page(self, title: str = "") -> str:
+        """Return the model's certificate as HTML text; title: by default the camera's name."""
+        states = [self.at(float(t)) for t in np.linspace(*self._limits, 41)]
+        return render_certificate(self.as_dict(), states, title)
+
     def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
         Covers the range that the model was fitted on, with 95 % bands of these changes; other
         thermometers are taken to be as warm.
         """
-        limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
-        T = np.linspace(*limits, 60)
+        T = np.linspace(*self._limits, 60)
 
         def at(t: float) -> tuple[Array, Array, Array]:
             alike = dict.fromkeys(self.channels, t)
@@ -148,10 +159,6 @@ class ThermalCamera(Result):
         >>> now.temperature
         25.0
         """
-        if size is not None and (
-            len(np.atleast_1d(size)) != 2 or not all(isinstance(n, NUMBER) for n in size)
-        ):
-            raise UsageError(f"size is {size!r}: give (width, height) px")
         return LiveCamera(self if size is None else self.for_images(*size))
 
     def for_images(self, width: int, height: int, camera: str | None = None) -> ThermalCamera:
@@ -263,12 +270,9 @@ class ThermalCamera(Result):
         a model that uses them. Warns outside the model's validity; raises UsageError far outside it
         (unless `extrapolate`), also for a temperature that looks like Fahrenheit.
         """
-        try:
-            T = float(temperature)
-        except (TypeError, ValueError):
-            T = math.nan
+        T = float(temperature)
         if math.isnan(T):
-            raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
+            raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
         if channels is None:
             values, slope, J = self._steady.at(T)
@@ -309,8 +313,6 @@ class ThermalCamera(Result):
         ((3, 10), (3, 10))
         """
         require_sd(temperature_sd)
-        if not isinstance(relative_to, (*NUMBER, type(None))):
-            raise UsageError(f"relative_to is {relative_to!r}: give one number, °C")
         t = seconds(times)
         columns = (
             temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
@@ -434,8 +436,6 @@ class ThermalCamera(Result):
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
-        if not isinstance(given, Mapping):
-            raise UsageError(f"channels is {given!r}: give {{channel: °C}}")
         known = list(dict.fromkeys([*self.model.validity, *self.channels]))
         for name, value in given.items():
             if name not in known:
@@ -463,8 +463,6 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
-    if not isinstance(path, (str, Path)):
-        raise UsageError(f"the path of a model is {path!r}: give a text or a Path")
     return ThermalCamera(read_model(Path(path).expanduser()))
 
 
@@ -475,6 +473,7 @@ def _push(followers: list[Any], time: float, value: float) -> Array:
     return np.array([value])
 
 
+@checked
 class LiveCamera:
     """A camera that follows its thermometer; made by `ThermalCamera.live`.
 
@@ -510,6 +509,10 @@ class LiveCamera:
             for sign in (1.0, -1.0)
             if name.split(".")[0] in drives
         }
+
+    def __repr__(self) -> str:
+        now = "no reading yet" if self._now is None else f"{self._now.temperature:g} °C"
+        return f"<LiveCamera {self.thermal.model.camera}: {now}>"
 
     def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
         """Take a reading and return the camera now, equal to `along` over the history so far.
@@ -593,12 +596,11 @@ class LiveCamera:
         self, time: Any, temperature: float | Mapping[str, float]
     ) -> tuple[float, tuple[float, ...]]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
+        if np.ndim(time):
+            raise UsageError("time: give one time for a reading")
         t = float(seconds(time))
         given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
-        try:
-            names, row = tuple(given), tuple(float(v) for v in given.values())
-        except (TypeError, ValueError):
-            raise UsageError(f"{temperature!r}: give °C, NaN for a failed reading") from None
+        names, row = tuple(given), tuple(float(v) for v in given.values())
         if not row:
             raise UsageError("there is no reading: give a temperature, or {channel: °C}")
         if self._times:

@@ -13,11 +13,11 @@ import io
 import json
 import math
 import shutil
-from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client import generate_latest
@@ -68,50 +68,45 @@ _ONLINE = {
 }
 
 
-@dataclass(frozen=True)
-class _StatusCollector:
-    """A daemon's status as metrics; it is empty if no daemon runs."""
-
-    status: Mapping[str, Any]
-
-    def collect(self) -> Iterator[GaugeMetricFamily]:
-        status = self.status
-        single: list[tuple[str, str, float]] = [("up", "Whether a daemon answers.", bool(status))]
-        if status:
-            store = status["store"]
-            single += [
-                ("status_age_s", "Age of the daemon's status, s.", status["age_s"]),
-                ("stalled", "Devices or pipelines that hang.", len(status["stalled"])),
-                ("store_ok", "Whether the store can be written.", store["state"] == "ok"),
-                ("store_waiting", "Epochs waiting in memory.", store["waiting"]),
-                ("store_lost", "Epochs taken but not stored.", store["lost"]),
-                ("clock_trusted", "Whether UTC is synchronised.", status["clock"]["trusted"]),
-            ]
-        for name, about, value in single:
-            yield GaugeMetricFamily(f"thermocald_{name}", about, value=float(value))
-        if not status:
-            return
-        labels = ["kind", "name"]
-        up = GaugeMetricFamily("thermocald_device_up", "Whether a device is open.", labels=labels)
-        for kind in ("cameras", "thermometers", "outputs"):
-            for name, device in status[kind].items():
-                up.add_metric([kind[:-1], name], float(device["device"] == "open"))
-        yield up
-        for names, inner in ((_CAMERA, ()), (_EPOCH, ("last",)), (_ONLINE, ("last", "online"))):
-            for key, about in names.items():
-                family = GaugeMetricFamily(f"thermocald_{key}", about, labels=["camera", "series"])
-                for name, camera in status["cameras"].items():
-                    values = camera
-                    for part in inner:
-                        values = values.get(part) or {}
-                    if (value := values.get(key)) is not None:
-                        family.add_metric([name, camera["series"]], float(value))
-                yield family
+def _families(status: Mapping[str, Any]) -> Iterator[GaugeMetricFamily]:
+    """Yield a daemon's status as metrics; only that none answers if no daemon runs."""
+    single: list[tuple[str, str, float]] = [("up", "Whether a daemon answers.", bool(status))]
+    if status:
+        store = status["store"]
+        single += [
+            ("status_age_s", "Age of the daemon's status, s.", status["age_s"]),
+            ("stalled", "Devices or pipelines that hang.", len(status["stalled"])),
+            ("store_ok", "Whether the store can be written.", store["state"] == "ok"),
+            ("store_waiting", "Epochs waiting in memory.", store["waiting"]),
+            ("store_lost", "Epochs taken but not stored.", store["lost"]),
+            ("clock_trusted", "Whether UTC is synchronised.", status["clock"]["trusted"]),
+        ]
+    for name, about, value in single:
+        yield GaugeMetricFamily(f"thermocald_{name}", about, value=float(value))
+    if not status:
+        return
+    labels = ["kind", "name"]
+    up = GaugeMetricFamily("thermocald_device_up", "Whether a device is open.", labels=labels)
+    for kind in ("cameras", "thermometers", "outputs"):
+        for name, device in status[kind].items():
+            up.add_metric([kind[:-1], name], float(device["device"] == "open"))
+    yield up
+    for names, inner in ((_CAMERA, ()), (_EPOCH, ("last",)), (_ONLINE, ("last", "online"))):
+        for key, about in names.items():
+            family = GaugeMetricFamily(f"thermocald_{key}", about, labels=["camera", "series"])
+            for name, camera in status["cameras"].items():
+                values = camera
+                for part in inner:
+                    values = values.get(part) or {}
+                if (value := values.get(key)) is not None:
+                    family.add_metric([name, camera["series"]], float(value))
+            yield family
 
 
 def _metrics(request: Request) -> Response:
     """Return the status in the text format of Prometheus."""
-    text = generate_latest(_StatusCollector(_view(request).status()))
+    status = _view(request).status()
+    text = generate_latest(SimpleNamespace(collect=lambda: _families(status)))
     return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
 

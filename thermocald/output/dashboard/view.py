@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 _SHOWN = ("c", "x0", "y0")
 _COUNTS = ("n_observations", "n_rejected")
-_MOST_POINTS = 2000
 _ROWS_AT_ONCE = 500
 _OLD_S = 30.0
 _LOST_S = 3600.0  # the daemon is unhealthy for this long after an epoch was lost
@@ -159,10 +158,10 @@ class View:
         """Return columns for the charts: means over at most `points` bins with equal numbers of
         epochs.
 
-        until: UTC, s, by default the last epoch; since_s: only this many s before `until`, None:
-        all. A standard deviation is the mean of those of the bin's epochs, hence larger than that
-        of the bin's mean. Epochs taken before the machine knew the time, which `unset` counts, are
-        left out if the series has later ones.
+        points: at least 1; until: UTC, s, by default the last epoch; since_s: only this many s
+        before `until`, None: all. A standard deviation is the mean of those of the bin's epochs,
+        hence larger than that of the bin's mean. Epochs taken before the machine knew the time,
+        which `unset` counts, are left out if the series has later ones.
         """
         names = ["sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
         with Store.open(self._store) as store:
@@ -178,7 +177,6 @@ class View:
             if since_s is not None and chosen.any():
                 chosen &= times >= times[chosen].max() - since_s
             rows = np.flatnonzero(chosen)
-            points = max(2, min(points, _MOST_POINTS))
             bins = np.array_split(rows, min(points, len(rows))) if len(rows) else []
             averaged = {"frame_time": _means(times, bins)}
             for name in (*names, *channels):

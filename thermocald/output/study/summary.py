@@ -12,6 +12,7 @@ import numpy as np
 from thermocald.numbers import (
     coefficient,
     duration,
+    enumerated,
     parameter_label,
     percent,
     plain,
@@ -122,12 +123,11 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
     )
     T = channel.thermometer.values
     low, high = float(np.nanmin(T)), float(np.nanmax(T))
-    joined = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
     rough = " (standard deviations are rough, because the series is short)"
     where = parameter_label(channel.thermometer.name)
     return (
         f"{study.series.name}: between {low:.0f} and {high:.0f} °C "
-        f"{'' if where == 'temperature' else f'({where}) '}{joined}"
+        f"{'' if where == 'temperature' else f'({where}) '}{enumerated(parts)}"
         f"{rough if any(d.too_short for *_, d in found) else ''}."
     )
 
@@ -152,8 +152,7 @@ def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
     ]
     parts[0] = parts[0].replace(" with", " of the points with") + " held fixed"
     text = (
-        f"The camera, along its own path, stays within {limit_mm / 10:g} cm at "
-        f"{', '.join(parts[:-1])} and {parts[-1]}."
+        f"The camera, along its own path, stays within {limit_mm / 10:g} cm at {enumerated(parts)}."
     )
     strong = []
     known = sum(len(study.series) for study in camera.series) >= FEWEST_FOR_R
@@ -196,7 +195,7 @@ def _change(study: SeriesStudy) -> str:
     if not words:
         return ""
     time = duration(float(s.time_s[-1] - s.time_s[0]))
-    return f"{s.name}: in {time} {' and '.join(words)}{_warmed(study)}."
+    return f"{s.name}: in {time} {', and '.join(words)}{_warmed(study)}."
 
 
 def _distance(c: Deviation) -> str:
@@ -232,8 +231,8 @@ def _warmed(study: SeriesStudy) -> str:
         over = "" if within == largest else f" (range {within})"
         back = abs(d.change) < 3 * d.sd_change
         end = "" if back else f"{plain(abs(d.change), 'K', 3)} from "
-        return f" while {name} {rose} by up to {largest}{over} and ended {end}where it started"
-    return f" while {name} changed by {plain(d.change, 'K', 3)}"
+        return f", while {name} {rose} by up to {largest}{over} and ended {end}where it started"
+    return f", while {name} changed by {plain(d.change, 'K', 3)}"
 
 
 def _noise(study: SeriesStudy) -> str:
@@ -304,10 +303,8 @@ def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
 def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
     covariance = study.displacement_covariance
-    moved = {"points": study.grid, "displacement": study.displacement}
-    moved["sd_displacement"] = (
-        None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    )
+    sd = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    moved = {"points": study.grid, "displacement": study.displacement, "sd_displacement": sd}
     return {name: getattr(s, name) for name in _OF_SERIES} | {
         **{name: getattr(study, name) for name in _OF_STUDY},
         "epochs": len(s),

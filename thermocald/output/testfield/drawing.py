@@ -316,12 +316,6 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
     return pen.figure
 
 
-def draw_sheets(sheets: Sequence[Sheet]) -> list[Any]:
-    """Draw sheets as Figures; for a corner, its plan is the last one."""
-    pages = [draw(sheet) for sheet in sheets]
-    return [*pages, draw_plan(sheets)] if len(sheets) == 3 else pages
-
-
 def write_pdf(pages: Sequence[Any], path: Path) -> None:
     """Write Figures as the pages of one PDF."""
     about = {"Title": "thermocald test field", "Creator": "thermocald", "CreationDate": None}

@@ -282,7 +282,10 @@ def print_testfield(design: Design, folder: Path, *, replace_printed: bool = Fal
     """
     sheets = lay_out(design)
     field = field_of(sheets)
-    files = _publish(_drawing().draw_sheets(sheets), len(sheets), field, folder, replace_printed)
+    drawing = _drawing()
+    pages = [drawing.draw(sheet) for sheet in sheets]
+    plan = [drawing.draw_plan(sheets)] if len(sheets) == 3 else []
+    files = _publish([*pages, *plan], len(sheets), field, folder, replace_printed)
     return Printed(folder, files, sheets, field, design.page)
 
 

@@ -35,6 +35,7 @@ from thermocald.photogrammetry.camera_files.formats import (
     OPENCV,
     ROS,
 )
+from thermocald.result import Result
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -160,8 +161,8 @@ def _require_plausible(sensor: Sensor, interior: Array) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Conversion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Conversion(Result):
     """A camera file written in another format; statement: how exact the written file is."""
 
     source: Path
@@ -187,12 +188,12 @@ class Conversion:
             **asdict(camera.model.interior),
         }
 
-    def __str__(self) -> str:
-        camera = self.camera
-        return (
-            f"{self.source} ({camera.format}): {camera.how_read}\n"
-            f"{self.out} ({self.to}): {self.statement}"
-        )
+    def lines(self) -> list[str]:
+        """Return what `camera convert` prints."""
+        return [
+            f"{self.source} ({self.camera.format}): {self.camera.how_read}",
+            f"{self.out} ({self.to}): {self.statement}",
+        ]
 
 
 def convert(

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 KINDS = ("circle", "marker_corner", "chess_corner")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TestField:
     """A test field's targets: names, coordinates with standard deviations, and appearance.
 
@@ -63,6 +63,9 @@ class TestField:
             raise TestFieldError(f"target {twice!r} is duplicated in the test field")
         for array in (self.points, self.sigmas, self.diameters):
             array.setflags(write=False)
+
+    def __repr__(self) -> str:
+        return f"<TestField: {len(self)} targets>"
 
     @classmethod
     def build(

@@ -55,11 +55,9 @@ from thermocald.photogrammetry.series.estimator import (
 )
 from thermocald.photogrammetry.series.mount import (
     FEWEST_EPOCHS,
-    STILL,
     Movement,
     estimate_movement,
     image_px,
-    mean_movement,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 from thermocald.photogrammetry.series.result import (
@@ -99,9 +97,13 @@ def choose_exterior(
         return replace(series, s=s, bound=None, choice=why)
     movement, A = estimate_mount_movement(series, estimate), estimate.system.design.at.A
     px = image_px(movement.covariance, A)
+    doubt = ""
+    if movement.hidden.any():
+        hidden = 2.0 * image_px(movement.hidden, A)
+        doubt = f"; in a gap it may have moved by up to {hidden:.1g} px, which nothing shows"
     if movement.still and asked == "auto":
         noise = image_px(movement.noise, A)
-        why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
+        why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px){doubt}"
         return replace(series, s=replace(series.s, exterior="series"), bound=None, choice=why)
     how = ""
     if movement.memory:
@@ -110,7 +112,7 @@ def choose_exterior(
         how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
         how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
-    why = f"the mount moves by {px:.3f} px about its mean pose{how}"
+    why = f"the mount moves by {px:.3f} px about its mean pose{how}{doubt}"
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
 
@@ -128,18 +130,22 @@ def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Move
         correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
     good = system.good & np.isfinite(b).all(axis=1)  # epochs that diverged are left out
-    found, starts = [], []
-    for part in series.windows or (slice(0, len(N)),):
-        if good[part].sum() < FEWEST_EPOCHS and series.windows:
-            continue
-        starts.append(part.start)
-        found.append(
-            estimate_movement(
-                N[part] / variance, b[part] / variance, free, good[part],
-                series.s.drift_period, correlated, [k - part.start for k in series.s.gaps],
-            )
-        )  # fmt: skip
-    return mean_movement(found, starts) if found else STILL
+    starts = [part.start for part in series.windows[1:]]
+    found = estimate_movement(
+        N / variance, b / variance, free, good, series.s.drift_period, correlated,
+        [*series.s.gaps, *starts],
+    )  # fmt: skip
+    if not series.windows:
+        return found
+    # where between the parts of a long series the mount moved is not known
+    still = replace(
+        found,
+        courses=found.courses[:0],
+        steps=found.steps[:0],
+        step_covariances=found.step_covariances[:0],
+    )
+    memory = max(found.memory, len(N) / 2.0) if found.jumps else found.memory
+    return replace(still, slow=found.slow + found.of_jumps, memory=memory)
 
 
 def adjust_series(
@@ -235,13 +241,22 @@ def result(
     movement = series.movement
     if s.exterior == "series" and len(use) >= FEWEST_EPOCHS:
         movement = estimate_mount_movement(series, estimate)
-    mount_trend = np.zeros((16, 16))
+    slow: list[tuple[Array, Array]] = []
+    line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
         if s.exterior == "series":
-            relative[block] += common_error_covariance(system, movement.covariance)
+            relative[block] += common_error_covariance(system, movement.swaying)
         G = typical_sensitivity(system)
-        mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
-    slow, step = np.zeros((16, 16)), 0
+        trend[own[:, None], own] += G @ movement.tilt(line) @ G.T
+        held = s.exterior == "series"
+        follows = G if held else np.eye(len(own))[:, -6:] - G
+        for course, jump, V in zip(
+            movement.courses, movement.steps, movement.step_covariances, strict=True
+        ):
+            changes = np.zeros((16, 16))
+            of_step = V + np.outer(jump, jump) if held else V
+            changes[own[:, None], own] = follows @ of_step @ follows.T
+            slow.append((course, changes))
     if many and estimate.solved.any():
         # only of few targets is it unknown which have moved
         targets = np.median(use[estimate.solved].sum(axis=1))
@@ -249,16 +264,15 @@ def result(
         changes, step = slow_errors(
             estimate.residuals, use & estimate.solved[:, None], few and not series.windows
         )
-        slow = slow_target_covariance(system, changes, series.testfield.groups, few)
-        trend += slow
+        of_targets = slow_target_covariance(system, changes, series.testfield.groups, few)
+        slow.append((slow_course(len(use), step), of_targets))
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
         excess[own] = _excess(series, estimate.values[:, own], variances, sound)
         relative[block] = with_excess(relative[block], excess[own])
-    # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends,
-    # or a step
-    if slow.any():
-        relative += slow_course(len(use), step)[:, None, None] ** 2 * slow
+    for course, changes in slow:
+        relative += course[:, None, None] ** 2 * changes
+        trend += (line @ course) ** 2 * changes
     relative[~sound] = 0.0
     still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
@@ -274,7 +288,7 @@ def result(
         judge_epochs(series, estimate, relative, unit / pooled, sigma0, redundancy, still),
         level_covariance=level,
         excess_sd=np.sqrt(excess),
-        trend_sd=np.sqrt(np.diag(trend + mount_trend)),
+        trend_sd=np.sqrt(np.diag(trend)),
         perspective_sd=np.sqrt(pooled) * perspective_cofactor_roots(system),
         field_ratio=float(np.sqrt(series.field_variance)),
         outer_noise=_outer_noise(series, estimate),
@@ -282,7 +296,7 @@ def result(
         affinity=held_affinity,
         movement=movement,
         choice=series.choice,
-        slow=slow,
+        slow=tuple(slow),
         step=step,
         pairs=pairs or None,
     )

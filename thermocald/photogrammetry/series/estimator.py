@@ -414,12 +414,15 @@ class SeriesEstimator:
         for name, (value, sd) in s.priors.items():
             k = PARAMETER_NAMES.index(name)
             known[k], weight[k] = value, variance / sd**2
-        own_prior = np.diag(weight[own])
+        own_prior, shifts = np.diag(weight[own]), None
         if self.bound is not None:
             own_prior[-6:, -6:] = self.bound * variance
+            shifts = self.movement.shifts
+            if self.held is not None:  # epochs after those that showed the mount
+                shifts = shifts[-1:]
         offsets = self.has_offsets and with_common
         return Design(
-            at, own, common, known, own_prior, weight[common], self.bound is not None,
+            at, own, common, known, own_prior, weight[common], shifts,
             offset_weights(self.testfield, at) * (variance / self.field_variance)
             if offsets else np.empty((0, 3)),
         )  # fmt: skip

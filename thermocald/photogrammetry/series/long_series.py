@@ -244,6 +244,10 @@ class KnownSeries:
         system, unit = estimate.system, series.variance(estimate)
         at = system.design.at
         design = series.design(at, unit)
+        slow = sum(
+            ((2.0 * course[-1]) ** 2 * changes for course, changes in sample.slow),
+            np.zeros((16, 16)),
+        )
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
         T = series.grid.points.shape[1]
@@ -254,7 +258,7 @@ class KnownSeries:
         known = cls(
             held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
             system.common_share, sample.excess_sd**2, _ratios(series), middle,
-            sample.pairs, sample.movement, sample.slow,
+            sample.pairs, sample.movement, slow,
         )  # fmt: skip
         sums = CommonSums(design)
         right = np.zeros((len(sample.values), len(design.own)))

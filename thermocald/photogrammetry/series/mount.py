@@ -13,8 +13,9 @@ Limit: a change of the interior orientation as abrupt as a tremble is attributed
 makes the standard deviations too large, not too small.
 
 The trajectory may have jumps, if the mount was knocked or a lens slipped. A jump that the
-perspective attributes to the interior orientation is the camera's; every other one is a movement of
-the mount.
+perspective attributes to the interior orientation is the camera's; every other one is a step of the
+mount's mean pose, estimated from the jump itself. In a gap the camera may drift: only the
+perspective shows whether the mount moved, and by how much.
 
 The result is averaged over the lengths of the memory, and over models with and without each
 component, weighted by their plausibility.
@@ -26,24 +27,29 @@ updates as Févotte and Idier (2011), Neural Computation 23, 2421-2456.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PRINCIPAL
 from thermocald.photogrammetry.linalg import (
+    inverse_of_determined,
     mad_sd,
     stacked_inverses,
     symmetric_power,
     unit_diagonal,
 )
 from thermocald.photogrammetry.series.covariances import pose_equations
+from thermocald.photogrammetry.series.target_noise import slow_course
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from thermocald.arrays import Array, Index, Mask
+
+    Step = tuple[Array, Array]
+    """A step (k,) of the pose and the weights (k,) of what is known of it."""
 
 
 _PHI = np.array([0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98])
@@ -225,7 +231,9 @@ class Movement:
     white, slow (6, 6): covariances of the exterior orientation, rad and mm, for movements without
     and with memory; memory: epochs after which the slow movement has lost 63 % of its correlation;
     noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
-    first epoch after each jump.
+    first epoch after each of J jumps of the mean pose; courses (J, E): of unit steps there, about
+    their mean; steps (J, 6), step_covariances (J, 6, 6): of the jumps; hidden (6, 6): covariance of
+    a step in a gap that shows none.
     """
 
     white: Array
@@ -233,18 +241,41 @@ class Movement:
     memory: float
     noise: Array
     jumps: tuple[int, ...] = ()
+    courses: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    steps: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    step_covariances: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    hidden: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def shifts(self) -> Array:
+        """Shifts (E, 6) of the mean pose by the jumps, (1, 6) without any."""
+        shifts: Array = self.courses.T @ self.steps
+        return shifts
+
+    @property
+    def of_jumps(self) -> Array:
+        """Covariance (6, 6) of an epoch's pose about the mean by the jumps."""
+        share = np.mean(self.courses**2, axis=1)[:, None, None]
+        shifts = self.shifts
+        uncertain: Array = (share * self.step_covariances).sum(axis=0)
+        return uncertain + shifts.T @ shifts / len(shifts)
+
+    @property
+    def swaying(self) -> Array:
+        """Covariance (6, 6) of an epoch's movement about the shifted mean pose."""
+        return self.white + self.slow
 
     @property
     def covariance(self) -> Array:
-        """Covariance (6, 6) of an epoch's movement."""
-        return self.white + self.slow
+        """Covariance (6, 6) of an epoch's movement about the mean pose, with the jumps."""
+        return self.swaying + self.of_jumps
 
     @property
     def still(self) -> bool:
         """Whether the movement is hidden by the noise of one epoch in every direction."""
         whiten = self._whitening()
-        inside = np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T)
-        return bool(inside[-1] < _HIDDEN)
+        inside = np.linalg.eigvalsh(whiten @ self.swaying @ whiten.T)
+        return not self.jumps and bool(inside[-1] < _HIDDEN)
 
     def _whitening(self) -> Array:
         """Return T (6, 6) with T · noise · Tᵀ = 1."""
@@ -253,9 +284,12 @@ class Movement:
         return whitening
 
     def precision(self) -> Array:
-        """Return the inverse covariance (6, 6), with an sd of at least 1e-3 of the noise's."""
+        """Return the inverse covariance (6, 6) of the movements about the shifted mean pose.
+
+        Their sd is at least 1e-3 of the noise's.
+        """
         T = self._whitening()
-        inside = T @ self.covariance @ T.T
+        inside = T @ self.swaying @ T.T
         return T.T @ symmetric_power(inside, -1.0, _FLAT) @ T
 
     def tilt(self, weights: Array) -> Array:
@@ -277,20 +311,6 @@ STILL = Movement(np.zeros((6, 6)), np.zeros((6, 6)), 0.0, np.eye(6))
 """A mount that does not move."""
 
 
-def mean_movement(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
-    """Return the mean of the movements of parts of a series, with the longest memory.
-
-    starts: first epoch of each part, from which the jumps' epochs in the series follow.
-    """
-    return Movement(
-        np.mean([m.white for m in movements], axis=0),
-        np.mean([m.slow for m in movements], axis=0),
-        max(m.memory for m in movements),
-        np.mean([m.noise for m in movements], axis=0),
-        tuple(start + row for m, start in zip(movements, starts, strict=True) for row in m.jumps),
-    )
-
-
 def image_px(covariance: Array, A: Array) -> float:
     """Return the effect of a movement's covariance (6, 6) on the image, px, by partials (T, 2, 16).
 
@@ -304,25 +324,37 @@ _LARGE = 8.0  # robust standard deviations of the change between neighbours
 _LASTING = 0.5  # share of the change that must remain
 _SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
-_SURE = 4.0  # standard deviations by which the perspective must exclude a movement
-_UNSEEN = 3.0  # standard deviations below which the perspective shows no movement
+_LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
+_EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
+_SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
+_MEDIAN_CHI2_6 = 5.348
 
 
-def find_jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Array]:
+def find_jumps(
+    trajectory: Array, M: Array, g: Array, gaps: Sequence[int]
+) -> tuple[Array, dict[int, Step], Array]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
-    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free. Returns
-    the first epoch after each jump, the sum of the steps (E, k), and the covariance (k, k) of the
-    pose about its mean that the steps cause.
+    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; gaps:
+    the first epoch after each gap. Returns the trajectory without any jumps, what is known of the
+    mount's by their first epoch, and the covariance (k, k) of a step in a gap that shows none.
     """
-    E = len(trajectory)
-    rows: list[int] = []
-    stairs, uncertain = np.zeros_like(trajectory), np.zeros(trajectory.shape[1])
-    left = trajectory.copy()
-    examined: set[int] = set()
-    while len(examined) < _MOST and E >= 4 * _SIDE:
-        change = np.diff(left, axis=0)
-        size = np.abs(change) / np.maximum(mad_sd(change, axis=0), 1e-12)
+    jumps: dict[int, Step]
+    left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
+    # in a gap the camera drifts, too: only the perspective shows how far the mount moved
+    for row in gaps:
+        step, _ = _step(left, row)
+        left[row:] -= step
+        jumps[row] = np.zeros_like(step), _loose(step)
+    for row, (moved, V) in zip(gaps, _estimate_steps(M, g, jumps), strict=True):
+        if _chi2(moved, V) < _SHOWN:
+            del jumps[row]
+            hidden = max(hidden, V, key=np.trace)
+    noise = np.maximum(mad_sd(_without_drift(np.diff(left, axis=0)), axis=0), np.sqrt(2.0))
+    examined = {*gaps}
+    while len(examined) < _MOST + len(gaps) and len(left) >= 4 * _SIDE:
+        change = _without_drift(np.diff(left, axis=0))
+        size = np.abs(change) / noise
         for row in examined:
             size[row - 1] = 0.0
         worst = int(size.max(axis=1).argmax())
@@ -334,13 +366,38 @@ def find_jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array,
         if abs(step[column]) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
-        if not _is_of_camera(row, step, M, g):
-            rows.append(row)
-            stairs[row:] += step
-            variance = factor * mad_sd(change, axis=0) ** 2 / 2
-            uncertain += variance * (row / E) * (1 - row / E)
-    about = stairs - stairs.mean(axis=0)
-    return rows, stairs, about.T @ about / max(E, 1) + np.diag(uncertain)
+        if jump := _find_mover(row, step, factor * noise**2 / 2, M, g):
+            jumps[row] = jump
+    return left, dict(sorted(jumps.items())), hidden
+
+
+def _estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[Array, Array]]:
+    """Estimate the steps (k,) of the pose at some epochs, and their covariances (k, k).
+
+    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps, in order of time.
+    """
+    k = g.shape[1]
+    starts = [0, *jumps]
+    sums = [M[row:].sum(axis=0) for row in starts]
+    each = range(len(starts))
+    N = np.block([[sums[max(i, j)] for i in each] for j in each])
+    right = np.concatenate([g[row:].sum(axis=0) for row in starts])
+    for j, (step, weights) in enumerate(jumps.values(), start=1):
+        own = np.arange(j * k, (j + 1) * k)
+        N[own, own] += weights
+        right[own] += weights * step
+    Q = inverse_of_determined(N)
+    found = (Q @ right).reshape(-1, k)
+    Q = Q.reshape(len(starts), k, len(starts), k)
+    return [(found[j], Q[j, :, j]) for j in each[1:]]
+
+
+def _without_drift(change: Array) -> Array:
+    """Return changes (E - 1, k) between neighbours less the median of those around."""
+    padded = np.pad(change, ((_SIDE, _SIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE + 1, axis=0)
+    out: Array = change - np.median(windows, axis=-1)
+    return out
 
 
 def _step(trajectory: Array, row: int) -> tuple[Array, float]:
@@ -352,19 +409,27 @@ def _step(trajectory: Array, row: int) -> tuple[Array, float]:
     return estimator @ part, float(estimator @ estimator)
 
 
-def _is_of_camera(row: int, step: Array, M: Array, g: Array) -> bool:
-    """Return whether the perspective excludes a step of the pose."""
+def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:
+    """Return what is known of a jump of the pose; None if the camera jumped.
 
-    def estimate(part: slice) -> tuple[float, float]:
-        information = float(np.einsum("i,eij,j->", step, M[part], step))
-        return float((g[part] @ step).sum()) / max(information, 1e-300), information
+    step, variance (k,): of the trajectory. If the perspective excludes neither that the mount
+    jumped nor that the camera did, it alone shows how far.
+    """
+    ((moved, V),) = _estimate_steps(M, g, {row: (step, np.zeros_like(step))})
+    if _chi2(moved, V) > _EXCLUDED:
+        return step, 1.0 / variance
+    if _chi2(step - moved, V + np.diag(variance)) > _EXCLUDED:
+        return None
+    return np.zeros_like(step), _loose(step)
 
-    (before, weight_before), (after, weight_after) = map(estimate, (slice(row), slice(row, None)))
-    if min(weight_before, weight_after) <= 0:
-        return False
-    sd = float(np.sqrt(1.0 / weight_before + 1.0 / weight_after))
-    moved = after - before
-    return abs(1.0 - moved) > _SURE * sd and abs(moved) < _UNSEEN * sd
+
+def _loose(step: Array) -> Array:
+    """Return the weights (k,) of a step that is hardly larger than this change of the image."""
+    return np.full_like(step, 1.0 / (_LOOSE * float(step @ step)))
+
+
+def _chi2(difference: Array, covariance: Array) -> float:
+    return float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
 
 
 FEWEST_EPOCHS = 20
@@ -418,8 +483,7 @@ def estimate_movement(
     N (E, 16, 16), b (E, 16): of every epoch at one linearisation, in units of the noise; own (p,):
     the free interior parameters; good (E,): epochs to use; period: from `drift_period`; correlated
     (6, 6): part of the pose's normal matrix from correlated errors, ΣAᵀPCPA; gaps: from
-    `drift_gaps`. Across a gap in which the perspective shows that the camera drifted, nothing is
-    known of the mount.
+    `drift_gaps`. In a gap the mount has moved if the perspective shows it.
     """
     rows = np.flatnonzero(good)
     if len(rows) < FEWEST_EPOCHS:
@@ -438,17 +502,24 @@ def estimate_movement(
     # the pose by the perspective alone, the interior orientation eliminated
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
     M, g = back.T @ M @ back, g @ back
-    jumped, stairs, of_jumps = find_jumps(trajectory, M, g)
-    trajectory = trajectory - stairs
+    unit = _unit_variance(M, g)
+    M, g = M / unit, g / unit
     # what c, x0 and y0 do not follow, as they are held, is the mount's, however slow
     held = not (own < PRINCIPAL.stop).any()
     period = 0.0 if held else min(period, len(trajectory) / _PERIODS)
+    pauses = {*np.searchsorted(rows, gaps).tolist()}
+    if period:
+        pauses |= {*(np.flatnonzero(np.diff(rows) > 0.5 * period) + 1).tolist()}
+    paused: list[int] = []
+    for row in sorted(pauses):
+        if min(row - max(paused, default=0), len(rows) - row) >= _SIDE:
+            paused.append(row)
+    trajectory, jumps, hidden = find_jumps(trajectory, M, g, paused)
+    steps = _estimate_steps(M, g, jumps)
     cuts: list[int] = []
     if period:
-        missing = np.flatnonzero(np.diff(rows) > 0.5 * period) + 1
-        for row in sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()}):
-            long = min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS
-            if long and _is_of_camera(row, _step(trajectory, row)[0], M, g):
+        for row in paused:
+            if min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS:
                 cuts.append(row)
         parts = np.split(trajectory, cuts)
         smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
@@ -463,16 +534,29 @@ def estimate_movement(
     found = [components(p, min(period, len(p) / _PERIODS), held) for p in parts]
     size = [len(p) for p in parts]
     white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
-    memory = max(f[2] for f in found)
-    axes = back @ directions
-    if jumped:
-        memory = max(memory, len(trajectory) / 2.0)
+    axes, first = back @ directions, [int(rows[k]) for k in jumps]
+    moved = {
+        "courses": np.array([slow_course(len(good), row) for row in first]),
+        "steps": np.array([back @ step for step, _ in steps]),
+        "step_covariances": np.array([back @ V @ back.T for _, V in steps]),
+    }
     return Movement(
-        (axes * white) @ axes.T,
-        (axes * slow) @ axes.T + back @ of_jumps @ back.T,
-        memory, back @ back.T,
-        tuple(int(rows[k]) for k in jumped),
+        (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[2] for f in found), back @ back.T,
+        tuple(first), hidden=back @ hidden @ back.T, **(moved if first else {}),
     )  # fmt: skip
+
+
+def _unit_variance(M: Array, g: Array) -> float:
+    """Return the variance of unit weight, at least 1, of the poses by the perspective.
+
+    M (E, k, k), g (E, k): as in `find_jumps`; from the changes between neighbours.
+    """
+    Q, found = stacked_inverses(M)
+    change = np.diff(np.einsum("eij,ej->ei", Q, g), axis=0)[..., None]
+    chi2 = (change * np.linalg.solve(Q[1:] + Q[:-1], change)).sum(axis=(1, 2))[
+        found[1:] & found[:-1]
+    ]
+    return max(float(np.median(chi2)) / _MEDIAN_CHI2_6, 1.0) if len(chi2) else 1.0
 
 
 def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:

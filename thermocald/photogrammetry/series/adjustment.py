@@ -268,7 +268,12 @@ def result(
         slow.append((slow_course(len(use), step), of_targets))
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
-        excess[own] = _excess(series, estimate.values[:, own], variances, sound)
+        inner = len(free_columns(s.free))
+        found = _excess(series, estimate.values[:, own[:inner]], variances[:, :inner], sound)
+        # the pose moves itself; its scatter beyond the noise is as large as the interior's
+        usual = variances[sound].mean(axis=0) if sound.any() else np.ones(len(own))
+        ratio = np.median(found / usual[:inner]) if inner else 0.0
+        excess[own] = np.append(found, ratio * usual[inner:])
         relative[block] = with_excess(relative[block], excess[own])
     for course, changes in slow:
         relative += course[:, None, None] ** 2 * changes

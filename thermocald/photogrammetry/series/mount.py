@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PRINCIPAL
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import (
     inverse_of_determined,
     mad_sd,
@@ -68,7 +68,7 @@ def components(trajectory: Array, period: float, held: bool = False) -> tuple[Ar
     """Estimate the variance components of every column of a trajectory.
 
     trajectory (E, k): in units of its noise; period: shortest period of the drift in epochs, 0 for
-    none; held: there is none as c, x0 and y0 are held, in a series of any length.
+    none; held: no free parameter follows it, in a series of any length.
 
     Returns the variances (k,) of the white part and of the part with memory, about its mean, and
     the memory in epochs, 0 without one. A component without support by the likelihood is 0.
@@ -444,6 +444,7 @@ _SPIKE = 6.0  # robust standard deviations beyond which a deviation is a passer-
 _WEAK = 3.0  # times the usual variance of the pose, beyond which an epoch is interpolated
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
+_FOLLOWED = 1e-9  # share of a movement that the free parameters follow, beyond rounding
 _PERIODS = 2.5  # periods that a series must have to show a drift
 
 
@@ -504,9 +505,9 @@ def estimate_movement(
     M, g = back.T @ M @ back, g @ back
     unit = _unit_variance(M, g)
     M, g = M / unit, g / unit
-    # what c, x0 and y0 do not follow, as they are held, is the mount's, however slow
-    held = not (own < PRINCIPAL.stop).any()
-    period = 0.0 if held else min(period, len(trajectory) / _PERIODS)
+    alike, axes = np.linalg.eigh(whiten @ _hidden(N, own, root) @ whiten)
+    drifting = alike > _FOLLOWED
+    period = min(period, len(trajectory) / _PERIODS) if drifting.any() else 0.0
     pauses = {*np.searchsorted(rows, gaps).tolist()}
     if period:
         pauses |= {*(np.flatnonzero(np.diff(rows) > 0.5 * period) + 1).tolist()}
@@ -517,23 +518,23 @@ def estimate_movement(
     trajectory, jumps, hidden = find_jumps(trajectory, M, g, paused)
     steps = _estimate_steps(M, g, jumps)
     cuts: list[int] = []
-    if period:
-        for row in paused:
-            if min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS:
-                cuts.append(row)
-        parts = np.split(trajectory, cuts)
-        smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
-    else:
-        trajectory = trajectory - trajectory.mean(axis=0)
-        smooth = np.zeros_like(trajectory)
-    rough = trajectory - smooth
-    limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
-    rough = np.clip(rough, -limit, limit)
-    directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
-    parts = np.split((smooth + rough) @ directions, cuts)
-    found = [components(p, min(period, len(p) / _PERIODS), held) for p in parts]
-    size = [len(p) for p in parts]
-    white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
+    for row in paused if period else []:
+        if min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS:
+            cuts.append(row)
+    # what the free parameters do not follow is the mount's, however slow
+    found = [
+        _separate(trajectory, axes[:, part], alike[part], *how)
+        for part, how in ((~drifting, ([], 0.0, True)), (drifting, (cuts, period, False)))
+        if part.any()
+    ]
+    directions, white, slow = (np.concatenate([f[k] for f in found], axis=-1) for k in range(3))
+    steady = np.count_nonzero(~drifting)
+    if 0 < steady < 6:  # a mount that drifts where this shows does so in all directions
+        usual = ((directions.T @ whiten @ root / np.sqrt(np.diag(root.T @ root))) ** 2).sum(axis=1)
+        share = (slow[:steady] / usual[:steady]).max()
+        slow[steady:] = np.maximum(slow[steady:], share * usual[steady:])
+    # the directions are uncertain themselves, so that movements leak into all others
+    white = np.maximum(white, np.count_nonzero(white + slow) / len(trajectory) - slow)
     axes, first = back @ directions, [int(rows[k]) for k in jumps]
     moved = {
         "courses": np.array([slow_course(len(good), row) for row in first]),
@@ -541,7 +542,7 @@ def estimate_movement(
         "step_covariances": np.array([back @ V @ back.T for _, V in steps]),
     }
     return Movement(
-        (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[2] for f in found), back @ back.T,
+        (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
         tuple(first), hidden=back @ hidden @ back.T, **(moved if first else {}),
     )  # fmt: skip
 
@@ -588,31 +589,47 @@ def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, 
     return pose @ root.T, root, weak
 
 
-def _visible(N: Array, own: Index, root: Array) -> Array:
-    """Return the share (6, 6), 0 to 1, of a movement that an epoch's perspective shows, in units of
-    `root`; the rest looks like a change of the interior orientation.
+def _hidden(N: Array, own: Index, root: Array) -> Array:
+    """Return the share (6, 6), 0 to 1, of a movement that looks like a change of the interior
+    orientation, in units of `root`; an epoch's perspective shows the rest.
     """
-    usual = N.mean(axis=0, keepdims=True)
-    Q, _ = stacked_inverses(usual[:, own[:, None], own])
-    seen, _ = pose_equations(usual, usual[:, 0], own, Q)
-    inverse = np.linalg.inv(root)
-    visible: Array = inverse.T @ seen[0] @ inverse
-    return visible
+    usual = N.mean(axis=0)
+    Q, _ = stacked_inverses(usual[None, own[:, None], own])
+    looks = np.linalg.solve(root.T, usual[EOP_COLUMNS[:, None], own])
+    hidden: Array = looks @ Q[0] @ looks.T
+    return hidden
 
 
-def _directions(rough: Array, visible: Array) -> Array:
-    """Return orthonormal directions (6, 6) of the movements, from their rough part (E, 6).
+def _separate(
+    trajectory: Array, axes: Array, alike: Array, cuts: list[int], period: float, held: bool
+) -> tuple[Array, Array, Array, float]:
+    """Estimate the variance components of a trajectory (E, 6) along some orthonormal axes (6, d).
+
+    alike (d,): share of a movement along each that looks like the camera's; cuts: the first epoch
+    after each gap; period, held: as in `components`. Returns orthonormal directions (6, d), the
+    white and the slow variances (d,), and the memory.
 
     Directions that an epoch's perspective shows are separate from the others, as by a chance
     correlation the former would predict the latter.
     """
-    share, axes = np.linalg.eigh(visible)
-    found = []
-    for part in (axes[:, share < 0.5], axes[:, share >= 0.5]):
-        if part.shape[1]:
-            inside = rough @ part
-            found.append(part @ np.linalg.eigh(inside.T @ inside)[1])
-    return np.concatenate(found, axis=1)
+    trajectory = trajectory - trajectory.mean(axis=0)
+    smooth = np.zeros_like(trajectory)
+    if period:
+        parts = np.split(trajectory, cuts)
+        smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
+    rough = trajectory - smooth
+    limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
+    rough = np.clip(rough, -limit, limit)
+    groups = []
+    for part in (axes[:, alike > 0.5], axes[:, alike <= 0.5]):
+        inside = rough @ part
+        groups.append(part @ np.linalg.eigh(inside.T @ inside)[1])
+    directions = np.concatenate(groups, axis=1)
+    parts = np.split((smooth + rough) @ directions, cuts)
+    found = [components(p, min(period, len(p) / _PERIODS), held) for p in parts]
+    size = [len(p) for p in parts]
+    white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
+    return directions, white, slow, max(f[2] for f in found)
 
 
 def _fill(trajectory: Array, missing: Mask) -> Array:

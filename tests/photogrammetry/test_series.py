@@ -321,7 +321,7 @@ def test_a_slow_movement_that_no_free_parameter_follows_is_the_mounts(free, turn
 
 @pytest.mark.parametrize(
     ("knock", "missing", "seen"),
-    [(0.0, 31, "it may have moved by up to"), (1e-4, 31, "with jumps at row 60"),
+    [(0.0, 31, "in a gap it may have moved by up to"), (1e-4, 31, "with jumps at row 60"),
      (8e-5, 0, "with jumps at row 60")],
 )  # fmt: skip
 def test_a_knock_in_a_gap_or_in_a_drift_is_the_mounts(knock, missing, seen):

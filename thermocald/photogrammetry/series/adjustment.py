@@ -100,7 +100,8 @@ def choose_exterior(
     doubt = ""
     if movement.hidden.any():
         hidden = 2.0 * image_px(movement.hidden, A)
-        doubt = f"; in a gap it may have moved by up to {hidden:.1g} px, which nothing shows"
+        where = "between the sampled epochs" if series.windows else "in a gap"
+        doubt = f"; {where} it may have moved by up to {hidden:.1g} px unnoticed"
     if movement.still and asked == "auto":
         noise = image_px(movement.noise, A)
         why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px){doubt}"
@@ -111,7 +112,8 @@ def choose_exterior(
         slowly = f"over about {movement.memory:.0f} epochs"
         how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
-        how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
+        at = f"at row {', '.join(map(str, movement.jumps))}"
+        how += f", with jumps {'in a sample of the epochs' if series.windows else at}"
     why = f"the mount moves by {px:.3f} px about its mean pose{how}{doubt}"
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
@@ -130,22 +132,15 @@ def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Move
         correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
     good = system.good & np.isfinite(b).all(axis=1)  # epochs that diverged are left out
-    starts = [part.start for part in series.windows[1:]]
+    gaps = [*series.s.gaps, *(part.start for part in series.windows[1:])]
     found = estimate_movement(
-        N / variance, b / variance, free, good, series.s.drift_period, correlated,
-        [*series.s.gaps, *starts],
-    )  # fmt: skip
-    if not series.windows:
+        N / variance, b / variance, free, good, series.s.drift_period, correlated, gaps
+    )
+    if not series.windows or not found.jumps:
         return found
     # where between the parts of a long series the mount moved is not known
-    still = replace(
-        found,
-        courses=found.courses[:0],
-        steps=found.steps[:0],
-        step_covariances=found.step_covariances[:0],
-    )
-    memory = max(found.memory, len(N) / 2.0) if found.jumps else found.memory
-    return replace(still, slow=found.slow + found.of_jumps, memory=memory)
+    memory = max(found.memory, len(N) / 2.0)
+    return replace(found, slow=found.slow + found.of_jumps, memory=memory, steps=())
 
 
 def adjust_series(
@@ -250,9 +245,7 @@ def result(
         trend[own[:, None], own] += G @ movement.tilt(line) @ G.T
         held = s.exterior == "series"
         follows = G if held else np.eye(len(own))[:, -6:] - G
-        for course, jump, V in zip(
-            movement.courses, movement.steps, movement.step_covariances, strict=True
-        ):
+        for course, jump, V in movement.steps:
             changes = np.zeros((16, 16))
             of_step = V + np.outer(jump, jump) if held else V
             changes[own[:, None], own] = follows @ of_step @ follows.T

@@ -231,8 +231,8 @@ class Movement:
     white, slow (6, 6): covariances of the exterior orientation, rad and mm, for movements without
     and with memory; memory: epochs after which the slow movement has lost 63 % of its correlation;
     noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
-    first epoch after each of J jumps of the mean pose; courses (J, E): of unit steps there, about
-    their mean; steps (J, 6), step_covariances (J, 6, 6): of the jumps; hidden (6, 6): covariance of
+    first epoch after each jump of the mean pose; steps: the jumps, each with the course (E,) of a
+    unit step about its mean, the step (6,) and its covariance (6, 6); hidden (6, 6): covariance of
     a step in a gap that shows none.
     """
 
@@ -241,24 +241,21 @@ class Movement:
     memory: float
     noise: Array
     jumps: tuple[int, ...] = ()
-    courses: Array = field(default_factory=lambda: np.zeros((0, 1)))
-    steps: Array = field(default_factory=lambda: np.zeros((0, 6)))
-    step_covariances: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    steps: tuple[tuple[Array, Array, Array], ...] = ()
     hidden: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def shifts(self) -> Array:
         """Shifts (E, 6) of the mean pose by the jumps, (1, 6) without any."""
-        shifts: Array = self.courses.T @ self.steps
-        return shifts
+        each = (np.outer(course, step) for course, step, _ in self.steps)
+        return sum(each, np.zeros((1, 6)))
 
     @property
     def of_jumps(self) -> Array:
         """Covariance (6, 6) of an epoch's pose about the mean by the jumps."""
-        share = np.mean(self.courses**2, axis=1)[:, None, None]
         shifts = self.shifts
-        uncertain: Array = (share * self.step_covariances).sum(axis=0)
-        return uncertain + shifts.T @ shifts / len(shifts)
+        of_shifts: Array = shifts.T @ shifts / len(shifts)
+        return sum((np.mean(course**2) * V for course, _, V in self.steps), of_shifts)
 
     @property
     def swaying(self) -> Array:
@@ -425,7 +422,7 @@ def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> S
 
 def _loose(step: Array) -> Array:
     """Return the weights (k,) of a step that is hardly larger than this change of the image."""
-    return np.full_like(step, 1.0 / (_LOOSE * float(step @ step)))
+    return np.full_like(step, 1.0 / max(_LOOSE * float(step @ step), 1e-12))
 
 
 def _chi2(difference: Array, covariance: Array) -> float:
@@ -508,23 +505,19 @@ def estimate_movement(
     alike, axes = np.linalg.eigh(whiten @ _hidden(N, own, root) @ whiten)
     drifting = alike > _FOLLOWED
     period = min(period, len(trajectory) / _PERIODS) if drifting.any() else 0.0
-    pauses = {*np.searchsorted(rows, gaps).tolist()}
-    if period:
-        pauses |= {*(np.flatnonzero(np.diff(rows) > 0.5 * period) + 1).tolist()}
-    paused: list[int] = []
-    for row in sorted(pauses):
-        if min(row - max(paused, default=0), len(rows) - row) >= _SIDE:
-            paused.append(row)
-    trajectory, jumps, hidden = find_jumps(trajectory, M, g, paused)
+    missing = np.flatnonzero(np.diff(rows) > (0.5 * period or np.inf)) + 1
+    pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
+    pauses = _apart(pauses, len(rows), _SIDE)
+    cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
+    trajectory, jumps, hidden = find_jumps(trajectory, M, g, pauses)
     steps = _estimate_steps(M, g, jumps)
-    cuts: list[int] = []
-    for row in paused if period else []:
-        if min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS:
-            cuts.append(row)
     # what the free parameters do not follow is the mount's, however slow
     found = [
         _separate(trajectory, axes[:, part], alike[part], *how)
-        for part, how in ((~drifting, ([], 0.0, True)), (drifting, (cuts, period, False)))
+        for part, how in (
+            (~drifting, ([], 0.0, True)),
+            (drifting, (cuts if period else [], period, False)),
+        )
         if part.any()
     ]
     directions, white, slow = (np.concatenate([f[k] for f in found], axis=-1) for k in range(3))
@@ -535,16 +528,24 @@ def estimate_movement(
         slow[steady:] = np.maximum(slow[steady:], share * usual[steady:])
     # the directions are uncertain themselves, so that movements leak into all others
     white = np.maximum(white, np.count_nonzero(white + slow) / len(trajectory) - slow)
-    axes, first = back @ directions, [int(rows[k]) for k in jumps]
-    moved = {
-        "courses": np.array([slow_course(len(good), row) for row in first]),
-        "steps": np.array([back @ step for step, _ in steps]),
-        "step_covariances": np.array([back @ V @ back.T for _, V in steps]),
-    }
+    axes, first = back @ directions, tuple(int(rows[k]) for k in jumps)
+    moved = tuple(
+        (slow_course(len(good), row), back @ step, back @ V @ back.T)
+        for row, (step, V) in zip(first, steps, strict=True)
+    )
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
-        tuple(first), hidden=back @ hidden @ back.T, **(moved if first else {}),
+        first, moved, back @ hidden @ back.T,
     )  # fmt: skip
+
+
+def _apart(rows: Sequence[int], end: int, least: int) -> list[int]:
+    """Return the rows before which, and up to `end`, there are at least so many epochs."""
+    kept: list[int] = []
+    for row in rows:
+        if min(row - max(kept, default=0), end - row) >= least:
+            kept.append(row)
+    return kept
 
 
 def _unit_variance(M: Array, g: Array) -> float:

@@ -22,6 +22,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
+    EOP_COLUMNS,
     IOP,
     PRINCIPAL_POINT,
     ExteriorOrientation,
@@ -37,12 +38,10 @@ from thermocald.photogrammetry.epoch.snooping import (
 )
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
-    common_error_covariance,
     correlated_error_cofactors,
     estimate_held_affinity,
     line_weights,
     perspective_cofactor_roots,
-    prior_cofactors,
     slow_target_covariance,
     stillness,
     typical_sensitivity,
@@ -223,7 +222,7 @@ def result(
     # in few epochs the offsets absorb the common part of the image points' errors
     least = np.maximum(unit, 1.0) if few else unit
     # The priors' part is scaled by the series' variance, not by the epoch's.
-    bound = prior_cofactors(system)
+    bound = system.prior_cofactors
     relative[block] -= bound
     many = s.target_noise and len(use) >= FEW_EPOCHS
     pairs = series.pairs(estimate) if many else None
@@ -240,7 +239,8 @@ def result(
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
         if s.exterior == "series":
-            relative[block] += common_error_covariance(system, movement.swaying)
+            each = system.Q @ system.N[:, own[:, None], EOP_COLUMNS]
+            relative[block] += each @ movement.swaying @ np.swapaxes(each, 1, 2)
         G = typical_sensitivity(system)
         trend[own[:, None], own] += G @ movement.tilt(line) @ G.T
         held = s.exterior == "series"

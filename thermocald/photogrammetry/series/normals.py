@@ -313,15 +313,7 @@ def cofactors(N: Array) -> tuple[Array, Mask]:
 def among_all(Q: Array, own: Index) -> Array:
     """Expand matrices (E, p, p) of some parameters to all (E, 16, 16), 0 for the others."""
     whole = np.zeros((len(Q), 16, 16))
-    # none if the common exterior orientation is all that is estimated
-    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1) if len(own) else []
-    for rows in runs:
-        for columns in runs:
-            a, b = (
-                slice(own[rows[0]], own[rows[-1]] + 1),
-                slice(own[columns[0]], own[columns[-1]] + 1),
-            )
-            whole[:, a, b] = Q[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    whole[:, own[:, None], own] = Q
     return whole
 
 

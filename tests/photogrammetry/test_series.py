@@ -330,7 +330,7 @@ def test_a_knock_in_a_gap_or_in_a_drift_is_the_mounts(knock, missing, seen):
     field = scene.corner_field(0.02, per_side=4)
     epochs = np.r_[:60, 60 + missing : 119 + missing]
     warm = np.where(epochs < 75, 1 - np.exp(-epochs / 40), 5.52 * np.exp(-epochs / 40))
-    ratios = []
+    ratios, ends = [], []
     for seed in range(6):
         rng, observations = np.random.default_rng(seed), []
         moved = replace(field, points=field.points + rng.normal(0, 0.02, field.points.shape))
@@ -349,7 +349,10 @@ def test_a_knock_in_a_gap_or_in_a_drift_is_the_mounts(knock, missing, seen):
         error = (r.values - truth)[:, own]
         within = np.sqrt(np.diagonal(r.covariance, axis1=1, axis2=2)[:, own])
         ratios.append((error - error.mean(axis=0)) / within)
+        slow = sum((-2.0 * c[0] * c[-1] * np.diag(V) for c, V in r.slow), np.zeros(16))[own]
+        ends.append((error[-1] - error[0]) / np.sqrt(within[0] ** 2 + within[-1] ** 2 + slow))
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert 0.7 < np.sqrt(np.mean(np.square(ends))) < 1.3
 
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])

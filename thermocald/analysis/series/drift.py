@@ -51,15 +51,6 @@ def _p_value(change: float, sd: float) -> float:
     return float(2 * ndtr(-abs(change) / sd)) if sd > 0 else 0.0
 
 
-def _slow_errors(table: Epochs) -> tuple[Array, Array]:
-    """Return the courses (n, E) of the series' slow errors, and their variances (n, 16)."""
-    slow = () if table.adjustment is None else table.adjustment.slow
-    at = np.linspace(0.0, 1.0, len(table))  # a long series has the course of its sample
-    courses = [np.interp(at, np.linspace(0.0, 1.0, len(c)), c) for c, _ in slow]
-    variances = [np.diag(changes) for _, changes in slow]
-    return np.reshape(courses, (-1, len(table))), np.reshape(variances, (-1, 16))
-
-
 def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """Fit straight lines to the estimated parameters; p is corrected for their number (Holm).
 
@@ -69,9 +60,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """
     found, ok = [], table.ok
     time = table.frame_time[ok]
-    course, variances = _slow_errors(table)
-    # slow errors have opposite signs in the first and the last epoch
-    slow = -2.0 * (course[:, 0] * course[:, -1]) @ variances
+    slow = table.slow_between_ends
     for name in names:
         column = IOP_NAMES.index(name)
         values, sds = table.values[ok, column], table.sd[ok, column]
@@ -108,7 +97,7 @@ def courses(table: Epochs) -> list[Course]:
     temperature, time = table.temperature[have], table.frame_time[have]
     if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
         warming = temperature - temperature.mean()
-        course, variances = _slow_errors(table)
+        course, variances = table.slow_errors
         per_kelvin = course[:, have] @ warming / (warming @ warming)
         slow = np.sqrt(per_kelvin**2 @ variances)
         for name, line in lines.items():

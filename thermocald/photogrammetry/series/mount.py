@@ -360,7 +360,8 @@ def find_jumps(
             break
         examined.add(row)
         step, factor = _step(left, row)
-        if abs(step[column]) < _LASTING * abs(change[worst, column]):
+        lasting = _step(left, row, 1)[0][column]  # a spike is no jump
+        if abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
         if jump := _find_mover(row, step, factor * noise**2 / 2, M, g):
@@ -397,13 +398,15 @@ def _without_drift(change: Array) -> Array:
     return out
 
 
-def _step(trajectory: Array, row: int) -> tuple[Array, float]:
-    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's."""
-    first = max(row - _SIDE, 0)
-    part = trajectory[first : row + _SIDE]
-    t = np.arange(first, first + len(part)) - row
+def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
+    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's.
+
+    apart: number of epochs on both sides that do not count.
+    """
+    t = np.arange(max(row - _SIDE, 0), min(row + _SIDE, len(trajectory))) - row
+    t = t[(t < -apart) | (t >= apart)]
     estimator = np.linalg.pinv(np.column_stack([np.ones(len(t)), t, t >= 0]))[2]
-    return estimator @ part, float(estimator @ estimator)
+    return estimator @ trajectory[row + t], float(estimator @ estimator)
 
 
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:

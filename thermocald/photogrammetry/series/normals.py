@@ -57,8 +57,7 @@ class ObservationGrid:
         present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
         shape = (len(epochs), len(field))
         if not present:
-            none = np.empty(0, dtype=np.int64)
-            return cls.from_rows(shape, none, none, np.empty((0, 2)), np.empty((0, 2)))
+            return cls(np.full((*shape, 2), np.nan), np.zeros((*shape, 3)))
         xy = None
         if any(obs.covariances is not None for _, obs in present):
             xy = np.concatenate(

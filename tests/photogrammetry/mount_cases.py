@@ -20,12 +20,12 @@ class Tremble:
     memory: float = 0.0
 
 
-def simulate(rng, field: TestField, epochs: int, tremble: Tremble):
+def simulate(rng, field: TestField, epochs: int, tremble: Tremble, warm_px: float = 8.0):
     """Return observations and true values (E, 16) of a camera that warms up on a moving mount."""
     truth = np.tile(scene.TRUTH, (epochs, 1))
     at = linearise(scene.SENSOR, field, truth[0, :10], truth[0, 10:])
     per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
-    warm = 8.0 * (1 - np.exp(-np.arange(epochs) / 25))
+    warm = warm_px * (1 - np.exp(-np.arange(epochs) / 25))
     truth[:, PRINCIPAL] += warm[:, None] * np.array([1e-4, 5e-4, -4e-4])
     move = rng.normal(size=(epochs, 3))
     for e in range(1, epochs):

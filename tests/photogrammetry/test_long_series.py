@@ -40,11 +40,11 @@ def case():
     return known, truth, ObservationGrid.from_rows(shape, rows, targets, points[see], sigmas)
 
 
-def blocked(case, size, exterior="series", jobs=1, **other):
+def blocked(case, size, exterior="series", jobs=1, together=120, **other):
     field, _, grid = case
     return adjust_long_series(
         scene.SENSOR, field, InBlocks(grid, size), scene.INTERIOR, scene.EXTERIOR,
-        SeriesSettings(exterior=exterior, **other), together=120, jobs=jobs,
+        SeriesSettings(exterior=exterior, **other), together=together, jobs=jobs,
     )  # fmt: skip
 
 
@@ -105,3 +105,20 @@ def test_processes_do_not_matter(case):
     np.testing.assert_array_equal(two.level_sd, one.level_sd)
     np.testing.assert_array_equal(two.trend_sd, one.trend_sd)
     assert two.rows.status == one.rows.status
+
+
+def test_a_knock_between_the_sampled_epochs_is_the_mounts():
+    """Regression: it was not examined, and errors of x0 were up to 26 sds."""
+    rng, field, epochs = np.random.default_rng(1), scene.corner_field(per_side=4), 1200
+    truth = np.tile(scene.TRUTH, (epochs, 1))
+    truth[:, :3] += np.sin(np.arange(epochs) / 120)[:, None] * np.array([1e-4, 1e-3, -8e-4])
+    truth[530:, 10:13] += np.array([2e-4, -1e-4, 1e-4])
+    points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], field.points)
+    points += rng.normal(0, scene.SIGMA_PX, points.shape)
+    weights = np.zeros((*points.shape[:2], 3))
+    weights[..., :2] = scene.SIGMA_PX**-2
+    found = blocked((field, truth, ObservationGrid(points, weights)), 400, "auto", together=300)
+    assert "with jumps in a sample of the epochs" in found.sample.choice
+    error = (found.rows.values - truth)[:, 1:3]
+    ratio = (error - error.mean(axis=0)) / found.rows.sd[:, 1:3]
+    assert np.sqrt(np.mean(ratio**2)) < 1.3

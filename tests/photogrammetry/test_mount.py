@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mount_cases import Tremble, simulate, standardised
 
-from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, PRINCIPAL_POINT, project
+from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, PRINCIPAL_POINT, project
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.mount import Movement, components, drift_period
 
@@ -52,6 +52,19 @@ def adjusted(seed: int, epochs: int, tremble: Tremble, **settings):
     grid, truth = simulate(np.random.default_rng(seed), field, epochs, tremble)
     r = scene.adjusted_series(field, grid, exterior="auto", **settings)
     return r, truth
+
+
+@pytest.mark.parametrize("tremble", [TREMBLES, SWAYS])
+def test_poses_of_a_held_camera_are_as_good_as_stated(tremble):
+    """Regression: sds of the angles were 4 to 40 times too large, as movements counted as noise."""
+    field, ratios = scene.corner_field(per_side=4), []
+    for seed in range(10):
+        grid, truth = simulate(np.random.default_rng([47, seed]), field, 80, tremble, warm_px=0.0)
+        r = scene.adjusted_series(field, grid, exterior="mount", free=())
+        error = (r.values - truth)[:, EOP]
+        within = np.sqrt(np.diagonal(r.covariance, axis1=1, axis2=2)[:, EOP])
+        ratios.append((error - error.mean(axis=0)) / within)
+    assert 0.85 < rms(np.concatenate(ratios).ravel()) < 1.2
 
 
 def test_auto_reports_its_choice_with_a_reason():

@@ -39,7 +39,7 @@ from thermocald.photogrammetry.series.long_series import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_gaps, drift_period, image_px
 from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS, slow_course
+from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS
 
 if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import CalibratedEpoch
@@ -140,8 +140,7 @@ class _Together:
         if self.moved:
             grid = taken_off(grid, self.moved, slice(-1, None))
         seen = grid.targets(self.seen)
-        last = slow_course(len(self.sample.status), self.sample.step)[-1:]
-        _, block = self.known.adjusted(seen, epochs, last)
+        _, block = self.known.adjusted(seen, epochs, np.array([0.5]))
         return self.epoch(0, block.spread(self.seen, grid.points.shape[1]))
 
 

@@ -19,7 +19,7 @@ from thermocald.analysis.series.course import LEVEL, Course
 from thermocald.analysis.statistics.dependence import dependence, holm, slope_noise
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
-from thermocald.photogrammetry.series.target_noise import slow_course, slow_errors
+from thermocald.photogrammetry.series.target_noise import slow_errors
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
@@ -51,13 +51,6 @@ def _p_value(change: float, sd: float) -> float:
     return float(2 * ndtr(-abs(change) / sd)) if sd > 0 else 0.0
 
 
-def _course_of_targets(table: Epochs) -> tuple[Array, Array]:
-    """Return the course (E,) of the targets' slow errors, and their variances (16,)."""
-    if table.adjustment is None:
-        return slow_course(len(table), 0), np.zeros(16)
-    return slow_course(len(table), table.adjustment.step), np.diag(table.adjustment.slow)
-
-
 def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """Fit straight lines to the estimated parameters; p is corrected for their number (Holm).
 
@@ -67,9 +60,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """
     found, ok = [], table.ok
     time = table.frame_time[ok]
-    course, slow = _course_of_targets(table)
-    # targets' slow errors have opposite signs in the first and the last epoch
-    of_targets = -2.0 * course[0] * course[-1] * slow
+    slow = table.slow_between_ends
     for name in names:
         column = IOP_NAMES.index(name)
         values, sds = table.values[ok, column], table.sd[ok, column]
@@ -90,7 +81,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
             float(np.sqrt(np.mean(sds**2))), slope * span,
             float(np.hypot(noise.sd * span, tilt_sd)), min(1.0, p), drifts=False,
             last_minus_first=float(values[-1] - values[0]),
-            sd_last_minus_first=float(np.sqrt(sds[-1] ** 2 + sds[0] ** 2 + of_targets[column])),
+            sd_last_minus_first=float(np.sqrt(sds[-1] ** 2 + sds[0] ** 2 + slow[column])),
             sd_by_perspective=float(np.sqrt(2.0) * table.perspective_sd[column]),
         )  # fmt: skip
         found.append(line)
@@ -106,16 +97,16 @@ def courses(table: Epochs) -> list[Course]:
     temperature, time = table.temperature[have], table.frame_time[have]
     if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
         warming = temperature - temperature.mean()
-        course, slow = _course_of_targets(table)
-        per_kelvin = float(warming @ course[have] / (warming @ warming))
+        course, variances = table.slow_errors
+        per_kelvin = course[:, have] @ warming / (warming @ warming)
+        slow = np.sqrt(per_kelvin**2 @ variances)
         for name, line in lines.items():
             column = IOP_NAMES.index(name)
             values, sds = table.values[have, column], table.sd[have, column]
-            of_targets = abs(per_kelvin) * float(np.sqrt(slow[column]))
             t, y, sd, times = _thin(temperature, values, sds, time)
             on = dependence(y, sd, t, estimate_reading_noise(times, t, None), times)
-            p = max(on.p_value, _p_value(on.slope, of_targets))
-            sd_slope = float(np.hypot(on.sd_slope, of_targets))
+            p = max(on.p_value, _p_value(on.slope, slow[column]))
+            sd_slope = float(np.hypot(on.sd_slope, slow[column]))
             lines[name] = replace(
                 line, per_kelvin=on.slope, sd_per_kelvin=sd_slope, p_temperature=p
             )

@@ -158,6 +158,29 @@ class Epochs(Result):
         return np.fromiter((word == "ok" for word in self.status), bool, len(self.status))
 
     @property
+    def slow_errors(self) -> tuple[Array, Array]:
+        """The courses (n, E) of errors that all epochs share but for a factor, and their variances
+        (n, 16).
+        """
+        slow = () if self.adjustment is None else self.adjustment.slow
+        at = np.linspace(0.0, 1.0, len(self))  # a long series has the course of its sample
+        courses = [np.interp(at, np.linspace(0.0, 1.0, len(c)), c) for c, _ in slow]
+        variances = [np.diag(changes) for _, changes in slow]
+        return np.reshape(courses, (-1, len(self))), np.reshape(variances, (-1, 16))
+
+    @property
+    def slow_between_ends(self) -> Array:
+        """The variances (16,) of last minus first by which slow errors exceed independent ones.
+
+        They have opposite signs in the first and the last epoch.
+        """
+        course, variances = self.slow_errors
+        ends = np.flatnonzero(self.ok)[[0, -1]] if self.ok.any() else [0, 0]
+        first, last = course[:, ends].T
+        out: Array = -2.0 * (first * last) @ variances
+        return out
+
+    @property
     def time(self) -> NDArray[np.datetime64]:
         """The frames' times (E,), UTC, to the microsecond."""
         return np.round(self.frame_time * 1e6).astype(np.int64).astype("datetime64[us]")

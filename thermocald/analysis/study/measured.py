@@ -74,7 +74,8 @@ class MeasuredSeries:
     orientation was estimated; choice: why; without_result: {reason: epochs}; start_utc: s UTC of
     the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
     image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that
-    moved, for which the observations are corrected; doubts: implausible recorded data.
+    moved, for which the observations are corrected; doubts: implausible recorded data; slow (10,):
+    variances of last minus first by which slow errors exceed independent ones.
     """
 
     label: str
@@ -98,6 +99,7 @@ class MeasuredSeries:
     image_noise_ratio: float = float("nan")
     field_movements: tuple[FieldMovement, ...] = ()
     doubts: tuple[str, ...] = ()
+    slow: Array = field(default_factory=lambda: np.zeros(10))
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -179,6 +181,7 @@ def measured_series(
         _clip(source, ok, observations), float(time_s[0]),
         "" if adjustment is None else adjustment.choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
+        slow=table.slow_between_ends[:10],
     )  # fmt: skip
 
 

@@ -63,11 +63,11 @@ class Deviation:
         return abs(self.largest) > max(1.5 * abs(self.change), 6 * self.sd_change)
 
 
-def deviation(values: Array, sds: Array) -> Deviation | None:
+def deviation(values: Array, sds: Array, slow: float = 0.0) -> Deviation | None:
     """Return the deviation of a column (n,) with standard deviations (n,); NaN epochs are left out.
 
-    The first and the last epoch count as independent, as they are if the standard deviations
-    contain only the noise of an epoch within its series. Returns None for fewer than two values.
+    slow: variance of last minus first beyond that of independent epochs, by errors that change
+    slowly within the series. Returns None for fewer than two values.
     """
     have = np.flatnonzero(np.isfinite(values))
     if len(have) < 2:
@@ -78,7 +78,7 @@ def deviation(values: Array, sds: Array) -> Deviation | None:
         float(values[first]),
         float(values[last]),
         float(difference[-1]),
-        float(np.hypot(sds[first], sds[last])),
+        float(np.sqrt(sds[first] ** 2 + sds[last] ** 2 + slow)),
         float(difference[np.argmax(np.abs(difference))]),
         float(np.ptp(difference)),
         float(np.std(values[have], ddof=1)),
@@ -245,7 +245,10 @@ class SeriesStudy:
 def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
     """Study one series. Never raises because of data; `notes` states what they do not allow."""
     notes = _circumstances(series)
-    every = {name: deviation(*series.column(name)) for name in series.free}
+    every = {
+        name: deviation(*series.column(name), float(series.slow[IOP_NAMES.index(name)]))
+        for name in series.free
+    }
     every["sigma0"] = deviation(series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy))
     for t in series.thermometers:
         every[t.name] = deviation(t.values, np.full(len(series), t.sd))

@@ -22,6 +22,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
+    EOP_COLUMNS,
     IOP,
     PRINCIPAL_POINT,
     ExteriorOrientation,
@@ -37,12 +38,10 @@ from thermocald.photogrammetry.epoch.snooping import (
 )
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
-    common_error_covariance,
     correlated_error_cofactors,
     estimate_held_affinity,
     line_weights,
     perspective_cofactor_roots,
-    prior_cofactors,
     slow_target_covariance,
     stillness,
     typical_sensitivity,
@@ -55,11 +54,9 @@ from thermocald.photogrammetry.series.estimator import (
 )
 from thermocald.photogrammetry.series.mount import (
     FEWEST_EPOCHS,
-    STILL,
     Movement,
     estimate_movement,
     image_px,
-    mean_movement,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 from thermocald.photogrammetry.series.result import (
@@ -99,9 +96,14 @@ def choose_exterior(
         return replace(series, s=s, bound=None, choice=why)
     movement, A = estimate_mount_movement(series, estimate), estimate.system.design.at.A
     px = image_px(movement.covariance, A)
+    doubt = ""
+    if movement.hidden.any():
+        hidden = 2.0 * image_px(movement.hidden, A)
+        where = "between the sampled epochs" if series.windows else "in a gap"
+        doubt = f"; {where} it may have moved by up to {hidden:.1g} px unnoticed"
     if movement.still and asked == "auto":
         noise = image_px(movement.noise, A)
-        why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
+        why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px){doubt}"
         return replace(series, s=replace(series.s, exterior="series"), bound=None, choice=why)
     how = ""
     if movement.memory:
@@ -109,8 +111,9 @@ def choose_exterior(
         slowly = f"over about {movement.memory:.0f} epochs"
         how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
-        how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
-    why = f"the mount moves by {px:.3f} px about its mean pose{how}"
+        at = f"at row {', '.join(map(str, movement.jumps))}"
+        how += f", with jumps {'in a sample of the epochs' if series.windows else at}"
+    why = f"the mount moves by {px:.3f} px about its mean pose{how}{doubt}"
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
 
@@ -128,18 +131,15 @@ def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Move
         correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
     good = system.good & np.isfinite(b).all(axis=1)  # epochs that diverged are left out
-    found, starts = [], []
-    for part in series.windows or (slice(0, len(N)),):
-        if good[part].sum() < FEWEST_EPOCHS and series.windows:
-            continue
-        starts.append(part.start)
-        found.append(
-            estimate_movement(
-                N[part] / variance, b[part] / variance, free, good[part],
-                series.s.drift_period, correlated, [k - part.start for k in series.s.gaps],
-            )
-        )  # fmt: skip
-    return mean_movement(found, starts) if found else STILL
+    gaps = [*series.s.gaps, *(part.start for part in series.windows[1:])]
+    found = estimate_movement(
+        N / variance, b / variance, free, good, series.s.drift_period, correlated, gaps
+    )
+    if not series.windows or not found.jumps:
+        return found
+    # where between the parts of a long series the mount moved is not known
+    memory = max(found.memory, len(N) / 2.0)
+    return replace(found, slow=found.slow + found.of_jumps, memory=memory, steps=())
 
 
 def adjust_series(
@@ -222,7 +222,7 @@ def result(
     # in few epochs the offsets absorb the common part of the image points' errors
     least = np.maximum(unit, 1.0) if few else unit
     # The priors' part is scaled by the series' variance, not by the epoch's.
-    bound = prior_cofactors(system)
+    bound = system.prior_cofactors
     relative[block] -= bound
     many = s.target_noise and len(use) >= FEW_EPOCHS
     pairs = series.pairs(estimate) if many else None
@@ -235,13 +235,21 @@ def result(
     movement = series.movement
     if s.exterior == "series" and len(use) >= FEWEST_EPOCHS:
         movement = estimate_mount_movement(series, estimate)
-    mount_trend = np.zeros((16, 16))
+    slow: list[tuple[Array, Array]] = []
+    line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
         if s.exterior == "series":
-            relative[block] += common_error_covariance(system, movement.covariance)
+            each = system.Q @ system.N[:, own[:, None], EOP_COLUMNS]
+            relative[block] += each @ movement.swaying @ np.swapaxes(each, 1, 2)
         G = typical_sensitivity(system)
-        mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
-    slow, step = np.zeros((16, 16)), 0
+        trend[own[:, None], own] += G @ movement.tilt(line) @ G.T
+        held = s.exterior == "series"
+        follows = G if held else np.eye(len(own))[:, -6:] - G
+        for course, jump, V in movement.steps:
+            changes = np.zeros((16, 16))
+            of_step = V + np.outer(jump, jump) if held else V
+            changes[own[:, None], own] = follows @ of_step @ follows.T
+            slow.append((course, changes))
     if many and estimate.solved.any():
         # only of few targets is it unknown which have moved
         targets = np.median(use[estimate.solved].sum(axis=1))
@@ -249,16 +257,20 @@ def result(
         changes, step = slow_errors(
             estimate.residuals, use & estimate.solved[:, None], few and not series.windows
         )
-        slow = slow_target_covariance(system, changes, series.testfield.groups, few)
-        trend += slow
+        of_targets = slow_target_covariance(system, changes, series.testfield.groups, few)
+        slow.append((slow_course(len(use), step), of_targets))
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
-        excess[own] = _excess(series, estimate.values[:, own], variances, sound)
+        inner = len(free_columns(s.free))
+        found = _excess(series, estimate.values[:, own[:inner]], variances[:, :inner], sound)
+        # the pose moves itself; its scatter beyond the noise is as large as the interior's
+        usual = variances[sound].mean(axis=0) if sound.any() else np.ones(len(own))
+        ratio = np.median(found / usual[:inner]) if inner else 0.0
+        excess[own] = np.append(found, ratio * usual[inner:])
         relative[block] = with_excess(relative[block], excess[own])
-    # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends,
-    # or a step
-    if slow.any():
-        relative += slow_course(len(use), step)[:, None, None] ** 2 * slow
+    for course, changes in slow:
+        relative += course[:, None, None] ** 2 * changes
+        trend += (line @ course) ** 2 * changes
     relative[~sound] = 0.0
     still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
@@ -274,7 +286,7 @@ def result(
         judge_epochs(series, estimate, relative, unit / pooled, sigma0, redundancy, still),
         level_covariance=level,
         excess_sd=np.sqrt(excess),
-        trend_sd=np.sqrt(np.diag(trend + mount_trend)),
+        trend_sd=np.sqrt(np.diag(trend)),
         perspective_sd=np.sqrt(pooled) * perspective_cofactor_roots(system),
         field_ratio=float(np.sqrt(series.field_variance)),
         outer_noise=_outer_noise(series, estimate),
@@ -282,7 +294,7 @@ def result(
         affinity=held_affinity,
         movement=movement,
         choice=series.choice,
-        slow=slow,
+        slow=tuple(slow),
         step=step,
         pairs=pairs or None,
     )

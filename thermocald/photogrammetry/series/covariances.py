@@ -146,14 +146,6 @@ def correlated_error_cofactors(
     return among_all(own, design.own)
 
 
-def prior_cofactors(system: SeriesSystem) -> Array:
-    """Return the part (E, p, p) of the cofactors that the priors contribute, Q P Q."""
-    design = system.design
-    part: Array = system.Q @ design.own_prior @ system.Q
-    part[~system.good] = 0.0
-    return part
-
-
 def typical_sensitivity(system: SeriesSystem) -> Array:
     """Return the derivatives (p, 6) of a typical epoch's own parameters by an error of the pose."""
     design = system.design
@@ -246,15 +238,6 @@ def _normals(A: Array, W: Array) -> Array:
 def _full(weights: Array) -> Array:
     """Return weights (T, 3) xx, yy, xy as matrices (T, 2, 2)."""
     return np.stack([weights[:, [0, 2]], weights[:, [2, 1]]], axis=1)
-
-
-def common_error_covariance(system: SeriesSystem, covariance: Array) -> Array:
-    """Propagate a covariance (q, q) of an epoch's common parameters to its own ones (E, p, p)."""
-    design = system.design
-    G = system.Q @ system.N[:, design.own[:, None], design.common]
-    part: Array = G @ covariance @ np.swapaxes(G, 1, 2)
-    part[~system.good] = 0.0
-    return part
 
 
 def pose_equations(N: Array, b: Array, own: Index, Q: Array) -> tuple[Array, Array]:

@@ -100,8 +100,9 @@ class SeriesEstimator:
     unknowns, None if they are estimated; unit: initial variance of unit weight for the priors;
     windows: runs of consecutive epochs, if the series is a sample of a longer one; typical:
     variance of unit weight for epochs too poor to estimate theirs, None for that of these epochs;
-    field_variance: factor of the field's stated covariance; freedom (T,): degrees of freedom of
-    each target's estimated noise, None if the noise is as stated.
+    field_variance: factor of the field's stated covariance; freedom (T,), ratios (T, 3): degrees of
+    freedom of each target's estimated noise and its variances over the stated ones, None and 1 if
+    the noise is as stated.
     """
 
     sensor: Sensor
@@ -118,6 +119,7 @@ class SeriesEstimator:
     typical: float | None = None
     field_variance: float = 1.0
     freedom: Array | None = None
+    ratios: Array | float = 1.0
 
     def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate]:
         """Estimate the series, its gross errors and the targets' noise.
@@ -285,10 +287,9 @@ class SeriesEstimator:
         ratios, freedom = noise_ratios(
             estimate.residuals, self.grid.weights, use, self.redundancy_share(use), lost
         )
-        weights = self.grid.weights.copy(order="K")
-        weights[..., :2] /= ratios
-        weights[..., 2] /= np.sqrt(ratios.prod(axis=1))
-        return replace(self, grid=ObservationGrid(self.grid.points, weights), freedom=freedom)
+        ratios = np.column_stack([ratios, np.sqrt(ratios.prod(axis=1))])
+        grid = ObservationGrid(self.grid.points, self.grid.weights / ratios)
+        return replace(self, grid=grid, ratios=ratios, freedom=freedom)
 
     def pairs(self, estimate: Estimate) -> CorrelatedPairs:
         """Find the pairs of image coordinates with correlated errors."""
@@ -414,12 +415,15 @@ class SeriesEstimator:
         for name, (value, sd) in s.priors.items():
             k = PARAMETER_NAMES.index(name)
             known[k], weight[k] = value, variance / sd**2
-        own_prior = np.diag(weight[own])
+        own_prior, shifts = np.diag(weight[own]), None
         if self.bound is not None:
             own_prior[-6:, -6:] = self.bound * variance
+            shifts = self.movement.shifts
+            if self.held is not None:  # epochs after those that showed the mount
+                shifts = shifts[-1:]
         offsets = self.has_offsets and with_common
         return Design(
-            at, own, common, known, own_prior, weight[common], self.bound is not None,
+            at, own, common, known, own_prior, weight[common], shifts,
             offset_weights(self.testfield, at) * (variance / self.field_variance)
             if offsets else np.empty((0, 3)),
         )  # fmt: skip

@@ -37,7 +37,6 @@ from thermocald.photogrammetry.series.adjustment import (
 from thermocald.photogrammetry.series.covariances import (
     correlated_error_cofactors,
     line_weights,
-    prior_cofactors,
     stillness,
     with_excess,
 )
@@ -217,9 +216,9 @@ class KnownSeries:
     series; offsets (T, 2) px, pose (6,): the common ones; cofactors (q + 2T, q + 2T): theirs; mean
     (p, q + 2T): mean G by which own parameters depend on the common ones; used: number of
     observations that these use up; excess (16,): variance of the epochs' excess scatter; ratios
-    (T, 3): factors of the weights; middle (16,): start values of epochs; pairs: correlated errors
-    of targets; movement: of the mount; slow (16, 16): covariance of a straight line over the series
-    from slow errors of targets.
+    (T, 3): of estimated to stated variances; middle (16,): start values of epochs; pairs:
+    correlated errors of targets; movement: of the mount; slow (16, 16): covariance of a straight
+    line over the series from slow errors.
     """
 
     estimator: SeriesEstimator
@@ -230,7 +229,7 @@ class KnownSeries:
     mean: Array
     used: float
     excess: Array
-    ratios: Array
+    ratios: Array | float
     middle: Array
     pairs: CorrelatedPairs | None
     movement: Movement
@@ -244,6 +243,10 @@ class KnownSeries:
         system, unit = estimate.system, series.variance(estimate)
         at = system.design.at
         design = series.design(at, unit)
+        slow = sum(
+            ((2.0 * course[-1]) ** 2 * changes for course, changes in sample.slow),
+            np.zeros((16, 16)),
+        )
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
         T = series.grid.points.shape[1]
@@ -253,8 +256,8 @@ class KnownSeries:
         )
         known = cls(
             held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
-            system.common_share, sample.excess_sd**2, _ratios(series), middle,
-            sample.pairs, sample.movement, sample.slow,
+            system.common_share, sample.excess_sd**2, series.ratios, middle,
+            sample.pairs, sample.movement, slow,
         )  # fmt: skip
         sums = CommonSums(design)
         right = np.zeros((len(sample.values), len(design.own)))
@@ -271,7 +274,7 @@ class KnownSeries:
         level and the series' own figures.
         """
         s, pooled = self.estimator.s, self.estimator.unit
-        weighted = ObservationGrid(grid.points, grid.weights * self.ratios)
+        weighted = ObservationGrid(grid.points, grid.weights / self.ratios)
         values = np.tile(self.middle, (len(grid), 1))
         if len(self.design.common):
             values[:, EOP] = self.pose
@@ -313,7 +316,7 @@ class KnownSeries:
             if swayed.any():
                 added[rows] = G[:, :6] @ swayed @ G[:, :6].T
         # The priors' part is scaled by the series' variance, not by the epoch's.
-        bound = prior_cofactors(system) if system.design.own_prior.any() else 0.0
+        bound = system.prior_cofactors if system.design.own_prior.any() else 0.0
         mine -= bound
         mine *= unit[:, None, None]
         mine += pooled * bound
@@ -321,18 +324,6 @@ class KnownSeries:
         mine = with_excess(mine, self.excess[own])
         mine[~system.good] = 0.0
         return among_all(mine, own)
-
-
-def _ratios(series: SeriesEstimator) -> Array:
-    """Return the factors (T, 3) of each target's weights that its own noise gave."""
-    seen = series.stated[..., 0] > 0
-    ratios = np.ones((seen.shape[1], 3))
-    for k in (0, 1):
-        ratio = series.grid.weights[..., k] / np.where(seen, series.stated[..., k], 1.0)
-        ratio = np.where(seen, ratio, 0.0).max(axis=0, initial=0.0)
-        ratios[:, k] = np.where(ratio > 0, ratio, 1.0)
-    ratios[:, 2] = np.sqrt(ratios[:, 0] * ratios[:, 1])
-    return ratios
 
 
 @dataclass(frozen=True, eq=False)

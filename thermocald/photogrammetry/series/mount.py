@@ -13,8 +13,9 @@ Limit: a change of the interior orientation as abrupt as a tremble is attributed
 makes the standard deviations too large, not too small.
 
 The trajectory may have jumps, if the mount was knocked or a lens slipped. A jump that the
-perspective attributes to the interior orientation is the camera's; every other one is a movement of
-the mount.
+perspective attributes to the interior orientation is the camera's; every other one is a step of the
+mount's mean pose, estimated from the jump itself. In a gap the camera may drift: only the
+perspective shows whether the mount moved, and by how much.
 
 The result is averaged over the lengths of the memory, and over models with and without each
 component, weighted by their plausibility.
@@ -26,24 +27,29 @@ updates as Févotte and Idier (2011), Neural Computation 23, 2421-2456.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PRINCIPAL
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import (
+    inverse_of_determined,
     mad_sd,
     stacked_inverses,
     symmetric_power,
     unit_diagonal,
 )
 from thermocald.photogrammetry.series.covariances import pose_equations
+from thermocald.photogrammetry.series.target_noise import slow_course
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from thermocald.arrays import Array, Index, Mask
+
+    Step = tuple[Array, Array]
+    """A step (k,) of the pose and the weights (k,) of what is known of it."""
 
 
 _PHI = np.array([0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98])
@@ -62,7 +68,7 @@ def components(trajectory: Array, period: float, held: bool = False) -> tuple[Ar
     """Estimate the variance components of every column of a trajectory.
 
     trajectory (E, k): in units of its noise; period: shortest period of the drift in epochs, 0 for
-    none; held: there is none as c, x0 and y0 are held, in a series of any length.
+    none; held: no free parameter follows it, in a series of any length.
 
     Returns the variances (k,) of the white part and of the part with memory, about its mean, and
     the memory in epochs, 0 without one. A component without support by the likelihood is 0.
@@ -225,7 +231,9 @@ class Movement:
     white, slow (6, 6): covariances of the exterior orientation, rad and mm, for movements without
     and with memory; memory: epochs after which the slow movement has lost 63 % of its correlation;
     noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
-    first epoch after each jump.
+    first epoch after each jump of the mean pose; steps: the jumps, each with the course (E,) of a
+    unit step about its mean, the step (6,) and its covariance (6, 6); hidden (6, 6): covariance of
+    a step in a gap that shows none.
     """
 
     white: Array
@@ -233,18 +241,38 @@ class Movement:
     memory: float
     noise: Array
     jumps: tuple[int, ...] = ()
+    steps: tuple[tuple[Array, Array, Array], ...] = ()
+    hidden: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def shifts(self) -> Array:
+        """Shifts (E, 6) of the mean pose by the jumps, (1, 6) without any."""
+        each = (np.outer(course, step) for course, step, _ in self.steps)
+        return sum(each, np.zeros((1, 6)))
+
+    @property
+    def of_jumps(self) -> Array:
+        """Covariance (6, 6) of an epoch's pose about the mean by the jumps."""
+        shifts = self.shifts
+        of_shifts: Array = shifts.T @ shifts / len(shifts)
+        return sum((np.mean(course**2) * V for course, _, V in self.steps), of_shifts)
+
+    @property
+    def swaying(self) -> Array:
+        """Covariance (6, 6) of an epoch's movement about the shifted mean pose."""
+        return self.white + self.slow
 
     @property
     def covariance(self) -> Array:
-        """Covariance (6, 6) of an epoch's movement."""
-        return self.white + self.slow
+        """Covariance (6, 6) of an epoch's movement about the mean pose, with the jumps."""
+        return self.swaying + self.of_jumps
 
     @property
     def still(self) -> bool:
         """Whether the movement is hidden by the noise of one epoch in every direction."""
         whiten = self._whitening()
-        inside = np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T)
-        return bool(inside[-1] < _HIDDEN)
+        inside = np.linalg.eigvalsh(whiten @ self.swaying @ whiten.T)
+        return not self.jumps and bool(inside[-1] < _HIDDEN)
 
     def _whitening(self) -> Array:
         """Return T (6, 6) with T · noise · Tᵀ = 1."""
@@ -253,9 +281,12 @@ class Movement:
         return whitening
 
     def precision(self) -> Array:
-        """Return the inverse covariance (6, 6), with an sd of at least 1e-3 of the noise's."""
+        """Return the inverse covariance (6, 6) of the movements about the shifted mean pose.
+
+        Their sd is at least 1e-3 of the noise's.
+        """
         T = self._whitening()
-        inside = T @ self.covariance @ T.T
+        inside = T @ self.swaying @ T.T
         return T.T @ symmetric_power(inside, -1.0, _FLAT) @ T
 
     def tilt(self, weights: Array) -> Array:
@@ -277,20 +308,6 @@ STILL = Movement(np.zeros((6, 6)), np.zeros((6, 6)), 0.0, np.eye(6))
 """A mount that does not move."""
 
 
-def mean_movement(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
-    """Return the mean of the movements of parts of a series, with the longest memory.
-
-    starts: first epoch of each part, from which the jumps' epochs in the series follow.
-    """
-    return Movement(
-        np.mean([m.white for m in movements], axis=0),
-        np.mean([m.slow for m in movements], axis=0),
-        max(m.memory for m in movements),
-        np.mean([m.noise for m in movements], axis=0),
-        tuple(start + row for m, start in zip(movements, starts, strict=True) for row in m.jumps),
-    )
-
-
 def image_px(covariance: Array, A: Array) -> float:
     """Return the effect of a movement's covariance (6, 6) on the image, px, by partials (T, 2, 16).
 
@@ -304,25 +321,37 @@ _LARGE = 8.0  # robust standard deviations of the change between neighbours
 _LASTING = 0.5  # share of the change that must remain
 _SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
-_SURE = 4.0  # standard deviations by which the perspective must exclude a movement
-_UNSEEN = 3.0  # standard deviations below which the perspective shows no movement
+_LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
+_EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
+_SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
+_MEDIAN_CHI2_6 = 5.348
 
 
-def find_jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Array]:
+def find_jumps(
+    trajectory: Array, M: Array, g: Array, gaps: Sequence[int]
+) -> tuple[Array, dict[int, Step], Array]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
-    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free. Returns
-    the first epoch after each jump, the sum of the steps (E, k), and the covariance (k, k) of the
-    pose about its mean that the steps cause.
+    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; gaps:
+    the first epoch after each gap. Returns the trajectory without any jumps, what is known of the
+    mount's by their first epoch, and the covariance (k, k) of a step in a gap that shows none.
     """
-    E = len(trajectory)
-    rows: list[int] = []
-    stairs, uncertain = np.zeros_like(trajectory), np.zeros(trajectory.shape[1])
-    left = trajectory.copy()
-    examined: set[int] = set()
-    while len(examined) < _MOST and E >= 4 * _SIDE:
-        change = np.diff(left, axis=0)
-        size = np.abs(change) / np.maximum(mad_sd(change, axis=0), 1e-12)
+    jumps: dict[int, Step]
+    left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
+    # in a gap the camera drifts, too: only the perspective shows how far the mount moved
+    for row in gaps:
+        step, _ = _step(left, row)
+        left[row:] -= step
+        jumps[row] = np.zeros_like(step), _loose(step)
+    for row, (moved, V) in zip(gaps, _estimate_steps(M, g, jumps), strict=True):
+        if _chi2(moved, V) < _SHOWN:
+            del jumps[row]
+            hidden = max(hidden, V, key=np.trace)
+    noise = np.maximum(mad_sd(_without_drift(np.diff(left, axis=0)), axis=0), np.sqrt(2.0))
+    examined = {*gaps}
+    while len(examined) < _MOST + len(gaps) and len(left) >= 4 * _SIDE:
+        change = _without_drift(np.diff(left, axis=0))
+        size = np.abs(change) / noise
         for row in examined:
             size[row - 1] = 0.0
         worst = int(size.max(axis=1).argmax())
@@ -331,40 +360,76 @@ def find_jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array,
             break
         examined.add(row)
         step, factor = _step(left, row)
-        if abs(step[column]) < _LASTING * abs(change[worst, column]):
+        lasting = _step(left, row, 1)[0][column]  # a spike is no jump
+        if abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
-        if not _is_of_camera(row, step, M, g):
-            rows.append(row)
-            stairs[row:] += step
-            variance = factor * mad_sd(change, axis=0) ** 2 / 2
-            uncertain += variance * (row / E) * (1 - row / E)
-    about = stairs - stairs.mean(axis=0)
-    return rows, stairs, about.T @ about / max(E, 1) + np.diag(uncertain)
+        if jump := _find_mover(row, step, factor * noise**2 / 2, M, g):
+            jumps[row] = jump
+    return left, dict(sorted(jumps.items())), hidden
 
 
-def _step(trajectory: Array, row: int) -> tuple[Array, float]:
-    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's."""
-    first = max(row - _SIDE, 0)
-    part = trajectory[first : row + _SIDE]
-    t = np.arange(first, first + len(part)) - row
+def _estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[Array, Array]]:
+    """Estimate the steps (k,) of the pose at some epochs, and their covariances (k, k).
+
+    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps, in order of time.
+    """
+    k = g.shape[1]
+    starts = [0, *jumps]
+    sums = [M[row:].sum(axis=0) for row in starts]
+    each = range(len(starts))
+    N = np.block([[sums[max(i, j)] for i in each] for j in each])
+    right = np.concatenate([g[row:].sum(axis=0) for row in starts])
+    for j, (step, weights) in enumerate(jumps.values(), start=1):
+        own = np.arange(j * k, (j + 1) * k)
+        N[own, own] += weights
+        right[own] += weights * step
+    Q = inverse_of_determined(N)
+    found = (Q @ right).reshape(-1, k)
+    Q = Q.reshape(len(starts), k, len(starts), k)
+    return [(found[j], Q[j, :, j]) for j in each[1:]]
+
+
+def _without_drift(change: Array) -> Array:
+    """Return changes (E - 1, k) between neighbours less the median of those around."""
+    padded = np.pad(change, ((_SIDE, _SIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE + 1, axis=0)
+    out: Array = change - np.median(windows, axis=-1)
+    return out
+
+
+def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
+    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's.
+
+    apart: number of epochs on both sides that do not count.
+    """
+    t = np.arange(max(row - _SIDE, 0), min(row + _SIDE, len(trajectory))) - row
+    t = t[(t < -apart) | (t >= apart)]
     estimator = np.linalg.pinv(np.column_stack([np.ones(len(t)), t, t >= 0]))[2]
-    return estimator @ part, float(estimator @ estimator)
+    return estimator @ trajectory[row + t], float(estimator @ estimator)
 
 
-def _is_of_camera(row: int, step: Array, M: Array, g: Array) -> bool:
-    """Return whether the perspective excludes a step of the pose."""
+def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:
+    """Return what is known of a jump of the pose; None if the camera jumped.
 
-    def estimate(part: slice) -> tuple[float, float]:
-        information = float(np.einsum("i,eij,j->", step, M[part], step))
-        return float((g[part] @ step).sum()) / max(information, 1e-300), information
+    step, variance (k,): of the trajectory. If the perspective excludes neither that the mount
+    jumped nor that the camera did, it alone shows how far.
+    """
+    ((moved, V),) = _estimate_steps(M, g, {row: (step, np.zeros_like(step))})
+    if _chi2(moved, V) > _EXCLUDED:
+        return step, 1.0 / variance
+    if _chi2(step - moved, V + np.diag(variance)) > _EXCLUDED:
+        return None
+    return np.zeros_like(step), _loose(step)
 
-    (before, weight_before), (after, weight_after) = map(estimate, (slice(row), slice(row, None)))
-    if min(weight_before, weight_after) <= 0:
-        return False
-    sd = float(np.sqrt(1.0 / weight_before + 1.0 / weight_after))
-    moved = after - before
-    return abs(1.0 - moved) > _SURE * sd and abs(moved) < _UNSEEN * sd
+
+def _loose(step: Array) -> Array:
+    """Return the weights (k,) of a step that is hardly larger than this change of the image."""
+    return np.full_like(step, 1.0 / max(_LOOSE * float(step @ step), 1e-12))
+
+
+def _chi2(difference: Array, covariance: Array) -> float:
+    return float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
 
 
 FEWEST_EPOCHS = 20
@@ -379,6 +444,7 @@ _SPIKE = 6.0  # robust standard deviations beyond which a deviation is a passer-
 _WEAK = 3.0  # times the usual variance of the pose, beyond which an epoch is interpolated
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
+_FOLLOWED = 1e-9  # share of a movement that the free parameters follow, beyond rounding
 _PERIODS = 2.5  # periods that a series must have to show a drift
 
 
@@ -418,8 +484,7 @@ def estimate_movement(
     N (E, 16, 16), b (E, 16): of every epoch at one linearisation, in units of the noise; own (p,):
     the free interior parameters; good (E,): epochs to use; period: from `drift_period`; correlated
     (6, 6): part of the pose's normal matrix from correlated errors, ΣAᵀPCPA; gaps: from
-    `drift_gaps`. Across a gap in which the perspective shows that the camera drifted, nothing is
-    known of the mount.
+    `drift_gaps`. In a gap the mount has moved if the perspective shows it.
     """
     rows = np.flatnonzero(good)
     if len(rows) < FEWEST_EPOCHS:
@@ -438,41 +503,65 @@ def estimate_movement(
     # the pose by the perspective alone, the interior orientation eliminated
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
     M, g = back.T @ M @ back, g @ back
-    jumped, stairs, of_jumps = find_jumps(trajectory, M, g)
-    trajectory = trajectory - stairs
-    # what c, x0 and y0 do not follow, as they are held, is the mount's, however slow
-    held = not (own < PRINCIPAL.stop).any()
-    period = 0.0 if held else min(period, len(trajectory) / _PERIODS)
-    cuts: list[int] = []
-    if period:
-        missing = np.flatnonzero(np.diff(rows) > 0.5 * period) + 1
-        for row in sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()}):
-            long = min(row - max(cuts, default=0), len(rows) - row) >= FEWEST_EPOCHS
-            if long and _is_of_camera(row, _step(trajectory, row)[0], M, g):
-                cuts.append(row)
-        parts = np.split(trajectory, cuts)
-        smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
-    else:
-        trajectory = trajectory - trajectory.mean(axis=0)
-        smooth = np.zeros_like(trajectory)
-    rough = trajectory - smooth
-    limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
-    rough = np.clip(rough, -limit, limit)
-    directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
-    parts = np.split((smooth + rough) @ directions, cuts)
-    found = [components(p, min(period, len(p) / _PERIODS), held) for p in parts]
-    size = [len(p) for p in parts]
-    white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
-    memory = max(f[2] for f in found)
-    axes = back @ directions
-    if jumped:
-        memory = max(memory, len(trajectory) / 2.0)
+    unit = _unit_variance(M, g)
+    M, g = M / unit, g / unit
+    alike, axes = np.linalg.eigh(whiten @ _hidden(N, own, root) @ whiten)
+    drifting = alike > _FOLLOWED
+    period = min(period, len(trajectory) / _PERIODS) if drifting.any() else 0.0
+    missing = np.flatnonzero(np.diff(rows) > (0.5 * period or np.inf)) + 1
+    pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
+    pauses = _apart(pauses, len(rows), _SIDE)
+    cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
+    trajectory, jumps, hidden = find_jumps(trajectory, M, g, pauses)
+    steps = _estimate_steps(M, g, jumps)
+    # what the free parameters do not follow is the mount's, however slow
+    found = [
+        _separate(trajectory, axes[:, part], alike[part], *how)
+        for part, how in (
+            (~drifting, ([], 0.0, True)),
+            (drifting, (cuts if period else [], period, False)),
+        )
+        if part.any()
+    ]
+    directions, white, slow = (np.concatenate([f[k] for f in found], axis=-1) for k in range(3))
+    steady = np.count_nonzero(~drifting)
+    if 0 < steady < 6:  # a mount that drifts where this shows does so in all directions
+        usual = ((directions.T @ whiten @ root / np.sqrt(np.diag(root.T @ root))) ** 2).sum(axis=1)
+        share = (slow[:steady] / usual[:steady]).max()
+        slow[steady:] = np.maximum(slow[steady:], share * usual[steady:])
+    # the directions are uncertain themselves, so that movements leak into all others
+    white = np.maximum(white, np.count_nonzero(white + slow) / len(trajectory) - slow)
+    axes, first = back @ directions, tuple(int(rows[k]) for k in jumps)
+    moved = tuple(
+        (slow_course(len(good), row), back @ step, back @ V @ back.T)
+        for row, (step, V) in zip(first, steps, strict=True)
+    )
     return Movement(
-        (axes * white) @ axes.T,
-        (axes * slow) @ axes.T + back @ of_jumps @ back.T,
-        memory, back @ back.T,
-        tuple(int(rows[k]) for k in jumped),
+        (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
+        first, moved, back @ hidden @ back.T,
     )  # fmt: skip
+
+
+def _apart(rows: Sequence[int], end: int, least: int) -> list[int]:
+    """Return the rows before which, and up to `end`, there are at least so many epochs."""
+    kept: list[int] = []
+    for row in rows:
+        if min(row - max(kept, default=0), end - row) >= least:
+            kept.append(row)
+    return kept
+
+
+def _unit_variance(M: Array, g: Array) -> float:
+    """Return the variance of unit weight, at least 1, of the poses by the perspective.
+
+    M (E, k, k), g (E, k): as in `find_jumps`; from the changes between neighbours.
+    """
+    Q, found = stacked_inverses(M)
+    change = np.diff(np.einsum("eij,ej->ei", Q, g), axis=0)[..., None]
+    chi2 = (change * np.linalg.solve(Q[1:] + Q[:-1], change)).sum(axis=(1, 2))[
+        found[1:] & found[:-1]
+    ]
+    return max(float(np.median(chi2)) / _MEDIAN_CHI2_6, 1.0) if len(chi2) else 1.0
 
 
 def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:
@@ -504,31 +593,47 @@ def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, 
     return pose @ root.T, root, weak
 
 
-def _visible(N: Array, own: Index, root: Array) -> Array:
-    """Return the share (6, 6), 0 to 1, of a movement that an epoch's perspective shows, in units of
-    `root`; the rest looks like a change of the interior orientation.
+def _hidden(N: Array, own: Index, root: Array) -> Array:
+    """Return the share (6, 6), 0 to 1, of a movement that looks like a change of the interior
+    orientation, in units of `root`; an epoch's perspective shows the rest.
     """
-    usual = N.mean(axis=0, keepdims=True)
-    Q, _ = stacked_inverses(usual[:, own[:, None], own])
-    seen, _ = pose_equations(usual, usual[:, 0], own, Q)
-    inverse = np.linalg.inv(root)
-    visible: Array = inverse.T @ seen[0] @ inverse
-    return visible
+    usual = N.mean(axis=0)
+    Q, _ = stacked_inverses(usual[None, own[:, None], own])
+    looks = np.linalg.solve(root.T, usual[EOP_COLUMNS[:, None], own])
+    hidden: Array = looks @ Q[0] @ looks.T
+    return hidden
 
 
-def _directions(rough: Array, visible: Array) -> Array:
-    """Return orthonormal directions (6, 6) of the movements, from their rough part (E, 6).
+def _separate(
+    trajectory: Array, axes: Array, alike: Array, cuts: list[int], period: float, held: bool
+) -> tuple[Array, Array, Array, float]:
+    """Estimate the variance components of a trajectory (E, 6) along some orthonormal axes (6, d).
+
+    alike (d,): share of a movement along each that looks like the camera's; cuts: the first epoch
+    after each gap; period, held: as in `components`. Returns orthonormal directions (6, d), the
+    white and the slow variances (d,), and the memory.
 
     Directions that an epoch's perspective shows are separate from the others, as by a chance
     correlation the former would predict the latter.
     """
-    share, axes = np.linalg.eigh(visible)
-    found = []
-    for part in (axes[:, share < 0.5], axes[:, share >= 0.5]):
-        if part.shape[1]:
-            inside = rough @ part
-            found.append(part @ np.linalg.eigh(inside.T @ inside)[1])
-    return np.concatenate(found, axis=1)
+    trajectory = trajectory - trajectory.mean(axis=0)
+    smooth = np.zeros_like(trajectory)
+    if period:
+        parts = np.split(trajectory, cuts)
+        smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
+    rough = trajectory - smooth
+    limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
+    rough = np.clip(rough, -limit, limit)
+    groups = []
+    for part in (axes[:, alike > 0.5], axes[:, alike <= 0.5]):
+        inside = rough @ part
+        groups.append(part @ np.linalg.eigh(inside.T @ inside)[1])
+    directions = np.concatenate(groups, axis=1)
+    parts = np.split((smooth + rough) @ directions, cuts)
+    found = [components(p, min(period, len(p) / _PERIODS), held) for p in parts]
+    size = [len(p) for p in parts]
+    white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
+    return directions, white, slow, max(f[2] for f in found)
 
 
 def _fill(trajectory: Array, missing: Mask) -> Array:

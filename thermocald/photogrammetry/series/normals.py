@@ -57,8 +57,7 @@ class ObservationGrid:
         present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
         shape = (len(epochs), len(field))
         if not present:
-            none = np.empty(0, dtype=np.int64)
-            return cls.from_rows(shape, none, none, np.empty((0, 2)), np.empty((0, 2)))
+            return cls(np.full((*shape, 2), np.nan), np.zeros((*shape, 3)))
         xy = None
         if any(obs.covariances is not None for _, obs in present):
             xy = np.concatenate(
@@ -313,15 +312,7 @@ def cofactors(N: Array) -> tuple[Array, Mask]:
 def among_all(Q: Array, own: Index) -> Array:
     """Expand matrices (E, p, p) of some parameters to all (E, 16, 16), 0 for the others."""
     whole = np.zeros((len(Q), 16, 16))
-    # none if the common exterior orientation is all that is estimated
-    runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1) if len(own) else []
-    for rows in runs:
-        for columns in runs:
-            a, b = (
-                slice(own[rows[0]], own[rows[-1]] + 1),
-                slice(own[columns[0]], own[columns[-1]] + 1),
-            )
-            whole[:, a, b] = Q[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    whole[:, own[:, None], own] = Q
     return whole
 
 

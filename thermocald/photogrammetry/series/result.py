@@ -138,10 +138,11 @@ class SeriesAdjustment:
     epoch; field_ratio: estimated over stated standard deviations of the field's coordinates, at
     least 1; outer_noise: noise of the outermost target over that in the image's middle, and its
     standard deviation; noise_ratio: estimated over stated noise; affinity: of held C1 and C2;
-    movement: of the mount; choice: how the exterior orientation was estimated, and why; slow
-    (16, 16): covariance of the change over the series from slow errors of targets; step: the first
-    epoch (row) after targets moved against one another, 0 for none; pairs: of coordinates with
-    correlated errors.
+    movement: of the mount; choice: how the exterior orientation was estimated, and why; slow:
+    errors common to all epochs but for a factor, each as that course (E,) and the covariance (16,
+    16) of a change by 1: slow errors of targets, jumps of the mount; step: the first epoch (row)
+    after targets moved against one another, 0 for none; pairs: of coordinates with correlated
+    errors.
     """
 
     settings: SeriesSettings
@@ -166,7 +167,7 @@ class SeriesAdjustment:
     affinity: HeldAffinity | None = None
     movement: Movement = STILL
     choice: str = ""
-    slow: Array = field(default_factory=lambda: np.zeros((16, 16)))
+    slow: tuple[tuple[Array, Array], ...] = ()
     step: int = 0
     pairs: CorrelatedPairs | None = None
 

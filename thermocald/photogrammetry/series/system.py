@@ -49,8 +49,9 @@ class Design:
     """The unknowns of a series and their priors.
 
     at: the linearisation; own (p,), common (q,): positions of the parameters; known (16,): values
-    of the priors; own_prior (p, p), common_prior (q,): their weights, 0 without a prior; sways:
-    whether the prior of an epoch's exterior orientation is the common one instead; offset_prior
+    of the priors; own_prior (p, p), common_prior (q,): their weights, 0 without a prior; shifts
+    (E, 6) or (1, 6): if the prior of an epoch's exterior orientation is the common one instead,
+    known movements of the latter, else None; offset_prior
     (T, 3) px⁻²: weights xx, yy, xy of the offsets, (0, 3) without offsets.
     """
 
@@ -60,7 +61,7 @@ class Design:
     known: Array
     own_prior: Array
     common_prior: Array
-    sways: bool
+    shifts: Array | None
     offset_prior: Array
 
     @property
@@ -288,14 +289,21 @@ class SeriesSystem:
         """Return Aᵀ P l (E, 16) of every epoch."""
         return right_hand_sides(self.weights, residuals, self.design.at.A, self.use)
 
+    @property
+    def prior_cofactors(self) -> Array:
+        """Part (E, p, p) of the own parameters' cofactors that the priors contribute, Q P Q."""
+        part: Array = self.Q @ self.design.own_prior @ self.Q
+        return part
+
     def own_gradient(self, residuals: Array, state: State) -> Array:
         """Return the gradient (E, p) of the own parameters and their priors; 0 at the solution."""
         own, A = self.design.own, self.design.at.A
         b = right_hand_sides(self.weights, residuals, A[..., own], self.use)
         if self.design.own_prior.any():
-            centre = self.design.known.copy()
-            if self.design.sways:
-                centre[EOP] = state.pose
+            centre, shifts = self.design.known, self.design.shifts
+            if shifts is not None:
+                centre = np.tile(centre, (len(shifts), 1))
+                centre[:, EOP] = state.pose + shifts
             b += (centre - state.values)[:, own] @ self.design.own_prior
         return b
 

@@ -327,7 +327,7 @@ class CameraDifference(Result):
     @property
     def rms_px(self) -> float:
         """The RMS of the shifts' lengths, px."""
-        return float(np.sqrt(2 * np.mean(self.shifts**2)))
+        return _rms(self.shifts)
 
     @cached_property
     def turned_shifts(self) -> Array:
@@ -363,7 +363,7 @@ class CameraDifference(Result):
             "largest_at": self._grid[worst],
             "rms_px": self.rms_px,
             "largest_turned_px": turned.max(),
-            "rms_turned_px": np.sqrt(2 * np.mean(self.turned_shifts**2)),
+            "rms_turned_px": _rms(self.turned_shifts),
         }
         if sds is not None:
             for suffix, shifts in (("", self.shifts), ("_turned", self.turned_shifts)):
@@ -449,3 +449,8 @@ class CameraDifference(Result):
             largest += float(along @ covariance @ along)
             rms += float(total @ covariance @ total)
         return float(np.sqrt(largest)), float(np.sqrt(rms))
+
+
+def _rms(shifts: Array) -> float:
+    """Return the RMS length of shifts (n, 2)."""
+    return float(np.sqrt(2 * np.mean(shifts**2)))

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.discovery import criteria
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined, unit_diagonal
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
@@ -342,5 +343,5 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound
     }
     statement = effect.sentence(estimates)
     if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
-        statement += f"; it follows {growth.other} equally well"
+        statement += f"; it follows {parameter_label(growth.other)} equally well"
     return EffectFound(effect.name, statement, where, estimates, evidence, [])

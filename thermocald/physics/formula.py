@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.numbers import with_sd
+from thermocald.numbers import parameter_label, with_sd
 from thermocald.physics.effect import (
     PARAMETER_UNITS,
     Effect,
@@ -207,7 +207,9 @@ class Node:
         if self.operator == TIME:
             return "t"
         if self.is_leaf:
-            return "T" if self.name == reference and not self.operator else self.name
+            label = parameter_label(self.name)
+            own = label if label.isalnum() else f'"{label}"'  # not taken for several quantities
+            return "T" if self.name == reference and not self.operator else own
         inner = [n.words(spoken, reference) for n in self.inputs]
         own = [spoken.get(str(c), f"{c:.4g}" if not isinstance(c, str) else c)
                for c in self.constants]  # fmt: skip

@@ -32,7 +32,6 @@ from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
 from thermocald.thermal.hypothesis import targets_of
 from thermocald.thermal.movement import (
-    WAVES,
     add_jumps_to_noise,
     add_tremble,
     detect_tremble,
@@ -354,7 +353,7 @@ def _examine_beside_mount(
     fitter = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = add_tremble(fitter, fitter.fit(()), WAVES)
+    shaken = add_tremble(fitter, fitter.fit(()))
     beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))

@@ -15,6 +15,7 @@ from thermocald.discovery.evidence import (
     replace_moved_boards,
 )
 from thermocald.discovery.mounted import (
+    KNOCKS,
     contradict,
     is_convincing,
     search_beside_mount,
@@ -30,7 +31,7 @@ from thermocald.discovery.validation import (
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
-from thermocald.thermal.hypothesis import targets_of
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
 from thermocald.thermal.movement import (
     add_jumps_to_noise,
     add_tremble,
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.physics.model import ModelEffect
-    from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.movement import Mount
     from thermocald.thermal.scan import Adequacy
     from thermocald.thermal.series import ReducedSeries
@@ -195,7 +195,47 @@ def _examine_standing(
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
         say("noise that targets share: searching again")
         found = search_in(noisy)
+    if not found.adequate or any(t.kind.is_event for t in found.best.terms):
+        knocked = _search_beside_knocks(found, say, jobs)
+        simpler = knocked is not None and len(knocked.best.terms) <= len(found.best.terms)
+        if knocked is not None and (simpler or not found.adequate):
+            return knocked
     return found
+
+
+def _search_beside_knocks(
+    found: Examination, say: Callable[[str], None], jobs: int
+) -> Examination | None:
+    """Search beside knocks of a mount that otherwise stands still; None if these do not suffice.
+
+    A knock is a step of the camera that explains much more than a step inside it at that time.
+    """
+    search, base, series = Search(found.fitter, say), found.base, found.fitter.series
+    slip = catalogue.find(lambda kind: kind.is_event and kind.seen_in == "trajectory")
+    whole, inside = (make_candidate(slip, names, series) for names in (EOP_NAMES, BASE))
+    knocks: tuple[Term, ...] = ()
+    for _ in range(KNOCKS):
+        better = [
+            a - b
+            for a, b in zip(
+                *(search.scanner.scan(c, base.fit).events for c in (whole, inside)), strict=True
+            )
+        ]
+        fresh = tuple(
+            ((whole.name, float(e.times[np.argmax(gain) + 1])),)
+            if np.max(gain) > criteria.SLIP_NOT_KNOCK
+            else None
+            for e, gain in zip(series, better, strict=True)
+        )
+        if not any(fresh):
+            break
+        knocks = (*knocks, Term(slip.name, EOP_NAMES, (), fresh))
+        say("alongside a knock of the mount")
+        base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
+        again = _search_standing(search, base, jobs)
+        if again.adequate:
+            return replace(again, knocks=knocks, as_slips=(False,) * len(knocks))
+    return None
 
 
 def _is_explained(series: list[ReducedSeries], found: Examination) -> bool:
@@ -421,4 +461,6 @@ def _drop_effect(search: Search, base: Solution, best: Solution, number: int) ->
     """Fit a solution again without one of its effects."""
     terms = best.terms[:number] + best.terms[number + 1 :]
     penalties = best.penalties[:number] + best.penalties[number + 1 :]
-    return search.refine(terms, penalties) if len(terms) > len(base.terms) else base
+    if len(terms) == len(base.terms):
+        return base
+    return replace(search.refine(terms, penalties), mount=best.mount, as_slips=best.as_slips)

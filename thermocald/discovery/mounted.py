@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
 _EFFECTS = 3
-_KNOCKS = 3
+KNOCKS = 3
 _PROMISE = 0.3  # share of a further effect's least gain that a scan before it must promise
 _CORNERS = (0.0, 3.0)
 _REST = 0.05  # share of the movement before that is added to a first guess
@@ -158,7 +158,7 @@ def _is_allowed(grown: Solution, best: Solution, plain: Solution, given: int) ->
     gain = best.score - grown.score
     own = [t for t in grown.terms[given:] if not t.kind.is_event]
     knocks = len(grown.terms) - given - len(own)
-    if len(own) > _EFFECTS or knocks > _KNOCKS or gain <= 0:
+    if len(own) > _EFFECTS or knocks > KNOCKS or gain <= 0:
         return False
     if grown.terms[-1].kind.is_event or len(own) == 1:
         return True

@@ -65,11 +65,14 @@ def field_lines(x: Examination) -> list[str]:
 
 def mount_lines(x: Examination) -> list[str]:
     """Return lines about the movement of the mount and its knocks."""
-    if x.mount is None:
+    if x.mount is None and not x.knocks:
         return []
-    sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
+    moves = "stands still but for knocks"
+    if x.mount is not None:
+        sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
+        moves = f"moves on its mount by {sizes} px RMS"
     return [
-        f"the camera moves on its mount by {sizes} px RMS; this is not counted as an effect",
+        f"the camera {moves}; this is not counted as an effect",
         *(
             f"    a knock of {k['size_px']:.3f} px at {k['time_s']:.0f} s (epoch {k['epoch']}) in "
             f"{k['recording']}" + ("; or a slip inside the camera" if k["not_excluded"] else "")
@@ -90,6 +93,8 @@ def say_adequate(x: Examination) -> str:
             "the model and a moving mount reproduce the recording; an effect that moves the image "
             "as the mount does cannot be seen"
         )
+    if x.knocks:
+        return "the model and knocks of the mount reproduce the recording; no effect is missing"
     return "the model reproduces the recording; no effect that it can show is missing"
 
 
@@ -170,9 +175,9 @@ class Discovery:
             document["gap"]["verify_each"] = [
                 {"recording": name, **gap} for name, gap in zip(names, others, strict=True)
             ]
-        if x.mount is not None:  # RMS over image points and time
+        if x.mount is not None or x.knocks:  # RMS over image points and time
             document["mount"] = {
-                "movement_px": [x.mount.size_px(e) for e in x.fitter.series],
+                "movement_px": [x.mount.size_px(e) if x.mount else 0.0 for e in x.fitter.series],
                 "knocks": _list_knocks(x),
                 "note": "the movement of the mount is estimated with the effects and is not the "
                 "camera's",

@@ -282,8 +282,10 @@ class Search:
         for i, term in enumerate(solution.terms):
             if not term.kind.is_event:
                 continue
-            same = (c for c in self.candidates if c.effect == term.effect)
-            candidate = next(c for c in same if c.parameters == term.parameters)
+            key = term.effect, term.parameters
+            candidate = next((c for c in self.candidates if (c.effect, c.parameters) == key), None)
+            if candidate is None:  # a knock of the mount
+                continue
             gains = self.scanner.scan(candidate, solution.fit).events
             for s, now in enumerate(term.fresh):
                 if now is None:

@@ -346,9 +346,7 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
     return out
 
 
-def _measure_fast_power(
-    fitter: HypothesisFitter, fit: Fit, series: int
-) -> tuple[Array, Array]:
+def _measure_fast_power(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array]:
     """Return the mean power (m, m) of the fast half-waves of a fit's misfit, and W (P, m).
 
     W are the determined combinations of the parameters. The power is the unit matrix if there is

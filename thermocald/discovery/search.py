@@ -277,7 +277,8 @@ class Search:
     def with_events_moved(self, solution: Solution) -> Solution:
         """Move the events to the times at which they explain most beside the other effects.
 
-        They were found without some of these.
+        They were found without some of these: a further series may seem to hold an event because
+        that of the first one distorted their common rates. It is dropped if it is not worth it.
         """
         for i, term in enumerate(solution.terms):
             if not term.kind.is_event:
@@ -291,12 +292,15 @@ class Search:
                 if now is None:
                     continue
                 time = float(self.fitter.series[s].times[int(np.argmax(gains[s])) + 1])
-                at = ((candidate.name, time),)
-                moved = replace(term, fresh=(*term.fresh[:s], at, *term.fresh[s + 1 :]))
-                terms = (*solution.terms[:i], moved, *solution.terms[i + 1 :])
-                trial = self.refine(terms, solution.penalties)
-                if trial.score < solution.score:
-                    solution, term = trial, moved
+                single = (len(term.parameters) + 2) * float(np.log(self.epochs))
+                for own, less in ((((candidate.name, time),), 0.0), (None, single))[: 1 + (s > 0)]:
+                    moved = replace(term, fresh=(*term.fresh[:s], own, *term.fresh[s + 1 :]))
+                    terms = (*solution.terms[:i], moved, *solution.terms[i + 1 :])
+                    penalties = list(solution.penalties)
+                    penalties[i] -= less
+                    trial = self.refine(terms, penalties)
+                    if trial.score < solution.score:
+                        solution, term = trial, moved
         return solution
 
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:

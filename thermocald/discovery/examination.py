@@ -215,17 +215,12 @@ def _search_beside_knocks(
     whole, inside = (make_candidate(slip, names, series) for names in (EOP_NAMES, BASE))
     knocks: tuple[Term, ...] = ()
     for _ in range(KNOCKS):
-        better = [
-            a - b
-            for a, b in zip(
-                *(search.scanner.scan(c, base.fit).events for c in (whole, inside)), strict=True
-            )
-        ]
+        steps = (search.scanner.scan(c, base.fit).events for c in (whole, inside))
         fresh = tuple(
-            ((whole.name, float(e.times[np.argmax(gain) + 1])),)
-            if np.max(gain) > criteria.SLIP_NOT_KNOCK
+            ((whole.name, float(e.times[np.argmax(a - b) + 1])),)
+            if np.max(a - b) > criteria.SLIP_NOT_KNOCK
             else None
-            for e, gain in zip(series, better, strict=True)
+            for e, a, b in zip(series, *steps, strict=True)
         )
         if not any(fresh):
             break

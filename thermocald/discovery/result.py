@@ -19,7 +19,6 @@ from thermocald.analysis.thermal.result import build_camera
 from thermocald.discovery import criteria
 from thermocald.discovery.entries import (
     EffectFound,
-    acts_on,
     compare_shift_and_tilt,
     effects_of,
     estimate_term,
@@ -45,6 +44,7 @@ from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.noise import sharpen_trajectories
 from thermocald.thermal.scan import examine, examine_all
+from thermocald.thermal.series import FIELD_SCALES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -277,6 +277,10 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
             "gains_of_surrogates": [float(g) for g in np.sort(test.surrogates)],
         }
     statement = term.kind.sentence(estimates)
+    # the epochs with more than a quarter of the effect's largest movement
+    other = x.fitter.fit(fit.terms[:k] + fit.terms[k + 1 :], only=[0])
+    size = np.sqrt(np.maximum(e.squares(fit.parameters(0) - other.parameters(0)), 0.0))
+    large = np.flatnonzero(size > 0.25 * size.max())
     part = compare_shift_and_tilt(x.fitter, x.best.fit, k)
     if part is not None:
         evidence["shift_and_tilt"], clause = part
@@ -294,8 +298,10 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
         term.effect,
         statement,
         {
-            "parameters": acts_on(term.parameters),
-            "epochs": _find_epochs(x, fit, k),
+            "parameters": [
+                f"object {p[-1]}" if p in FIELD_SCALES else p for p in term.parameters
+            ],
+            "epochs": [int(e.numbers[large[0]]), int(e.numbers[large[-1]])],
             "image_region": None,
         },
         estimates, evidence, alternatives, term,
@@ -334,15 +340,6 @@ def _widen_estimates(
         name: {**e, "sd": max(e["sd"], other[name]["sd"])} if e["sd"] is not None else e
         for name, e in estimates.items()
     }
-
-
-def _find_epochs(x: Examination, fit: Fit, k: int) -> list[int]:
-    """Return the first and last epoch with more than a quarter of the effect's largest movement."""
-    e = x.fitter.series[0]
-    other = x.fitter.fit(fit.terms[:k] + fit.terms[k + 1 :], only=[0])
-    size = np.sqrt(np.maximum(e.squares(fit.parameters(0) - other.parameters(0)), 0.0))
-    large = np.flatnonzero(size > 0.25 * size.max())
-    return [int(e.numbers[large[0]]), int(e.numbers[large[-1]])]
 
 
 def _list_alternatives(x: Examination, term: Term, first: bool) -> list[dict[str, Any]]:

@@ -330,11 +330,25 @@ def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> Redu
 def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
     """Return the series with the movement from epoch to epoch as a random movement of each epoch.
 
-    The slowest half-waves are the mount's.
+    It is measured by the mean power of the fast half-waves of the fit's misfit, without the
+    thermometers' share; the slow ones are the mount's.
     """
     out = []
     for s, e in enumerate(fitter.series):
-        M, W = _measure_fast_power(fitter, fit, s)
+        W = find_combinations([e])
+        fast = waves(e.times, len(e.times) - 1)[:, _count_waves(e) :].T
+        z = fast @ (_subtract_fit(fitter, fit, s) @ W)
+        M = z.T @ z / len(fast)  # the unit matrix if there is image noise only
+        for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, s):
+            if operator is None:
+                continue
+            carried = fast @ operator
+            noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
+            # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
+            taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
+            left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
+            along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
+            M -= left * np.outer(along, along)
         edge = (1.0 + np.sqrt(len(M) / (len(e.times) - _count_waves(e)))) ** 2
         factors, U = np.linalg.eigh(M)
         clear = factors > criteria.BEYOND * edge  # more than so few half-waves show by chance
@@ -344,30 +358,6 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
         D = np.column_stack([D, W[:, more] * np.sqrt(rest[more] - 1.0)])
         out.append(replace(e, tremble=D) if D.shape[1] else e)
     return out
-
-
-def _measure_fast_power(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array]:
-    """Return the mean power (m, m) of the fast half-waves of a fit's misfit, and W (P, m).
-
-    W are the determined combinations of the parameters. The power is the unit matrix if there is
-    image noise only; the thermometers' share is subtracted.
-    """
-    e = fitter.series[series]
-    W = find_combinations([e])
-    fast = waves(e.times, len(e.times) - 1)[:, _count_waves(e) :].T
-    z = fast @ (_subtract_fit(fitter, fit, series) @ W)
-    power: Array = z.T @ z / len(fast)
-    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
-        if operator is None:
-            continue
-        carried = fast @ operator
-        noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
-        # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
-        taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
-        left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
-        along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
-        power -= left * np.outer(along, along)
-    return power, W
 
 
 def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:

@@ -207,9 +207,10 @@ class Node:
         if self.operator == TIME:
             return "t"
         if self.is_leaf:
+            if self.name == reference and not self.operator:
+                return "T"
             label = parameter_label(self.name)
-            own = label if label.isalnum() else f'"{label}"'  # not taken for several quantities
-            return "T" if self.name == reference and not self.operator else own
+            return label if label.isalnum() else f'"{label}"'  # not taken for several quantities
         inner = [n.words(spoken, reference) for n in self.inputs]
         own = [spoken.get(str(c), f"{c:.4g}" if not isinstance(c, str) else c)
                for c in self.constants]  # fmt: skip

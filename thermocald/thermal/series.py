@@ -332,10 +332,10 @@ def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
     if span > _DAYS * _DAY_S:
         length = np.ceil(length / _DAY_S) * _DAY_S
     number = np.floor((evidence.times - evidence.times[0]) / max(length, 1e-9))
-    first = np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
+    first: list[int] = np.flatnonzero(np.diff(number, prepend=-1.0) > 0).tolist()
     heap: list[tuple[float, int, int]] = []
-    for start, stop in zip(first, np.append(first[1:], E), strict=True):
-        heapq.heappush(heap, (-gain(int(start), int(stop)), int(start), int(stop)))
+    for start, stop in zip(first, [*first[1:], E], strict=True):
+        heapq.heappush(heap, (-gain(start, stop), start, stop))
     done: list[int] = []
     while heap and len(heap) + len(done) < rows:
         _, start, stop = heapq.heappop(heap)

@@ -211,8 +211,8 @@ def _search_beside_knocks(
     A knock is a step of the camera that explains much more than a step inside it at that time.
     """
     search, base, series = Search(found.fitter, say), found.base, found.fitter.series
-    slip = catalogue.find(lambda kind: kind.is_event and kind.seen_in == "trajectory")
-    whole, inside = (make_candidate(slip, names, series) for names in (EOP_NAMES, BASE))
+    event = catalogue.find(lambda kind: kind.is_event and kind.seen_in == "trajectory")
+    whole, inside = (make_candidate(event, names, series) for names in (EOP_NAMES, BASE))
     knocks: tuple[Term, ...] = ()
     for _ in range(KNOCKS):
         steps = (search.scanner.scan(c, base.fit).events for c in (whole, inside))
@@ -224,7 +224,7 @@ def _search_beside_knocks(
         )
         if not any(fresh):
             break
-        knocks = (*knocks, Term(slip.name, EOP_NAMES, (), fresh))
+        knocks = (*knocks, Term(event.name, EOP_NAMES, (), fresh))
         say("alongside a knock of the mount")
         base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
         again = _search_standing(search, base, jobs)

@@ -197,8 +197,8 @@ def _examine_standing(
         found = search_in(noisy)
     if not found.adequate or any(t.kind.is_event for t in found.best.terms):
         knocked = _search_beside_knocks(found, say, jobs)
-        simpler = knocked is not None and len(knocked.best.terms) <= len(found.best.terms)
-        if knocked is not None and (simpler or not found.adequate):
+        most = len(found.best.terms) if found.adequate else np.inf
+        if knocked is not None and len(knocked.best.terms) <= most:
             return knocked
     return found
 

@@ -314,5 +314,4 @@ def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
 def _rate(T: Array, times: Array) -> Array:
     """Return the rate (E,) of a temperature, K/s; several epochs may have the same time."""
     distinct, first = np.unique(times, return_index=True)
-    rate: Array = np.interp(times, distinct, np.gradient(T[first], distinct))
-    return rate
+    return np.asarray(np.interp(times, distinct, np.gradient(T[first], distinct)))

@@ -53,8 +53,7 @@ _POWERS = np.array([0, 0, 0, 2, 4, 6, 1, 1, 0, 0])  # of c, in the order of IOP_
 
 def follow_angle(linear: Array, c0: float) -> Array:
     """Return interior orientations (…, 10) whose distortion, valid at c0 mm, follows the angle."""
-    out: Array = linear * (c0 / linear[..., :1]) ** _POWERS
-    return out
+    return np.asarray(linear * (c0 / linear[..., :1]) ** _POWERS)
 
 
 def distortion_along(iop: Array) -> Array:

@@ -17,6 +17,12 @@ def test_doubled_thermometer_noise_gives_no_name():
 
 
 @pytest.mark.slow
+def test_a_slip_of_the_first_recording_is_none_of_the_second():
+    """It distorts the rates that both have in common, by which the second seems to hold one too."""
+    assert judge(Case(("slip",), 0.05, 802)).right
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "share", "least"),
     [("hard-0.3", "exact_or_listed", 0.9), ("pair-0.3", "exact_or_listed", 0.9),

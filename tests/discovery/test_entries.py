@@ -67,6 +67,32 @@ def test_a_constant_that_is_not_determined_is_said_so():
     assert "about 120 s" in said
 
 
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [("board_temperature", "board temperature"), ("T, °C (LGR S/N: 2, LBL: Gehäuse)", "Gehäuse"),
+     ("{x} <b>7 K</b>", "{x} <b>7 K</b>")],
+)  # fmt: skip
+def test_a_foreign_thermometer_is_said_by_its_label(name, label):
+    channel = {"channel": {"value": name, "sd": None, "unit": "name"}}
+    product = Node("product", (T, Node("", name=name))).text()
+
+    heats = catalogue.get("second_heat_source").sentence(channel)
+
+    assert heats == f"{label} heats the camera too"
+    assert label in catalogue.get(product).sentence({"a_c": {}})
+
+
+def test_a_thermometer_that_is_stuck_is_as_if_there_were_none(evidence_of):
+    """Neither a second source of heat nor a cause of noise."""
+    (e,), _ = evidence_of("thermal_lag", epochs=50, with_m2=False)
+    stuck = np.full(50, 21.0)
+    source = replace(e.source, readings={**e.source.readings, "board_temperature": stuck})
+
+    found = discover_series([reduce_series(source)])
+
+    assert found.headline == "effects_found: thermal_lag"
+
+
 def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alone(lagging):
     """Its tail is an exponential: middle and size are one number."""
     found = find_tied_constants(lagging, saturating(lagging, 3783.7, 288.2), 0)

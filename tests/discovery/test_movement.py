@@ -12,7 +12,7 @@ from tests.blind.case import Case
 from tests.blind.generator import generate
 from tests.discovery.test_likelihood import of_images, products
 from tests.marks import mostly_slow
-from thermocald.discovery.result import discover_series
+from thermocald.discovery.result import discover_series, mount_lines
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import (
@@ -25,7 +25,7 @@ from thermocald.thermal.movement import (
     weight_jumps_down,
 )
 from thermocald.thermal.random_effects import Movement, waves
-from thermocald.thermal.reduce import reduce_together
+from thermocald.thermal.reduce import reduce_series, reduce_together
 
 
 def test_slow_drifts_in_weak_directions_are_movement(evidence_of):
@@ -124,15 +124,18 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
 
 
 @pytest.mark.parametrize(
-    ("effects", "px", "expected"),
-    [((), 0.0, False), (("thermal_lag",), 0.0, False), (("thermal_lag",), 0.01, True)],
-)
-def test_a_tremble_is_no_drift(effects, px, expected):
-    assert [detect_tremble(e) for e in trembling(effects, px, 3)] == [expected] * 2
+    ("effects", "px", "epochs", "expected"),
+    [((), 0.0, 180, False), (("thermal_lag",), 0.0, 180, False),
+     (("thermal_lag",), 0.01, 180, True), ((), 0.0, 45, False), ((), 0.05, 45, True)],
+)  # fmt: skip
+def test_a_tremble_is_no_drift(effects, px, epochs, expected):
+    """Nor are the kinks of a lamp that is switched, which are many in a short series."""
+    assert [detect_tremble(e) for e in trembling(effects, px, 3, epochs)] == [expected] * 2
 
 
 TREMBLING = (
-    ((), 0.05, 2, 90), (("softening",), 0.02, 3, 180), (("softening",), 0.05, 2, 180),
+    ((), 0.05, 2, 45), (("thermal_lag",), 0.03, 3, 45),
+    (("softening",), 0.02, 3, 180), (("softening",), 0.05, 2, 180),
     (("thermal_lag",), 0.02, 3, 180), (("thermal_lag",), 0.05, 2, 180),
     (("cyclic_interference",), 0.02, 3, 180),
 )  # fmt: skip
@@ -144,3 +147,21 @@ def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed, epochs
 
     assert tuple(e.effect for e in found.effects) == effects
     assert all(a.significance < 6.0 for a in found.examination.adequacy)
+
+
+@pytest.mark.parametrize(
+    "effects", [(), pytest.param(("thermal_lag",), marks=pytest.mark.slow), ("creep",)]
+)
+def test_a_knock_of_a_mount_that_stands_still_is_no_effect(evidence_of, effects):
+    (e,), _ = evidence_of(*effects, seed=3, epochs=90, with_m2=False)
+    knock = np.array([2e-4, -1e-4, 1e-4, 0.1, 0.2, -0.1]) * e.scale[10:16]
+    points = np.array(e.source.grid.points)
+    points[50:] += e.columns[:, :, 10:16] @ knock
+    source = replace(e.source, grid=ObservationGrid(points, e.source.grid.weights))
+
+    found = discover_series([reduce_series(source)])
+
+    assert tuple(x.effect for x in found.effects) == effects
+    (line,) = mount_lines(found.examination)[1:]
+    assert f"epoch {e.numbers[50]}" in line
+    assert found.as_dict()["mount"]["movement_px"] == [0.0]

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.discovery import criteria
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined, unit_diagonal
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
@@ -27,7 +28,7 @@ from thermocald.physics.model import ModelEffect
 from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.scan import normals_of_term
-from thermocald.thermal.series import COLUMNS, FIELD_SCALES
+from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -119,11 +120,6 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
         "experiment": "put a small, fast thermometer beside the present one and record again: a "
         "lag of the thermometer disappears, any other cause remains",
     }
-
-
-def acts_on(parameters: tuple[str, ...]) -> list[str]:
-    """Return the parameters' names in the document."""
-    return [p if p not in FIELD_SCALES else f"object {p[-1]}" for p in parameters]
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,5 +338,5 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound
     }
     statement = effect.sentence(estimates)
     if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
-        statement += f"; it follows {growth.other} equally well"
+        statement += f"; it follows {parameter_label(growth.other)} equally well"
     return EffectFound(effect.name, statement, where, estimates, evidence, [])

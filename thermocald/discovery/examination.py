@@ -15,6 +15,7 @@ from thermocald.discovery.evidence import (
     replace_moved_boards,
 )
 from thermocald.discovery.mounted import (
+    KNOCKS,
     contradict,
     is_convincing,
     search_beside_mount,
@@ -30,9 +31,8 @@ from thermocald.discovery.validation import (
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
-from thermocald.thermal.hypothesis import targets_of
+from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
 from thermocald.thermal.movement import (
-    WAVES,
     add_jumps_to_noise,
     add_tremble,
     detect_tremble,
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.physics.model import ModelEffect
-    from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.movement import Mount
     from thermocald.thermal.scan import Adequacy
     from thermocald.thermal.series import ReducedSeries
@@ -196,7 +195,42 @@ def _examine_standing(
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
         say("noise that targets share: searching again")
         found = search_in(noisy)
+    if not found.adequate or any(t.kind.is_event for t in found.best.terms):
+        knocked = _search_beside_knocks(found, say, jobs)
+        most = len(found.best.terms) if found.adequate else np.inf
+        if knocked is not None and len(knocked.best.terms) <= most:
+            return knocked
     return found
+
+
+def _search_beside_knocks(
+    found: Examination, say: Callable[[str], None], jobs: int
+) -> Examination | None:
+    """Search beside knocks of a mount that otherwise stands still; None if these do not suffice.
+
+    A knock is a step of the camera that explains much more than a step inside it at that time.
+    """
+    search, base, series = Search(found.fitter, say), found.base, found.fitter.series
+    event = catalogue.find(lambda kind: kind.is_event and kind.seen_in == "trajectory")
+    whole, inside = (make_candidate(event, names, series) for names in (EOP_NAMES, BASE))
+    knocks: tuple[Term, ...] = ()
+    for _ in range(KNOCKS):
+        steps = (search.scanner.scan(c, base.fit).events for c in (whole, inside))
+        fresh = tuple(
+            ((whole.name, float(e.times[np.argmax(a - b) + 1])),)
+            if np.max(a - b) > criteria.SLIP_NOT_KNOCK
+            else None
+            for e, a, b in zip(series, *steps, strict=True)
+        )
+        if not any(fresh):
+            break
+        knocks = (*knocks, Term(event.name, EOP_NAMES, (), fresh))
+        say("alongside a knock of the mount")
+        base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
+        again = _search_standing(search, base, jobs)
+        if again.adequate:
+            return replace(again, knocks=knocks, as_slips=(False,) * len(knocks))
+    return None
 
 
 def _is_explained(series: list[ReducedSeries], found: Examination) -> bool:
@@ -354,7 +388,7 @@ def _examine_beside_mount(
     fitter = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = add_tremble(fitter, fitter.fit(()), WAVES)
+    shaken = add_tremble(fitter, fitter.fit(()))
     beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))
@@ -422,4 +456,6 @@ def _drop_effect(search: Search, base: Solution, best: Solution, number: int) ->
     """Fit a solution again without one of its effects."""
     terms = best.terms[:number] + best.terms[number + 1 :]
     penalties = best.penalties[:number] + best.penalties[number + 1 :]
-    return search.refine(terms, penalties) if len(terms) > len(base.terms) else base
+    if len(terms) == len(base.terms):
+        return base
+    return replace(search.refine(terms, penalties), mount=best.mount, as_slips=best.as_slips)

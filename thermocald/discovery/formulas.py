@@ -190,8 +190,11 @@ class Library:
         for leaf in self.leaves:
             for inner in self.with_memory(leaf):
                 out += [inner, *self.shapes(inner)]
-            out += self.waves(leaf)
-            for rated in self.rates(leaf):
+            low, high = self.span(leaf)
+            for P in (high - low) * np.array([0.2, 0.3, 0.45, 0.7]):  # as from interference
+                out += [_apply("wave", leaf, P, phi) for phi in np.arange(4) * np.pi / 4]
+            smooth = [_apply("lag", leaf, tau) for tau in self.taus[1:5]]
+            for rated in (_apply("rate", n) for n in (leaf, *smooth)):
                 out += [rated, *self.shapes(rated, about_zero=True)]
             changed = _apply("change", leaf)
             out += [_apply(n, changed) for n in ("square", "cube", "magnitude", "signed_square")]
@@ -216,11 +219,6 @@ class Library:
         out += [_apply("minimum", node)]
         out += [_apply("peak", node, tau) for tau in taus[1:]]
         return out
-
-    def rates(self, node: Node) -> list[Node]:
-        """List the rates of a quantity, direct and smoothed."""
-        smooth = [_apply("rate", _apply("lag", node, tau)) for tau in self.taus[1:5]]
-        return [_apply("rate", node), *smooth]
 
     def offsets(self, node: Node, few: bool = False) -> list[Node]:
         """Shift a quantity's origin."""
@@ -253,12 +251,6 @@ class Library:
         ]
         out += [_apply("exponential", node, w * width) for w in (0.12, 0.4)]
         return out
-
-    def waves(self, node: Node) -> list[Node]:
-        """Make waves of a quantity, as from interference."""
-        low, high = self.span(node)
-        periods = (high - low) * np.array([0.2, 0.3, 0.45, 0.7])
-        return [_apply("wave", node, P, phi) for P in periods for phi in np.arange(4) * np.pi / 4]
 
     def products(self) -> list[Node]:
         """List products of two quantities."""

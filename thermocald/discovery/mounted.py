@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
 _EFFECTS = 3
-_KNOCKS = 3
+KNOCKS = 3
 _PROMISE = 0.3  # share of a further effect's least gain that a scan before it must promise
 _CORNERS = (0.0, 3.0)
 _REST = 0.05  # share of the movement before that is added to a first guess
@@ -69,7 +69,12 @@ def search_beside_mount(
         # a scan is accurate to a few percent, and a further effect must gain much
         further = any(not t.kind.is_event for t in best.terms[len(start.terms) :])
         least = _PROMISE * _least_further(plain, best) if further else 0.0
-        for solution in _add_delays(search, search.expand(best, 6, least)[:_WIDTH]):
+        solutions = search.expand(best, 6, least)[:_WIDTH]
+        # the other kind of delay: a scan without the movement of the mount may miss it
+        others = filter(None, map(search.with_other_delay, solutions))
+        if (other := next(others, None)) and other.names not in [s.names for s in solutions]:
+            solutions.append(other)
+        for solution in solutions:
             trial = _profile(best, solution)
             grown.append(_try_knock(best, trial) or trial)
         if not grown:
@@ -84,19 +89,6 @@ def search_beside_mount(
             break
         best = min(allowed, key=by_score)
     return best, ranking, seen, first
-
-
-def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
-    """Add the other kind of delay to the first solution with a delay of the temperature.
-
-    A scan without the movement of the mount may miss it.
-    """
-    for solution in solutions:
-        other = search.with_other_delay(solution)
-        if other is not None:
-            names = [s.names for s in solutions]
-            return solutions if other.names in names else [*solutions, other]
-    return solutions
 
 
 def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
@@ -158,7 +150,7 @@ def _is_allowed(grown: Solution, best: Solution, plain: Solution, given: int) ->
     gain = best.score - grown.score
     own = [t for t in grown.terms[given:] if not t.kind.is_event]
     knocks = len(grown.terms) - given - len(own)
-    if len(own) > _EFFECTS or knocks > _KNOCKS or gain <= 0:
+    if len(own) > _EFFECTS or knocks > KNOCKS or gain <= 0:
         return False
     if grown.terms[-1].kind.is_event or len(own) == 1:
         return True

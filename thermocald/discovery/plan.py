@@ -149,21 +149,14 @@ def plan_power(
                 changed = _add_drive(simulation, fitter, candidate, strength_px)
             else:
                 changed = _add_effect(fitter, candidate, strength_px, rng)
-            verdict = _examine(changed, given)
+            x = examine_series([changed], given=given)
+            every = [x.best.names, *(r.names for r in x.rivals)]
+            named = ("+".join(names[len(x.base.terms) :]) or "none" for names in every)
+            verdict = " or ".join(dict.fromkeys(named)) if x.adequate else "unexplained"
             row = found.setdefault(candidate.effect, {})
             row[verdict] = row.get(verdict, 0) + 1
             advance(1)
     return Plan(found, len(inputs), strength_px)
-
-
-def _examine(evidence: ReducedSeries, given: Sequence[ModelEffect]) -> str:
-    """Return the effects that an examination finds beyond the model's own."""
-    x = examine_series([evidence], given=given)
-    if not x.adequate:
-        return "unexplained"
-    known = len(x.base.terms)
-    every = [x.best.names, *(r.names for r in x.rivals)]
-    return " or ".join(dict.fromkeys("+".join(names[known:]) or "none" for names in every))
 
 
 def _add_effect(
@@ -174,7 +167,11 @@ def _add_effect(
     # the readings without the evidence's smoothing, since a camera follows every kink
     readings = {n: h.readings[n] + c.deviation for n, c in e.thermometers.items()}
     seen = HypothesisFitter([replace(e, history=replace(h, readings=readings))])
-    value = _choose_place(candidate, e, rng)
+    value = None  # of the non-linear parameter, with which the effect shows well
+    if candidate.name and candidate.kind.nonlinear[candidate.name].role == "period":
+        value = float(e.times[-1] / rng.uniform(4, 20))
+    elif candidate.name:
+        value = float(candidate.grid[int(len(candidate.grid) * rng.uniform(0.4, 0.6))])
     term = candidate.term(value, 1)
     if candidate.kind.is_event:
         term = Term(term.effect, term.parameters, (), (((candidate.name, value or 0.0),),))
@@ -212,15 +209,6 @@ def _add_drive(
     effect = ModelEffect(term.effect, dict(term.nonlinear))
     model = replace(simulation.model, effects=(*simulation.model.effects, effect))
     return reduce_series(_record(replace(simulation, model=model)))
-
-
-def _choose_place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:
-    """Choose a non-linear parameter with which the effect shows well, None if it has none."""
-    if not len(candidate.grid):
-        return None
-    if candidate.kind.nonlinear[candidate.name].role == "period":
-        return float(e.times[-1] / rng.uniform(4, 20))
-    return float(candidate.grid[int(len(candidate.grid) * rng.uniform(0.4, 0.6))])
 
 
 def _measure_left(fitter: HypothesisFitter, moved: Array) -> float:

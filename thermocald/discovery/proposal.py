@@ -69,8 +69,14 @@ def propose(
     if len(x.fitter.series) < 2:
         return None
     (progress or (lambda _: None))("beyond the catalogue")
-    base = _straighten(x)
-    fitter = base.fitter
+    # without the projection's curvature along all movements
+    series: list[ReducedSeries] = []
+    for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):
+        bridge = a.trajectories.T @ a.amplitudes
+        series.append(relinearise(x.fitter, x.base.fit, s, bridge) or e)
+    fitter = HypothesisFitter(series)
+    fit = fitter.fit(x.base.terms, x.base.fit.coefficients)
+    base = replace(x.base, fit=fit, fitter=fitter)
     search = FormulaSearch(condense(fitter, base.fit, moving), criteria.MARGIN)
     test = SurrogateTest(
         *search.surrogates(criteria.FORMULA_SURROGATES, np.random.default_rng(_SEED))
@@ -110,17 +116,6 @@ def propose(
         key=lambda r: r[1],
     )  # fmt: skip
     return Proposal(base, best, closed, test, tuple(rivals))
-
-
-def _straighten(x: Examination) -> Solution:
-    """Remove the projection's curvature along all movements from the series; fit the base model."""
-    series: list[ReducedSeries] = []
-    for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):
-        bridge = a.trajectories.T @ a.amplitudes
-        series.append(relinearise(x.fitter, x.base.fit, s, bridge) or e)
-    fitter = HypothesisFitter(series)
-    fit = fitter.fit(x.base.terms, x.base.fit.coefficients)
-    return replace(x.base, fit=fit, fitter=fitter)
 
 
 def _fit_formulas(

@@ -19,7 +19,6 @@ from thermocald.analysis.thermal.thermal_model import with_covariance
 from thermocald.discovery import criteria
 from thermocald.discovery.entries import (
     EffectFound,
-    acts_on,
     compare_shift_and_tilt,
     effects_of,
     estimate_term,
@@ -45,6 +44,7 @@ from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.noise import sharpen_trajectories
 from thermocald.thermal.scan import examine, examine_all
+from thermocald.thermal.series import FIELD_SCALES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -65,11 +65,14 @@ def field_lines(x: Examination) -> list[str]:
 
 def mount_lines(x: Examination) -> list[str]:
     """Return lines about the movement of the mount and its knocks."""
-    if x.mount is None:
+    if x.mount is None and not x.knocks:
         return []
-    sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
+    moves = "stands still but for knocks"
+    if x.mount is not None:
+        sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
+        moves = f"moves on its mount by {sizes} px RMS"
     return [
-        f"the camera moves on its mount by {sizes} px RMS; this is not counted as an effect",
+        f"the camera {moves}; this is not counted as an effect",
         *(
             f"    a knock of {k['size_px']:.3f} px at {k['time_s']:.0f} s (epoch {k['epoch']}) in "
             f"{k['recording']}" + ("; or a slip inside the camera" if k["not_excluded"] else "")
@@ -90,6 +93,8 @@ def say_adequate(x: Examination) -> str:
             "the model and a moving mount reproduce the recording; an effect that moves the image "
             "as the mount does cannot be seen"
         )
+    if x.knocks:
+        return "the model and knocks of the mount reproduce the recording; no effect is missing"
     return "the model reproduces the recording; no effect that it can show is missing"
 
 
@@ -170,9 +175,9 @@ class Discovery:
             document["gap"]["verify_each"] = [
                 {"recording": name, **gap} for name, gap in zip(names, others, strict=True)
             ]
-        if x.mount is not None:  # RMS over image points and time
+        if x.mount is not None or x.knocks:  # RMS over image points and time
             document["mount"] = {
-                "movement_px": [x.mount.size_px(e) for e in x.fitter.series],
+                "movement_px": [x.mount.size_px(e) if x.mount else 0.0 for e in x.fitter.series],
                 "knocks": _list_knocks(x),
                 "note": "the movement of the mount is estimated with the effects and is not the "
                 "camera's",
@@ -272,6 +277,10 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
             "gains_of_surrogates": [float(g) for g in np.sort(test.surrogates)],
         }
     statement = term.kind.sentence(estimates)
+    # the epochs with more than a quarter of the effect's largest movement
+    other = x.fitter.fit(fit.terms[:k] + fit.terms[k + 1 :], only=[0])
+    size = np.sqrt(np.maximum(e.squares(fit.parameters(0) - other.parameters(0)), 0.0))
+    large = np.flatnonzero(size > 0.25 * size.max())
     part = compare_shift_and_tilt(x.fitter, x.best.fit, k)
     if part is not None:
         evidence["shift_and_tilt"], clause = part
@@ -289,8 +298,10 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
         term.effect,
         statement,
         {
-            "parameters": acts_on(term.parameters),
-            "epochs": _find_epochs(x, fit, k),
+            "parameters": [
+                f"object {p[-1]}" if p in FIELD_SCALES else p for p in term.parameters
+            ],
+            "epochs": [int(e.numbers[large[0]]), int(e.numbers[large[-1]])],
             "image_region": None,
         },
         estimates, evidence, alternatives, term,
@@ -329,15 +340,6 @@ def _widen_estimates(
         name: {**e, "sd": max(e["sd"], other[name]["sd"])} if e["sd"] is not None else e
         for name, e in estimates.items()
     }
-
-
-def _find_epochs(x: Examination, fit: Fit, k: int) -> list[int]:
-    """Return the first and last epoch with more than a quarter of the effect's largest movement."""
-    e = x.fitter.series[0]
-    other = x.fitter.fit(fit.terms[:k] + fit.terms[k + 1 :], only=[0])
-    size = np.sqrt(np.maximum(e.squares(fit.parameters(0) - other.parameters(0)), 0.0))
-    large = np.flatnonzero(size > 0.25 * size.max())
-    return [int(e.numbers[large[0]]), int(e.numbers[large[-1]])]
 
 
 def _list_alternatives(x: Examination, term: Term, first: bool) -> list[dict[str, Any]]:

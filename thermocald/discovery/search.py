@@ -277,24 +277,30 @@ class Search:
     def with_events_moved(self, solution: Solution) -> Solution:
         """Move the events to the times at which they explain most beside the other effects.
 
-        They were found without some of these.
+        They were found without some of these: a further series may seem to hold an event because
+        that of the first one distorted their common rates. It is dropped if it is not worth it.
         """
         for i, term in enumerate(solution.terms):
             if not term.kind.is_event:
                 continue
-            same = (c for c in self.candidates if c.effect == term.effect)
-            candidate = next(c for c in same if c.parameters == term.parameters)
+            key = term.effect, term.parameters
+            candidate = next((c for c in self.candidates if (c.effect, c.parameters) == key), None)
+            if candidate is None:  # a knock of the mount
+                continue
             gains = self.scanner.scan(candidate, solution.fit).events
             for s, now in enumerate(term.fresh):
                 if now is None:
                     continue
                 time = float(self.fitter.series[s].times[int(np.argmax(gains[s])) + 1])
-                at = ((candidate.name, time),)
-                moved = replace(term, fresh=(*term.fresh[:s], at, *term.fresh[s + 1 :]))
-                terms = (*solution.terms[:i], moved, *solution.terms[i + 1 :])
-                trial = self.refine(terms, solution.penalties)
-                if trial.score < solution.score:
-                    solution, term = trial, moved
+                single = (len(term.parameters) + 2) * float(np.log(self.epochs))
+                for own, less in ((((candidate.name, time),), 0.0), (None, single))[: 1 + (s > 0)]:
+                    moved = replace(term, fresh=(*term.fresh[:s], own, *term.fresh[s + 1 :]))
+                    terms = (*solution.terms[:i], moved, *solution.terms[i + 1 :])
+                    penalties = list(solution.penalties)
+                    penalties[i] -= less
+                    trial = self.refine(terms, penalties)
+                    if trial.score < solution.score:
+                        solution, term = trial, moved
         return solution
 
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:

@@ -55,7 +55,7 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
     course_px = u[:, 0] * s[0]
     T = e.history.temperature()  # at all epochs, while the rows may be blocks of epochs
     recorded: dict[str, Array] = {
-        "temperature": e.averaged(T),
+        e.history.reference: e.averaged(T),
         "rate of temperature": e.averaged(_rate(T, e.history.times)),
         "time": e.times,
         "sigma0": e.sigma0,
@@ -80,7 +80,7 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
     statement = (
         f"something that no effect of the catalogue explains moves the image by {size:.3f} px RMS, "
         f"in {moving}; strongest correlation {correlation[strongest]:+.2f} with "
-        f"{strongest}. A smooth term bridges it in this series only"
+        f"{parameter_label(strongest)}. A smooth term bridges it in this series only"
     )
     return EffectFound(
         "unnamed",
@@ -314,5 +314,4 @@ def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
 def _rate(T: Array, times: Array) -> Array:
     """Return the rate (E,) of a temperature, K/s; several epochs may have the same time."""
     distinct, first = np.unique(times, return_index=True)
-    rate: Array = np.interp(times, distinct, np.gradient(T[first], distinct))
-    return rate
+    return np.asarray(np.interp(times, distinct, np.gradient(T[first], distinct)))

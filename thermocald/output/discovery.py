@@ -71,7 +71,7 @@ def _answer(d: Discovery) -> Answer:
     closing = [e for e, _, _ in by_gap]
     if closing:
         sentence = as_sentence(_statement(closing[0]))
-    elif d.examination.mount is not None:
+    elif mount_lines(d.examination):
         sentence = as_sentence(say_adequate(d.examination))
     else:
         sentence = (

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 from thermocald.physics.operators import OPERATORS
 
@@ -372,9 +373,13 @@ class Effect:
         """Write a sentence for a report; estimates: {parameter: {value, sd, unit}}."""
         texts = {}
         for name, estimate in estimates.items():
-            value = estimate["value"]
-            names = [value] if isinstance(value, str) else value
-            texts[name] = ", ".join(names) if isinstance(names, list) else say_estimate(estimate)
+            match estimate["value"]:
+                case str(channel):
+                    texts[name] = parameter_label(channel)
+                case list(targets):
+                    texts[name] = ", ".join(targets)
+                case _:
+                    texts[name] = say_estimate(estimate)
         if self.says:
             return self.says.format_map(texts)
         numbers = ", ".join(f"{name} = {value}" for name, value in texts.items())

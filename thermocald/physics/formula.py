@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.numbers import with_sd
+from thermocald.numbers import parameter_label, with_sd
 from thermocald.physics.effect import (
     PARAMETER_UNITS,
     Effect,
@@ -207,7 +207,10 @@ class Node:
         if self.operator == TIME:
             return "t"
         if self.is_leaf:
-            return "T" if self.name == reference and not self.operator else self.name
+            if self.name == reference and not self.operator:
+                return "T"
+            label = parameter_label(self.name)
+            return label if label.isalnum() else f'"{label}"'  # not taken for several quantities
         inner = [n.words(spoken, reference) for n in self.inputs]
         own = [spoken.get(str(c), f"{c:.4g}" if not isinstance(c, str) else c)
                for c in self.constants]  # fmt: skip
@@ -301,13 +304,24 @@ class Evaluator:
     def values(self, node: Node, at_knots: bool = False) -> Array:
         """Return the values (E,) of a bound formula at the frames, or (K,) at the knots."""
         key = (node, at_knots)
-        if key not in self._cache:
-            self._cache[key] = (
-                self._leaf(node, self.knots if at_knots else self.history.times)
-                if node.is_leaf
-                else node.kind.value(*self._arguments(node, at_knots))
+        if key in self._cache:
+            return self._cache[key]
+        at = self.knots if at_knots else self.history.times
+        if not node.is_leaf:
+            found = node.kind.value(*self._arguments(node, at_knots))
+        elif node.operator == TIME:
+            found = np.maximum(at, 0.0)
+        elif not node.operator:
+            found = self.history.polygon(node.name).at(at)
+        elif node.name in self.history.columns:
+            found = np.interp(at, *self.history.columns[node.name])
+        else:
+            raise DataError(
+                f"there is no recorded column {node.name!r}, which the formula reads; there "
+                f"are: {', '.join(self.history.columns) or 'none'}"
             )
-        return self._cache[key]
+        self._cache[key] = found
+        return found
 
     def _arguments(self, node: Node, at_knots: bool) -> tuple[Any, ...]:
         """Return the arguments of a node's operator: its inputs' values, or a polygon and times."""
@@ -316,18 +330,6 @@ class Evaluator:
         inner = self.values(node.inputs[0], at_knots=True)
         at = self.knots if at_knots else self.history.times
         return self.knots, inner, *node.constants, at
-
-    def _leaf(self, node: Node, at: Array) -> Array:
-        if node.operator == TIME:
-            return np.maximum(at, 0.0)
-        if node.operator:
-            if node.name not in self.history.columns:
-                raise DataError(
-                    f"there is no recorded column {node.name!r}, which the formula reads; there "
-                    f"are: {', '.join(self.history.columns) or 'none'}"
-                )
-            return np.interp(at, *self.history.columns[node.name])
-        return self.history.polygon(node.name).at(at)
 
     def sensitivity(self, node: Node, channel: str, at_knots: bool = False) -> csr_array:
         """Return ∂ values / ∂ readings of a channel, (E, R) or (K, R), sparse."""

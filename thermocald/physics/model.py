@@ -53,22 +53,7 @@ _POWERS = np.array([0, 0, 0, 2, 4, 6, 1, 1, 0, 0])  # of c, in the order of IOP_
 
 def follow_angle(linear: Array, c0: float) -> Array:
     """Return interior orientations (…, 10) whose distortion, valid at c0 mm, follows the angle."""
-    out: Array = linear * (c0 / linear[..., :1]) ** _POWERS
-    return out
-
-
-def angle_derivatives(linear: Array, c0: float, J: Array, by_c0: int | None = None) -> Array:
-    """Propagate ∂ linear / ∂ unknowns (…, 10, p) to the orientations of `follow_angle`.
-
-    by_c0: index of the unknown that is c0 itself, if any.
-    """
-    carried = follow_angle(linear, c0)
-    factors = carried * _POWERS
-    out: Array = J * ((c0 / linear[..., :1]) ** _POWERS)[..., None]
-    out = out - (factors / linear[..., :1])[..., None] * J[..., :1, :]
-    if by_c0 is not None:
-        out[..., by_c0] += factors / c0
-    return out
+    return np.asarray(linear * (c0 / linear[..., :1]) ** _POWERS)
 
 
 def distortion_along(iop: Array) -> Array:
@@ -219,8 +204,13 @@ class ThermalModel:
         """
         if self.distortion == "image":
             return J
-        place = list(names).index("interior.c") if "interior.c" in names else None
-        return angle_derivatives(linear, self.interior.c, J, place)
+        c0 = self.interior.c
+        factors = follow_angle(linear, c0) * _POWERS
+        out: Array = J * ((c0 / linear[..., :1]) ** _POWERS)[..., None]
+        out = out - (factors / linear[..., :1])[..., None] * J[..., :1, :]
+        if "interior.c" in names:
+            out[..., list(names).index("interior.c")] += factors / c0
+        return out
 
     def with_effect(self, effect: ModelEffect) -> ThermalModel:
         """Return the next version of the model, with a further effect."""

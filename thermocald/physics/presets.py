@@ -135,23 +135,8 @@ PRESETS: Mapping[str, Preset] = {
 """The presets, by name."""
 
 
-def _make_device(preset: Preset) -> CameraDevice:
-    """Return a camera module in a housing that cools in air: 63 % of the change in 300 s."""
-    loss = 0.2375
-    network = HeatNetwork(
-        {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
-        (
-            ("board", "housing", 6.0),
-            ("lens", "housing", 0.4),
-            ("sensor", "lens", 0.2),
-            ("housing", "ambient", loss),
-        ),
-    )
-    return CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
-
-
-def _make_programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
-    (loss,) = (g for _, second, g in device.network.links if second == "ambient")
+def _make_programme(preset: Preset, loss: float, series: str) -> Programme:
+    """Return the programme that heats by a lamp or from the board; loss: W/K to the air."""
     duration = (_EPOCHS - 1) * _INTERVAL_S
     ambient = preset.begin_degc if preset.lamp else 23.0
     power = loss * (preset.end_degc - ambient)
@@ -180,8 +165,17 @@ def preset_simulation(
     if name not in PRESETS:
         raise ConfigurationError(f"unknown preset {name!r}; known are: {', '.join(PRESETS)}")
     preset = PRESETS[name]
-    device = _make_device(preset)
-    programme = _make_programme(preset, device, series)
+    # a camera module in a housing that cools in air: 63 % of the change in 300 s
+    loss = 0.2375
+    links = (
+        ("board", "housing", 6.0),
+        ("lens", "housing", 0.4),
+        ("sensor", "lens", 0.2),
+        ("housing", "ambient", loss),
+    )
+    network = HeatNetwork({"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4}, links)
+    device = CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
+    programme = _make_programme(preset, loss, series)
     test_field = corner_field() if field is None else field
     bare = ThermalModel(
         preset.camera,

@@ -40,12 +40,13 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.series import ReducedSeries
 
-WAVES = 24
+_WAVES = 24
 _LEAST = 0.2  # variance of a half-wave, in units of the image noise, from which it is a state
 _TINY = 1e-6
 _FLOOR = 3.0
 _LITTLE = 1e-3  # of the best determined direction's gain in precision
 _FAST = 8  # order of differences that leaves little but jumps
+_KINKS = 3 * (_FAST + 1)  # differences that a lamp switched three times may bend
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ class Mount:
         size, directions = self.modes()
         out = []
         for e in series:
-            K = min(WAVES, len(e.times) // 2)
+            K = _count_waves(e)
             k = np.arange(1, K + 1)
             sd = np.sqrt(size[:, None] / (self.corner**2 + k**2))
             out.append(replace(e, movement=Movement(directions, waves(e.times, K), sd)))
@@ -101,11 +102,15 @@ class Mount:
     def size_px(self, e: ReducedSeries) -> float:
         """Return the movement's expected RMS, px, over image points and time."""
         size, _ = self.modes()
-        K = min(WAVES, len(e.times) // 2)
-        falling = 1.0 / (self.corner**2 + np.arange(1, K + 1) ** 2)
+        falling = 1.0 / (self.corner**2 + np.arange(1, _count_waves(e) + 1) ** 2)
         power = float(np.sum(size)) * float(np.sum(falling))
         coordinates = 2.0 * float(e.n.mean()) * len(e.times)
         return float(e.sigma_px * np.sqrt(power / max(coordinates, 1.0)))
+
+
+def _count_waves(e: ReducedSeries) -> int:
+    """Return the number of half-waves of the mount; faster movement is a tremble."""
+    return min(_WAVES, len(e.times) // 2)
 
 
 def find_combinations(series: Sequence[ReducedSeries]) -> Array:
@@ -130,7 +135,7 @@ def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
     for s, e in enumerate(fitter.series):
         w = fit.weightings[s]
         z = subtract_level(w.N, w.left(fit.parameters(s))) @ W
-        A = waves(e.times, min(WAVES, len(e.times) // 2)).T @ z
+        A = waves(e.times, _count_waves(e)).T @ z
         k = np.arange(1, len(A) + 1)
         total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
         count += len(A)
@@ -273,17 +278,16 @@ def _subtract_fit(fitter: HypothesisFitter, fit: Fit, series: int) -> Array:
 def detect_tremble(evidence: ReducedSeries) -> bool:
     """Return whether all targets jump together from epoch to epoch.
 
-    The test uses differences of an order so high that nothing that follows a temperature remains:
-    no effect is assumed, and no thermometer's error matters.
+    The test uses differences of an order so high that nothing that follows a temperature remains
+    but its kinks, the largest of them: no effect is assumed, and no thermometer's error matters.
     """
     W = find_combinations([evidence])
     d = np.diff((evidence.values @ evidence.N.mean(axis=0) @ W)[evidence.n > 0], _FAST, axis=0)
-    if len(d) < criteria.FEWEST:
+    if len(d) < _KINKS:
         return False
-    spread = mad_sd(d, axis=0)
-    usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
+    calm = np.argsort(np.sum(d**2, axis=1))[: max(len(d) - _KINKS, len(d) // 2)]
     white = comb(2 * _FAST, _FAST) / evidence.correlation
-    return _find_directions(d[usual], white, np.zeros((len(W.T), len(W.T))), _FAST) is not None
+    return _find_directions(d[calm], white, np.zeros((len(W.T), len(W.T))), _FAST) is not None
 
 
 def _find_directions(
@@ -295,8 +299,6 @@ def _find_directions(
     the differences. Returns variance factors (m,) and orthonormal directions (m, m).
     """
     n, m = d.shape
-    if n < criteria.FEWEST:
-        return None
     # differences are correlated: of n second ones, 18/35 are independent
     shared = np.array([comb(2 * order, k) for k in range(2 * order + 1)], dtype=float)
     independent = n * shared[order] ** 2 / np.sum(shared**2)
@@ -325,15 +327,29 @@ def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> Redu
     return turned.with_values(evidence.values)
 
 
-def add_tremble(fitter: HypothesisFitter, fit: Fit, slower: int) -> list[ReducedSeries]:
+def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
     """Return the series with the movement from epoch to epoch as a random movement of each epoch.
 
-    slower: the number of slowest half-waves, which are accounted for otherwise.
+    It is measured by the mean power of the fast half-waves of the fit's misfit, without the
+    thermometers' share; the slow ones are the mount's.
     """
     out = []
     for s, e in enumerate(fitter.series):
-        M, W = _measure_fast_power(fitter, fit, s, slower)
-        edge = (1.0 + np.sqrt(len(M) / max(len(e.times) - slower, 1))) ** 2
+        W = find_combinations([e])
+        fast = waves(e.times, len(e.times) - 1)[:, _count_waves(e) :].T
+        z = fast @ (_subtract_fit(fitter, fit, s) @ W)
+        M = z.T @ z / len(fast)  # the unit matrix if there is image noise only
+        for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, s):
+            if operator is None:
+                continue
+            carried = fast @ operator
+            noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
+            # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
+            taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
+            left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
+            along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
+            M -= left * np.outer(along, along)
+        edge = (1.0 + np.sqrt(len(M) / (len(e.times) - _count_waves(e)))) ** 2
         factors, U = np.linalg.eigh(M)
         clear = factors > criteria.BEYOND * edge  # more than so few half-waves show by chance
         D = W @ (U[:, clear] * np.sqrt(factors[clear] - 1.0))
@@ -342,32 +358,6 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit, slower: int) -> list[Reduced
         D = np.column_stack([D, W[:, more] * np.sqrt(rest[more] - 1.0)])
         out.append(replace(e, tremble=D) if D.shape[1] else e)
     return out
-
-
-def _measure_fast_power(
-    fitter: HypothesisFitter, fit: Fit, series: int, slower: int
-) -> tuple[Array, Array]:
-    """Return the mean power (m, m) of the fast half-waves of a fit's misfit, and W (P, m).
-
-    W are the determined combinations of the parameters. The power is the unit matrix if there is
-    image noise only; the thermometers' share is subtracted.
-    """
-    e = fitter.series[series]
-    W = find_combinations([e])
-    fast = waves(e.times, len(e.times) - 1)[:, slower:].T
-    z = fast @ (_subtract_fit(fitter, fit, series) @ W)
-    power: Array = z.T @ z / len(fast)
-    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
-        if operator is None:
-            continue
-        carried = fast @ operator
-        noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
-        # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
-        taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
-        left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
-        along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
-        power -= left * np.outer(along, along)
-    return power, W
 
 
 def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:

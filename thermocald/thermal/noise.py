@@ -151,6 +151,8 @@ def _estimate_slope(
         return total
 
     reach = max(float(np.max(np.abs(c))) for c in trajectories)
+    if reach == 0.0:  # a thermometer that is stuck
+        return 0.0, 0.0, float("inf")
     low = min(float(np.min(c)) for c in trajectories)
     high = max(float(np.max(c)) for c in trajectories)
     bounds = (-0.995 / max(high, 1e-9), 0.995 / max(-low, 1e-9))

@@ -112,18 +112,6 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
     )
 
 
-def require_change(source: SeriesInput, reference: str, channel: Thermometer) -> None:
-    """Raise DataError if the reference temperature does not change enough."""
-    trajectory = channel.trajectory[np.isfinite(channel.trajectory)]
-    change = float(np.ptp(trajectory))
-    if change < max(criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * channel.noise):
-        raise DataError(
-            f"{source.name}: the temperature {reference!r} is constant within "
-            f"{change:.2f} K; thermal effects cannot be separated from others. "
-            "Record a series in which it changes by 5 K or more"
-        )
-
-
 _HALF = 2  # neighbours on either side
 _PART = 2048  # epochs at a time
 _LAGS = 20  # epochs, of autocorrelations
@@ -291,8 +279,16 @@ def reduce_series(
         float(np.mean(trajectory)) if T0 is None else T0,
         source.polygons(),
     )
-    if strict:
-        require_change(source, reference, instruments[reference])
+    change = float(np.ptp(trajectory))
+    least_change = max(
+        criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * instruments[reference].noise
+    )
+    if strict and change < least_change:
+        raise DataError(
+            f"{source.name}: the temperature {reference!r} is constant within "
+            f"{change:.2f} K; thermal effects cannot be separated from others. "
+            "Record a series in which it changes by 5 K or more"
+        )
     at = linearise_series(source)
     offsets = mean_misclosure(source, at)
     bad = find_misplaced(offsets, at.iop[0] / source.sensor.pixel_pitch, FAR_ELSEWHERE)

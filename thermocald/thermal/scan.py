@@ -144,7 +144,8 @@ def gains_beside(
 
     parts: of each series A (G, k, k), c (G, k, n) of the candidate, B (G, k, K) with the base's
     unknowns, whose normal equations are base_A (K, K), base_c (K, n). The list has one element, or
-    one for each series if every series has its own coefficients.
+    one for each series if every series has its own coefficients. -inf is for negligible
+    trajectories.
     """
     change: Array | float = 0.0
     if candidate.kind.is_drive:  # it replaces T: the base's own rates are dropped
@@ -153,8 +154,18 @@ def gains_beside(
         parts = [(A, c, B[..., rest]) for A, c, B in parts]
         change = explained(base_A, base_c, _RIDGE) - whole
     by_series = candidate.kind.is_event or candidate.kind.is_periodic
-    sets = [[p] for p in parts] if by_series else [parts]
-    return [_sum_gains(some, base_A, base_c) + change for some in sets]
+    K, n = base_c.shape
+    out = []
+    for some in [[p] for p in parts] if by_series else [parts]:
+        A, c, B = (np.asarray(sum(p[i] for p in some)) for i in range(3))
+        if K:  # the base is eliminated
+            right = np.column_stack([base_c, B.reshape(-1, K).T])
+            X = scaled_solve(base_A, right, _RIDGE)
+            A = A - np.einsum("gir,rgj->gij", B, X[:, n:].reshape(K, *c.shape[:2]))
+            c = c - B @ X[:, :n]
+        weak = np.einsum("gii->gi", A).min(axis=1) < _FAINT
+        out.append(np.where(weak[:, None], -np.inf, explained(A, c, 1e-9)) + change)
+    return out
 
 
 def normals_beside(
@@ -212,18 +223,6 @@ def normals_of_term(
         centred = (trajectory - trajectory.mean())[:, None]
         further.append((np.tile(centred, k), unit_directions(names), np.arange(k)))
     return normals_beside(fit, further, k, weightings, leave)
-
-
-def _sum_gains(parts: Sequence[tuple[Array, Array, Array]], base_A: Array, base_c: Array) -> Array:
-    """Sum the parts and eliminate the base; return χ² (G, n), -inf for negligible trajectories."""
-    A, c, B = (np.asarray(sum(p[i] for p in parts)) for i in range(3))
-    K, n = base_c.shape
-    if K:
-        X = scaled_solve(base_A, np.column_stack([base_c, B.reshape(-1, K).T]), _RIDGE)
-        A = A - np.einsum("gir,rgj->gij", B, X[:, n:].reshape(K, *c.shape[:2]))
-        c = c - B @ X[:, :n]
-    weak = np.einsum("gii->gi", A).min(axis=1) < _FAINT
-    return np.where(weak[:, None], -np.inf, explained(A, c, 1e-9))
 
 
 _RIDGE = 1e-12  # of a unit diagonal
@@ -329,7 +328,19 @@ def relinearise(
     e = fitter.series[series]
     if e.blocks is not None:
         return None
-    bend = _compute_bend(fitter, fit, series, beyond)
+    # the image's movement beyond first order, without its mean
+    moved = fit.parameters(series) + (0.0 if beyond is None else beyond)
+    rest = np.einsum("epq,eq->p", e.N, e.values - moved)
+    # levels of combinations that the field cannot determine stay unchanged
+    step = moved + np.linalg.lstsq(e.N.sum(axis=0), rest, rcond=1e-6)[0]
+    parameters = step / e.scale
+    points = e.source.field.points * (1.0 + parameters[:, None, 16:])
+    seen = project(e.source.sensor, e.orientations(parameters),
+                   e.at.eop + parameters[:, 10:16], points)  # fmt: skip
+    straight = e.at.predicted + np.einsum("tik,ek->eti", e.columns, step)
+    there = e.weights[..., :1] > 0
+    bend = np.where(there, np.nan_to_num(seen - straight), 0.0)
+    bend = np.where(there, bend - bend.sum(axis=0) / np.maximum(there.sum(axis=0), 1), 0.0)
     change = bend if e.bend is None else bend - e.bend
     if float(np.sqrt(np.mean(change**2))) < _WORTH_PX:
         return None
@@ -344,23 +355,3 @@ def relinearise(
         hidden=e.hidden.less(change) if e.hidden else None,
         bend=bend,
     )
-
-
-def _compute_bend(fitter: HypothesisFitter, fit: Fit, series: int, beyond: Array | None) -> Array:
-    """Return the image's movement (E, T, 2) px beyond first order, without its mean."""
-    e = fitter.series[series]
-    moved = fit.parameters(series) + (0.0 if beyond is None else beyond)
-    rest = np.einsum("epq,eq->p", e.N, e.values - moved)
-    # levels of combinations that the field cannot determine stay unchanged
-    level = np.linalg.lstsq(e.N.sum(axis=0), rest, rcond=1e-6)[0]
-    step = moved + level
-    parameters = step / e.scale
-    points = e.source.field.points * (1.0 + parameters[:, None, 16:])
-    seen = project(e.source.sensor, e.orientations(parameters),
-                   e.at.eop + parameters[:, 10:16], points)  # fmt: skip
-    straight = e.at.predicted + np.einsum("tik,ek->eti", e.columns, step)
-    there = e.weights[..., :1] > 0
-    bend = np.where(there, np.nan_to_num(seen - straight), 0.0)
-    total = np.maximum(there.sum(axis=0), 1)
-    out: Array = np.where(there, bend - bend.sum(axis=0) / total, 0.0)
-    return out

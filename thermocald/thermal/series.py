@@ -326,10 +326,16 @@ def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
     def gain(start: int, stop: int) -> float:
         return nonlinear(start, stop) + _ALL_MOVEMENT * every(start, stop)
 
-    first = _cut_evenly(evidence.times, rows // 2)
+    # first blocks of equal duration, in whole days for a long series
+    span = float(evidence.times[-1] - evidence.times[0])
+    length = span / max(rows // 2, 1)
+    if span > _DAYS * _DAY_S:
+        length = np.ceil(length / _DAY_S) * _DAY_S
+    number = np.floor((evidence.times - evidence.times[0]) / max(length, 1e-9))
+    first: list[int] = np.flatnonzero(np.diff(number, prepend=-1.0) > 0).tolist()
     heap: list[tuple[float, int, int]] = []
-    for start, stop in zip(first, np.append(first[1:], E), strict=True):
-        heapq.heappush(heap, (-gain(int(start), int(stop)), int(start), int(stop)))
+    for start, stop in zip(first, [*first[1:], E], strict=True):
+        heapq.heappush(heap, (-gain(start, stop), start, stop))
     done: list[int] = []
     while heap and len(heap) + len(done) < rows:
         _, start, stop = heapq.heappop(heap)
@@ -342,16 +348,6 @@ def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
         for part in ((start, middle), (middle, stop)):
             heapq.heappush(heap, (-gain(*part), *part))
     return np.array(sorted([*done, *(start for _, start, _ in heap)]), dtype=np.int64)
-
-
-def _cut_evenly(times: Array, most: int) -> NDArray[np.int64]:
-    """Return the first epochs of blocks of equal duration, in whole days for a long series."""
-    span = float(times[-1] - times[0])
-    length = span / max(most, 1)
-    if span > _DAYS * _DAY_S:
-        length = np.ceil(length / _DAY_S) * _DAY_S
-    number = np.floor((times - times[0]) / max(length, 1e-9))
-    return np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
 
 
 def _remove_rates(evidence: ReducedSeries) -> Array:

@@ -88,7 +88,7 @@ def condensed(
         length = size * int(np.clip(0.5 * spare / size, _SHORTEST, _LONGEST))
         count = max(int(spare / length), 1)
         chosen = _choose_fast_windows(
-            trajectory, _average_neighbours(_fill_temperature(series), fine), length // fine, count
+            trajectory, _average_temperature(series, fine), length // fine, count
         )
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
         inside = [(rows.first >= w.start) & (rows.first < w.stop) for w in windows]
@@ -138,24 +138,16 @@ def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
     )
 
 
-def _fill_temperature(series: SeriesInput) -> Array:
-    """Return the reference temperature (E,) of the epochs, interpolated linearly across gaps."""
-    if not series.readings:
-        return np.zeros(len(series.frame_times))
-    values = np.asarray(next(iter(series.readings.values())), dtype=float)
-    there = np.isfinite(values)
-    if not there.any():
-        return np.zeros(len(values))
-    out: Array = np.interp(np.arange(len(values)), np.flatnonzero(there), values[there])
-    return out
-
-
-def _average_neighbours(values: Array, size: int) -> Array:
-    """Return averages (⌈E / size⌉, …) over `size` neighbours each."""
+def _average_temperature(series: SeriesInput, size: int) -> Array:
+    """Return averages (⌈E / size⌉,) of the reference temperature, interpolated across gaps."""
+    values = np.zeros(len(series.frame_times))
+    for readings in list(series.readings.values())[:1]:
+        there = np.flatnonzero(np.isfinite(readings))
+        if len(there):
+            values = np.interp(np.arange(len(values)), there, readings[there])
     starts = np.arange(0, len(values), size)
-    count = np.diff(np.append(starts, len(values)))
-    total = np.add.reduceat(values, starts, axis=0)
-    return np.asarray(total / count.reshape(-1, *(1,) * (values.ndim - 1)))
+    total = np.add.reduceat(values, starts)
+    return np.asarray(total / np.diff(np.append(starts, len(values))))
 
 
 def _average_epochs(

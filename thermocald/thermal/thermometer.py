@@ -315,9 +315,7 @@ def smooth_channel(
     t, y = times[own], readings[own]
     there = np.isfinite(y)
     smooth = filled = np.interp(t, t[there], y[there])
-    if passed is not None:
-        smooth = filled
-    elif valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
+    if passed is None and valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
         smooth = _smooth(filled, there.astype(float), noise)
     trajectory, sd = np.full(len(times), np.nan), np.full(len(times), 1e-6)
     trajectory[own] = smooth

@@ -10,13 +10,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.daemon.conftest import make_recording, replayed_camera
 from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.acquisition.thermometers import Thermometers
 from thermocald.config import parse_config
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.live_state import status_warnings
-from thermocald.daemon.plan import check_series, plan_cameras
+from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.service import Service
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
@@ -64,12 +66,50 @@ def test_a_temperature_that_a_series_began_without_is_reported_once(tmp_path, ca
         epoch = Epoch(number, 1e9 + number, 1e9, {channels: 20.0})
         keeper.keep(AcquiredEpoch(number, replace(frame, utc=1e9 + number), True, epoch))
     kinds = [event.kind for event in guard.store.events()]
-    with pytest.raises(ConfigurationError, match=r"temperatures \(temperature\), without lens; ch"):
-        check_series(plan_of(), keeper.series, ["temperature", "lens"])
-    check_series(plan_of(), keeper.series, ["temperature"])
     guard.close()
     assert kinds == ["series_begun", "channel_unknown"]
     assert caplog.text.count("series M1 began without lens: no analysis") == 1
+
+
+AIR, CASE = ({"name": name, "driver": "mock"} for name in ("air", "case"))
+UNNAMED = {"name": "u", "driver": "replay"}
+GONE = {"faults": [{"kind": "unplugged", "at_s": 0, "for_s": 1e9}]}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "why"),
+    [
+        ([AIR, CASE], [CASE, AIR], None),
+        ([AIR, CASE], [AIR, {**CASE, **GONE}], None),
+        ([{**AIR, **GONE}, CASE], [AIR, CASE], None),
+        ([AIR], [CASE], None),  # of one thermometer, the column is `temperature`
+        ([UNNAMED], [UNNAMED], None),  # regression: refused at each start after the first
+        ([UNNAMED, AIR], [UNNAMED, AIR], None),
+        ([AIR], [AIR, CASE], r"thermometers \(temperature\), not air, case; give those, or choose"),
+    ],
+)  # fmt: skip
+def test_a_start_is_refused_only_for_other_thermometers(tmp_path, before, after, why):
+    recording = make_recording(tmp_path / "R", 2)
+    for name in ("recording.yaml", "epochs.csv"):
+        text = (recording / name).read_text()
+        text = text.replace("temperature:", "lens:").replace(",temperature,", ",lens,")
+        (recording / name).write_text(text)
+
+    def start(thermometers):
+        devices = [{**one, "recording": str(recording)} if one["name"] == "u" else one
+                   for one in thermometers]  # fmt: skip
+        names = [one["name"] for one in thermometers]
+        document = {"cameras": [replayed_camera(recording, name="r", thermometers=names)],
+                    "thermometers": devices, "frames": {"keep": "none"}}  # fmt: skip
+        config = parse_config(document, tmp_path / "config.yaml")
+        assert Service(config, fast=True, epochs=1, until_finished=True).run()
+
+    start(before)
+    if why is None:
+        start(after)
+    else:
+        with pytest.raises(ConfigurationError, match=why):
+            start(after)
 
 
 def test_a_long_series_does_not_keep_its_next_epochs_waiting(tmp_path, monkeypatch):

@@ -87,10 +87,9 @@ class Pipeline:
     """The queue of one camera, with a thread that calibrates and one that stores.
 
     calibrator: None if epochs are only acquired; names: of the camera's thermometers, the reference
-    first; patience_s: how long to wait
-    for a reading that is being taken, by default 2 s, at most half a period; observe: (a calibrated
-    epoch, whether it comes in order) → the epoch to be stored; on_lost: receives why an acquired
-    epoch was not stored.
+    first; patience_s: how long to wait for a reading that is being taken, by default 2 s, at most
+    half a period; observe: (a calibrated epoch, whether it comes in order) → the epoch to be
+    stored; on_lost: receives why an acquired epoch was not stored.
     """
 
     def __init__(

@@ -98,7 +98,7 @@ class Thermometers:
         self.links: dict[str, Link] = {}
         self._cameras = config.cameras
         self._devices: dict[str, Thermometer] = {}
-        self._channels: dict[str, tuple[str, ...]] = {}  # as declared, then as read
+        self._channels: dict[str, tuple[str, ...]] = {}  # as named by the options, then as read
         self._periods_s = {one.name: one.period_s for one in config.thermometers}
         self._kept: dict[str, deque[Reading]] = {}
         self._missed: set[tuple[str, str]] = set()  # channels that were reported as missing
@@ -118,7 +118,8 @@ class Thermometers:
             self._channels[one.name] = tuple(device.named_channels())
             count = max(_REMEMBERED, round(_REMEMBERED_S / one.period_s))
             self._kept[one.name] = deque(maxlen=count)
-        self._require(self._channels, ConfigurationError)
+        self._named = self._channels
+        self._require(self._named, ConfigurationError)
 
     def _require(self, channels: Mapping[str, Sequence[str]], error: type[Exception]) -> None:
         for camera in self._cameras:
@@ -131,6 +132,10 @@ class Thermometers:
         """
         channels = {name: self._channels[name] or ("temperature",) for name in names}
         return require_columns(channels, ConfigurationError)
+
+    def named_columns(self, names: Sequence[str]) -> list[str]:
+        """Return the columns that the options name, not those that a device names when opened."""
+        return require_columns({name: self._named[name] for name in names}, ConfigurationError)
 
     def identity(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Return the identities of some thermometers, by name."""

@@ -110,7 +110,7 @@ class SeriesRun:
             plan, runtime.guard, line.frames, self._kept, line.identity, start=start
         )
         if (stored := self.keeper.series) is not None:
-            check_series(plan, stored, line.thermometers.columns(plan.config.thermometers))
+            check_series(plan, stored, line.thermometers.named_columns(plan.config.thermometers))
         calibrator = plan.calibrator
         self._calibrator = calibrator if isinstance(calibrator, Calibrator) else None
         self.observer = self._make_observer()

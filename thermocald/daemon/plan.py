@@ -214,20 +214,23 @@ def series_head(
 
 
 def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]) -> None:
-    """Raise ConfigurationError if a continued series would change its test field or channels."""
+    """Raise ConfigurationError if a continued series would change its test field or channels.
+
+    channels: those that the configuration names; their order does not matter.
+    """
     mine, field = plan.testfield, series.testfield
+    had = series.head.channels
     what = ""
     if mine is not None and not (
         mine.names == field.names and np.array_equal(mine.points, field.points)
     ):
-        what = "another test field"
-    elif new := [name for name in channels if name not in series.head.channels]:
-        had = ", ".join(series.head.channels) or "none"
-        what = f"other temperatures ({had}), without {', '.join(new)}"
+        what = "another test field; give that one"
+    elif new := [name for name in channels if name not in had]:
+        what = f"other thermometers ({', '.join(had) or 'none'}), not {', '.join(new)}; give those"
     if what:
         raise ConfigurationError(
-            f"camera {plan.name!r}: series {plan.series!r} was begun with {what}; choose another "
-            "series"
+            f"camera {plan.name!r}: series {plan.series!r} was begun with {what}, or choose "
+            "another series"
         )
 
 

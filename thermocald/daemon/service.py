@@ -124,10 +124,10 @@ class Service:
     """A daemon in this process.
 
     path: the configuration file, which SIGHUP reloads; with_options: changes what is read there as
-    the command line demands; until_finished: stop when all recordings
-    have been played or all epochs taken, instead of serving requests at the control socket;
-    on_turn: called in every turn, stops the service by returning True; clock: a virtual clock, on
-    which rendered devices take no time. For the other arguments see `Runtime`.
+    the command line demands; until_finished: stop when all recordings have been played or all
+    epochs taken, instead of serving requests at the control socket; on_turn: called in every turn,
+    stops the service by returning True; clock: a virtual clock, on which rendered devices take no
+    time. For the other arguments see `Runtime`.
     """
 
     def __init__(

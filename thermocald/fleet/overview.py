@@ -308,9 +308,6 @@ def _clock(camera: FleetCamera) -> Findings:
     clock = camera.state.clock
     if clock is not None and abs(clock) > _CLOCK_S:
         offset = f"{short_duration(abs(clock))} {'ahead of' if clock > 0 else 'behind'}"
-        yield (
-            "clock",
-            f"its station's clock is {offset} the server's; epochs have its time",
-        )
+        yield "clock", f"its station's clock is {offset} the server's; epochs have its time"
     elif camera.lag_s < -_FUTURE_S:
         yield "clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future"

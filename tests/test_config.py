@@ -9,12 +9,9 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from thermocald.config import Config, InteriorName, ParameterName, load_config, parse_config
 from thermocald.errors import ConfigurationError
-from thermocald.files import dump_yaml
 from thermocald.hal import driver_names, load_driver
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES, PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -152,26 +149,6 @@ def test_options_are_checked_against_the_driver():
         parse(camera(seed="b"), load_driver=load_driver)
     with pytest.raises(ConfigurationError, match=r"\[0\].driver: there is no camera driver"):
         parse(camera(driver="nikon"), load_driver=load_driver)
-
-
-@settings(
-    max_examples=200,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(at=st.integers(0, 400), put=st.binary(max_size=10))
-def test_any_damage_to_the_text(tmp_path, at, put):
-    path = tmp_path / "config.yaml"
-    text = dump_yaml(document()).encode()
-    path.write_bytes(text[: at % len(text)] + put + text[at % len(text) + len(put) :])
-    try:
-        load_config(path)
-    except ConfigurationError as error:
-        message = str(error)
-    else:
-        return
-    assert message.startswith(str(path))
 
 
 def test_the_comments_of_config_yaml_name_drivers_that_exist():

@@ -16,7 +16,6 @@ import thermocald as tc
 from tests.commands import call
 from tests.drivers.fakes.sysfs import Sysfs
 from tests.store.small import write_recording
-from tests.store.test_crafted import change
 from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline
 from thermocald.acquisition.thermometers import Thermometers, require_columns
 from thermocald.config import parse_config
@@ -161,19 +160,6 @@ def test_a_recording_with_a_column_of_ours_is_refused_when_it_is_opened(tmp_path
     for command in ("check", "replay", "study", "fit --output m.yaml", "discover"):
         done = call(*command.split(), tmp_path / "M1", folder=tmp_path)
         assert "'sigma0': it is the name of a column" in done.stderr
-
-
-def test_names_with_marks_are_quoted_in_the_csv_of_the_page(tmp_path):
-    """A store may be older than the refusal of such names."""
-    head = Head("a", "M1", 10.0, CameraSpec("cam", Sensor(640, 480, 0.001)), {"left": Channel()})
-    with Store.open(tmp_path / "t.db", "append") as store:
-        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
-        store.append(series, Epoch(1, 1e9, 1e9, {"left": 20.0}))
-    change(tmp_path / "t.db", "UPDATE series SET head = replace(head, 'left', 'Diode, left')")
-    text = "".join(View(tmp_path / "t.db", tmp_path).csv("cam", "M1"))
-    header, row = csv.reader(io.StringIO(text))
-    assert len(header) == len(row)
-    assert "Diode, left" in header
 
 
 def test_the_reference_keeps_its_place_when_it_is_not_read():

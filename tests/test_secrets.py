@@ -23,7 +23,7 @@ from thermocald import addresses
 from thermocald.acquisition.device_loop import Link
 from thermocald.addresses import CleanFormatter, hide_secrets, without_secrets
 from thermocald.errors import ConfigurationError, DeviceDenied, DeviceGone, UsageError
-from thermocald.hal import Device, DriverOptions, SystemClock, VirtualClock, open_device
+from thermocald.hal import Device, DriverOptions, SystemClock
 from thermocald.store.server.connection import ServerAddress
 
 SECRET = "hunter2"
@@ -219,9 +219,6 @@ def test_what_is_no_secret_stays(text):
 @pytest.mark.parametrize("address", ADDRESSES[:3])
 def test_a_webhook_refuses_a_user_and_quotes_nothing(tmp_path, address):
     options = {"url": address, "when": [{"no_result": 3}]}
-    with pytest.raises(ConfigurationError, match="url: ") as told:
-        open_device("output", "alert_webhook", options, VirtualClock())
-    assert SECRET not in str(told.value)
     document = {
         "thermometers": [{"name": "t", "driver": "mock"}],
         "outputs": [{"name": "hook", "driver": "alert_webhook", **options}],
@@ -230,6 +227,7 @@ def test_a_webhook_refuses_a_user_and_quotes_nothing(tmp_path, address):
     for command in (["check"], ["check", "--probe"], ["run", "--config"]):
         done = call(*command, tmp_path / "config.yaml", folder=tmp_path)
         assert done.returncode == 2
+        assert "url: " in done.stderr
         assert SECRET not in done.stderr + done.stdout
 
 

@@ -22,11 +22,6 @@ def read(options, times):
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def test_programme_is_followed_and_held():
-    options = {"programme": [[0, 20], [100, 40], [200, 30]], "channels": {"t": QUIET}}
-    assert read(options, [0, 50, 100, 150, 500])["t"].tolist() == [20, 30, 40, 35, 30]
-
-
 def test_lag_against_the_differential_equation():
     times, values, lag = np.array([0.0, 100.0, 250.0]), np.array([20.0, 50.0, 30.0]), 40.0
     instants = np.linspace(0, 600, 61)

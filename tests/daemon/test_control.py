@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -85,6 +86,22 @@ def test_it_listens_again_after_its_folder_was_deleted(ear, caplog):
         ear.ensure_open()
     assert ask(ear.folder, "session status")["ok"]
     assert [t.name for t in threading.enumerate()].count("control") == 1
+
+
+def test_it_listens_again_after_it_failed(ear, monkeypatch):
+    """Regression: without a free file descriptor for once, no session could begin any more."""
+
+    def fail(channel):
+        monkeypatch.undo()
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(socket.socket, "accept", fail)
+    assert ask(ear.folder, "session status")["ok"]  # by the call of `accept` that waits already
+    deadline = time.monotonic() + 5.0
+    while "control" in [t.name for t in threading.enumerate()] and time.monotonic() < deadline:
+        time.sleep(0.01)
+    ear.ensure_open()
+    assert ask(ear.folder, "session status")["ok"]
 
 
 HOSTILE = [

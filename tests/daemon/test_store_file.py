@@ -41,8 +41,8 @@ def keeping(path, durable=False) -> StoreGuard:
     series = create_small_series(guard.store, start="cold")
     guard.told = {}
 
-    def keep(number: int) -> None:
-        row = Row(series, small_epoch(number), small_result(number), {}, True)
+    def keep(number: int, time_s: float = 1e9) -> None:
+        row = Row(series, small_epoch(number, time_s), small_result(number), {}, True)
         guard.told[number] = guard.append(row)
 
     guard.keep = keep

@@ -69,22 +69,6 @@ def test_by_call(clock, small, device, kind, error):
         assert outcomes(mock, 6) == ["ok", error, error, error, "ok", "ok"]
 
 
-def test_by_time_and_open_fails_too(clock):
-    faults = [{"kind": "unplugged", "at_s": 60, "for_s": 30}]
-    device = open_device("thermometer", "mock", {"faults": faults, "conversion_s": 0}, clock)
-    device.open()
-    assert outcomes(device, 1) == ["ok"]
-    clock.sleep_until(60.0)
-    assert outcomes(device, 2) == ["DeviceGone"] * 2
-    device.close()
-    with pytest.raises(DeviceGone):
-        device.open()
-    clock.sleep_until(90.0)
-    device.open()
-    assert outcomes(device, 1) == ["ok"]
-    device.close()
-
-
 def test_stuck_repeats_the_value_with_new_instants(clock):
     options = {"faults": [{"kind": "stuck", "at": 3, "count": 3}]}
     with open_device("thermometer", "mock", options, clock) as device:

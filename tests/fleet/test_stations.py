@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import psycopg
 import pytest
 
 from tests.fleet.conftest import address, count, execute
@@ -14,7 +13,7 @@ from thermocald.fleet.forward import Cursor, Forwarder
 from thermocald.fleet.overview import add_findings, read_overview
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event, LoggedReading
-from thermocald.store.server.connection import ServerAddress, create_tables
+from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.fleet_reader import FleetReader
 
 
@@ -75,35 +74,6 @@ def test_one_station_that_got_a_new_store_is_no_twin(server, two):
     Forwarder(two[1], place, "gauge-7").send_waiting()
     with FleetReader(place) as fleet:
         assert fleet.stations()["gauge-7"].stores == 1
-
-
-def test_another_database_gets_every_row(server, two):
-    with psycopg.connect(server.address(), autocommit=True) as connection:
-        connection.execute("DROP DATABASE IF EXISTS elsewhere WITH (FORCE)")
-        connection.execute("CREATE DATABASE elsewhere")
-    elsewhere = ServerAddress.parse(server.address(name="elsewhere"))
-    create_tables(elsewhere)
-    for place in (address(server), elsewhere):
-        assert Forwarder(two[0], place, "gauge-7").send_waiting().rows == 5
-        assert Forwarder(two[0], place, "gauge-7").send_waiting().rows == 0
-
-
-def test_a_restored_or_another_store_under_the_old_name_is_sent_from_its_start(server, two):
-    place = address(server)
-    kept = two[0].with_name("backup.db")
-    with Store.open(two[0]) as store:
-        store.copy_to(kept)
-        identity = store.identity
-    assert Forwarder(two[0], place, "a").send_waiting().rows == 5
-    two[0].unlink()
-    shutil.copyfile(kept, two[0])
-    with Store.open(two[0]) as store:
-        assert store.identity == identity  # a copy is the same store
-    Forwarder(two[0], place, "a").send_waiting()
-    assert count(server, "epoch") == 5  # nothing twice
-    shutil.copyfile(two[1], two[0])
-    Forwarder(two[0], place, "a").send_waiting()
-    assert count(server, "epoch") == 10
 
 
 ONE = "postgresql://owner:secret@db.example:5432/thermocald?sslmode=require&host=/run/a"

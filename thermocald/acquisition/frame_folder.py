@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.files import is_unmounted, mount_point
+from thermocald.machine import NOT_BEFORE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _DAY_S = 86400.0
-_NOT_BEFORE = 1_700_000_000.0
 _GB = 1e9
 _PER_FOLDER = 1000
 _NUMBER = re.compile(r"\d{4,}")
@@ -90,10 +90,9 @@ class FrameFolder:
             self.paused = ""
         return relative
 
-    def keep_corrected(self, relative: Path, jpeg: bytes) -> Path | None:
-        """Write a corrected frame beside the original; return as `keep`."""
-        beside = _beside(relative)
-        return beside if self._write(beside, jpeg) else None
+    def keep_corrected(self, relative: Path, jpeg: bytes) -> None:
+        """Write a corrected frame beside the original; if that fails, `paused` is the reason."""
+        self._write(_beside(relative), jpeg)
 
     def delete(self, relative: Path) -> None:
         """Delete a frame and its corrected frame, if they exist."""
@@ -123,8 +122,8 @@ class FrameFolder:
         if config.max_age_days is not None and now_utc is not None:
             limit = now_utc - config.max_age_days * _DAY_S
             # a time before this program existed: the clock was not set, the age is unknown
-            old = [f for f in files if _NOT_BEFORE <= f[0] < limit]
-            files = [f for f in files if not _NOT_BEFORE <= f[0] < limit]
+            old = [f for f in files if NOT_BEFORE <= f[0] < limit]
+            files = [f for f in files if not NOT_BEFORE <= f[0] < limit]
             deleted += self._delete(old, f"older than {config.max_age_days:g} days")
         surplus, why = 0, ""
         if config.max_size_gb is not None:

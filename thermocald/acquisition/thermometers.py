@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from thermocald.acquisition.device_loop import Link
 from thermocald.errors import ConfigurationError, WrongDevice
@@ -137,10 +137,6 @@ class Thermometers:
         """Return the columns that the options name, not those that a device names when opened."""
         return require_columns({name: self._named[name] for name in names}, ConfigurationError)
 
-    def identity(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """Return the identities of some thermometers, by name."""
-        return {name: self.links[name].identity() for name in names}
-
     def read(self, name: str) -> Reading:
         """Read a thermometer that is open, and store the reading; raises DeviceError."""
         reading = self._devices[name].read()
@@ -151,10 +147,9 @@ class Thermometers:
         """Read those of some thermometers that are read with frames up to a frame's time, s."""
         with self._reading:
             for name in self.with_frames.intersection(names):
+                read = partial(self.links[name].do, partial(self.read, name))
                 for _ in range(_MOST_AT_ONCE):
-                    if self._is_near(name, monotonic):
-                        break
-                    if not self.links[name].do(partial(self.read, name)):
+                    if self._is_near(name, monotonic) or not read():
                         break
 
     def add(self, name: str, reading: Reading) -> None:

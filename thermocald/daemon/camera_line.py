@@ -288,7 +288,8 @@ class CameraLine:
 
     def identity(self) -> dict[str, Any]:
         """Return the identities that the camera and its thermometers report."""
-        thermometers = self.thermometers.identity(self.plan.config.thermometers)
+        names = self.plan.config.thermometers
+        thermometers = {name: self.thermometers.links[name].identity() for name in names}
         return {**self.link.identity(), **({"thermometers": thermometers} if thermometers else {})}
 
     @property

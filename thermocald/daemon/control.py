@@ -84,11 +84,11 @@ class ControlSocket:
         self._failed = False
 
     def ensure_open(self) -> None:
-        """Listen, and do so again after somebody has deleted the socket's file or its folder.
+        """Listen, also again after a failure, or after the socket's file or folder was deleted.
 
         If that fails, log it once: the daemon works without the socket.
         """
-        if self._socket is not None and os.path.exists(self._folder / _NAME):
+        if self._thread.is_alive() and os.path.exists(self._folder / _NAME):
             return
         self.close()
         channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)

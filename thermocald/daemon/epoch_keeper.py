@@ -97,7 +97,7 @@ class EpochKeeper:
             return []
 
     def last_seen(self) -> tuple[float | None, int]:
-        """Return the fingerprint of the last stored frame that was measured, and its epoch."""
+        """Return the fingerprint of the last stored frame if it was measured, and its epoch."""
         for stored in self.read(self.first_number - 1, details=False):
             if stored.result.n_observations or stored.result.status == "repeated_frame":
                 return stored.extra.get("fingerprint"), stored.epoch.number

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -221,17 +220,6 @@ def test_a_new_store_in_the_place_of_the_old_is_sent_from_its_start(
         Forwarder(path, address(server), "bank").send_waiting()
         path.unlink()
     assert count(server, "epoch") == 8
-
-
-def test_two_forwarders_at_once_do_no_harm(filled, server, tmp_path):
-    store, _ = filled
-
-    def send(name):
-        Forwarder(store.path, address(server), "bank", tmp_path / name, batch=2).send_waiting()
-
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(send, ("a", "b", "c", "d")))  # none fails
-    assert count(server, "epoch") == 20
 
 
 def test_addresses():

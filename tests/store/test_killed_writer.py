@@ -72,20 +72,6 @@ def test_a_full_disk(store_path, head, field, make_epoch, make_result, request):
         assert store.last_epoch(series) == last
 
 
-def test_space_again_after_a_full_disk(store_path, head, field, make_epoch, make_result):
-    """SQLite's own limit of pages gives the error of a full disk."""
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        store._db.execute("PRAGMA max_page_count = 60")
-        last = fill(store, series, make_epoch, make_result)
-        store._db.execute("PRAGMA max_page_count = 100000")
-        for number in range(last + 1, last + 30):
-            store.append(series, make_epoch(number), make_result(number))
-        assert store.examine().damaged == ()
-        found = store.series_columns(series, ["c"])["c"]
-        assert found.tolist() == [make_result(i).values[0] for i in range(1, last + 30)]
-
-
 def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):
     with pytest.raises(RecordingError, match="cannot be written"):
         write_recording(tmp_path / "r", head, field, map(make_epoch, range(10_000)))

@@ -224,9 +224,10 @@ def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]
     if mine is not None and not (
         mine.names == field.names and np.array_equal(mine.points, field.points)
     ):
-        what = "another test field; give that one"
+        what = "another test field; configure that one"
     elif new := [name for name in channels if name not in had]:
-        what = f"other thermometers ({', '.join(had) or 'none'}), not {', '.join(new)}; give those"
+        there = ", ".join(had) or "none"
+        what = f"other thermometers ({there}), not {', '.join(new)}; configure those"
     if what:
         raise ConfigurationError(
             f"camera {plan.name!r}: series {plan.series!r} was begun with {what}, or choose "

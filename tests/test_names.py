@@ -23,7 +23,7 @@ from thermocald.daemon.epoch_keeper import result_row
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice
 from thermocald.hal import Frame, Reading, VirtualClock, open_device
-from thermocald.names import channel_fault, require_channels
+from thermocald.names import channel_fault
 from thermocald.output.dashboard.view import View
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -180,11 +180,6 @@ def test_the_reference_keeps_its_place_when_it_is_not_read():
     assert epoch.temperatures["air"] == 12.0
     row = result_row(SimpleNamespace(name="cam", series="M1"), epoch, None, {})
     assert np.isnan(row["temperature"])
-
-
-def test_two_names_are_never_one():
-    with pytest.raises(ConfigurationError, match="two channels"):
-        require_channels(["a", "b", "a"], "here", ConfigurationError)
 
 
 @settings(max_examples=30, deadline=None)

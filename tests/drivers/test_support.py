@@ -28,9 +28,3 @@ def test_an_instant_on_the_clock_is_not_off_by_a_pause(pauses):
     monotonic, on_utc = support.on_clock(InterruptedClock(pauses), begin - 1.0)
     assert monotonic == pytest.approx(begin - 1.0, abs=0.002)
     assert on_utc == pytest.approx(utc - 1.0, abs=0.002)
-
-
-@pytest.mark.parametrize("text", ["2_5.0", "nan", "inf", "1e300", "٢٥", "0x19", "", "1,5", "--1"])
-def test_texts_that_are_not_numbers(text):
-    with pytest.raises(ValueError, match="not a plain decimal number"):
-        support.parse_number(text)

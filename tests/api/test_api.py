@@ -325,6 +325,9 @@ def test_what_is_wrong_is_said(M1, camera):
 
 OUT_OF_BOUNDS = {
     "window is -1": lambda M1, field: tc.study(M1, window=-1),
+    "clusters_mm is 3; it must be a list .each a number.": lambda M1, field: tc.reference_study(
+        clusters_mm=3
+    ),
     "grid is 0; it must be from 2 to 9": lambda M1, field: tc.study(M1, grid=0),
     "distance_mm is 0": lambda M1, field: tc.reference_study(distance_mm=0.0),
     "2 labels for 1 series": lambda M1, field: tc.study(M1, labels=["a", "b"]),

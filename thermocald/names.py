@@ -233,18 +233,17 @@ def _accepts(kind: Any, value: Any) -> bool:
         return False
     if origin is Any:
         return True
-    if origin in (bool, float) and getattr(value, "ndim", None) == 0:  # of NumPy, xarray, …
-        return not isinstance(value, str)
+    if getattr(value, "ndim", None) == 0:  # of NumPy, xarray, …
+        value = value.item()
     if isinstance(value, bool) and origin in (int, float):
         return False
     if not isinstance(value, _KINDS.get(origin, (origin,))[0]):
         return False
     if origin not in _KINDS or not inner or not isinstance(value, Collection):
         return True  # an iterator can be read only once
-    if isinstance(value, Mapping):
-        return all(_accepts(inner[1], one) for one in value.values())
     if isinstance(value, str):  # a list of its letters is never meant
         return False
-    if origin is tuple:
-        return len(inner) == len(value) and all(map(_accepts, inner, value))
-    return all(_accepts(inner[0], one) for one in value)
+    if isinstance(value, Mapping):
+        inner, value = inner[1:], value.values()
+    each = inner if origin is tuple else inner[:1] * len(value)
+    return len(each) == len(value) and all(map(_accepts, each, value))

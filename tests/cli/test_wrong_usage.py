@@ -56,6 +56,8 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),
+        (("study", "M1", "--report", "a.html", "--json", "./a.html"), r"would be \./a\.html"),
+        (("fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h"), "--json: both would be a"),
         # its `--report / --no-report` shares its name with files of other commands
         (("session", "start", "--camera", "a", "--config", "no.yaml"), r"error: no\.yaml: "),
     ],
@@ -155,17 +157,6 @@ def test_every_option_that_says_that_it_writes_is_looked_at():
             told = getattr(one, "help", None) or ""
             if re.match(r"(Also )?[Ww]rite|The .* to write", told):
                 assert (name, one.name) in OUTPUTS
-
-
-def test_one_file_for_two_results_is_refused(tmp_path):
-    words = ("study", "nowhere", "--report", "a.html", "--json", "./a.html")
-    status, lines = _typed(*words, folder=tmp_path)
-    assert (status, lines) == (2, ["error: --report and --json: both would be ./a.html"])
-    status, lines = _typed(
-        "fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h", folder=tmp_path
-    )
-    assert status == 2
-    assert "both would be" in lines[0]
 
 
 def test_outputs_that_can_be(tmp_path):

@@ -369,21 +369,6 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
         assert server.stderr.read() == ""
 
 
-def test_a_series_is_read_page_by_page(client_of, monkeypatch):
-    """Only one page of rows is in memory, and no transaction is open between pages."""
-    from thermocald.output.dashboard import view
-    from thermocald.store.database import columns
-
-    asked = []
-    page = columns.read_page
-    monkeypatch.setattr(view, "_ROWS_AT_ONCE", 100)
-    monkeypatch.setattr(columns, "read_columns", None)
-    monkeypatch.setattr(columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
-    answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
-    assert len(answer.text.splitlines()) == 1201
-    assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]
-
-
 def test_the_table_of_a_series_without_epochs_has_its_header(tmp_path):
     head = Head("rpi", "M1", 10.0, CameraSpec("rpi", Sensor(64, 48, 0.003)), {"t": Channel()})
     with Store.open(tmp_path / "t.db", "append", durable=False) as store:

@@ -124,7 +124,7 @@ def _list_knocks(x: Examination) -> list[dict[str, Any]]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Discovery:
     """The result of a discovery.
 

@@ -174,11 +174,12 @@ def test_outputs_that_can_be(tmp_path):
         check_output(tmp_path / "/proc/a.csv")
 
 
-def test_a_file_that_is_no_store_gets_no_page(tmp_path):
+@pytest.mark.parametrize(("file", "said"), [("notes.txt", "is not a"), ("no.db", "does not exist")])
+def test_what_is_no_store_gets_no_page(tmp_path, file, said):
     (tmp_path / "notes.txt").write_text("a gauge")
-    status, lines = _typed("dashboard", "--store", tmp_path / "notes.txt")
+    status, lines = _typed("dashboard", "--store", tmp_path / file)
     assert (status, len(lines)) == (1, 1)
-    assert "notes.txt: is not a store" in lines[0]
+    assert f"{file}: {said}" in lines[0]
 
 
 def test_an_input_in_a_closed_folder_cannot_be_read(monkeypatch):

@@ -245,7 +245,12 @@ def draw(sheet: Sheet) -> Any:
     crop_marks(pen, sheet.size)
     rulers(pen, sheet.size)
     _legend(pen, sheet)
-    # the common letter at each edge that meets another sheet
+    _edge_letters(pen, sheet)
+    return pen.figure
+
+
+def _edge_letters(pen: Pen, sheet: Sheet) -> None:
+    """Write the common letter at each edge that meets another sheet."""
     (w, h), size = sheet.size, 3.0
     places = {
         "left": (1.5, 0.75 * h),
@@ -254,7 +259,6 @@ def draw(sheet: Sheet) -> Any:
     }
     for side, letter in sheet.edges.items():
         pen.text(*places[side], letter, size, color=GREY)
-    return pen.figure
 
 
 def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:

@@ -29,7 +29,7 @@ from thermocald.figures import (
     new_drawing,
     tick_text,
 )
-from thermocald.numbers import parameter_label, plain, shortened, with_sd
+from thermocald.numbers import enumerated, parameter_label, plain, shortened, with_sd
 from thermocald.photogrammetry.linalg import best_level
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
@@ -496,7 +496,7 @@ def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str
     score = f"(−2 log L plus penalty) is {worse:,.0f} worse"
     if x.adequate and name.split(" ")[0] in best:
         if len(best) > 1:
-            return f"named, together with {' and '.join(n for n in best if n != name)}."
+            return f"named, together with {enumerated([n for n in best if n != name])}."
         return f"named: its misfit of {left:.3f} px is the noise."
     if any(name.split(" ")[0] in r.names for r in x.rivals):
         return f"cannot be excluded: its score {score} only."

@@ -283,8 +283,8 @@ def check(
     show(document, json, *document["lines"])
     if damaged := document.get("damaged"):
         raise DataError(
-            f"{source}: {counted(len(damaged), 'place')} damaged, the first: {damaged[0]}; restore a "
-            "backup, or use what can still be read"
+            f"{source}: {counted(len(damaged), 'place')} damaged, the first: {damaged[0]}; restore "
+            "a backup, or use what can still be read"
         )
     probes = document.get("probes", [])
     failed = [probe["name"] for probe in probes if probe["error"]]

@@ -10,14 +10,13 @@ a file's name holds no separator and no control character.
 
 from __future__ import annotations
 
-import builtins
 import functools
 import inspect
 import os
 import stat
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from itertools import chain, cycle
+from contextlib import suppress
+from itertools import chain, repeat
 from numbers import Integral, Real
 from pathlib import Path, PurePosixPath
 from types import FunctionType, NoneType, UnionType
@@ -158,28 +157,14 @@ _KINDS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "True or False"),
     float: (Real, "a number"),
     int: (Integral, "a whole number"),
-    tuple: (Collection, "a tuple"),
-    Iterable: (Iterable, "a list"),
-    Sequence: (Iterable, "a list"),
+    tuple: (Collection, "a tuple ({})"),
+    Iterable: (Iterable, "a list (each {})"),
+    Sequence: (Iterable, "a list (each {})"),
     Mapping: (Mapping, "a mapping"),
     Callable: (Callable, "a function"),
 }
 # of a class: the function that returns it
 _MADE_BY = {"Series": "open", "ThermalCamera": "fit", "TestField": "read_testfield"}
-
-
-class _Unknown(type):
-    """The type of a name that only type checkers import; with all its parts, it is any type."""
-
-    def __getattr__(cls, _: str) -> _Unknown:
-        return cls
-
-    __getitem__ = __getattr__
-
-
-_ANYTHING = _Unknown("_ANYTHING", (), {})
-_UNKNOWN = (_ANYTHING, Any, inspect.Parameter.empty)
-_UNIONS = (Union, UnionType)
 
 
 def checked(public: Public) -> Public:
@@ -195,54 +180,63 @@ def checked(public: Public) -> Public:
                 setattr(public, name, classmethod(checked(member.__func__)))
         return public
 
+    named_in_order = inspect.getfullargspec(public)
+
     @functools.cache
-    def annotations() -> tuple[list[str], dict[str, Any]]:  # when its module is imported whole
-        names = defaultdict(lambda: _ANYTHING, vars(builtins) | public.__globals__)
-        found = inspect.signature(public, locals=names, eval_str=True).parameters.values()
-        in_order = [p.name for p in found if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
-        return in_order, {p.name: p.annotation for p in found}
+    def kinds() -> dict[str | None, Any]:  # when its module is imported whole
+        found: dict[str | None, Any] = {}
+        for name in public.__annotations__.keys() - {"return"}:
+            with suppress(NameError):  # only type checkers import it: any value is accepted
+                found[name] = eval(public.__annotations__[name], public.__globals__)
+        return found
 
     @functools.wraps(public)
     def called(*given: Any, **named: Any) -> Any:
-        in_order, kinds = annotations()
-        names = chain(in_order, cycle(in_order[-1:]))  # the last may stand for several: *series
+        names = chain(named_in_order.args, repeat(named_in_order.varargs))  # *series is several
         for name, value in (*zip(names, given, strict=False), *named.items()):
-            if not _accepts(kinds.get(name, Any), value):
-                wanted = _in_words(kinds[name])
-                wanted += " without a NUL character" * ("\\x00" in repr(value))
-                raise UsageError(f"{name} is {repr(value)[:80]}; it must be {wanted}")
+            kind = kinds().get(name, Any)
+            if not _accepts(kind, value):
+                without = " without a NUL character" * ("\\x00" in repr(value))
+                raise UsageError(
+                    f"{name} is {repr(value)[:80]}; it must be {_in_words(kind)}{without}"
+                )
         return public(*given, **named)
 
     return cast("Public", called)
 
 
+def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Return an annotation's type and its elements' types; tuple[X, ...] is a list of X."""
+    inner = get_args(kind)
+    return (Sequence, inner[:1]) if Ellipsis in inner else (get_origin(kind) or kind, inner)
+
+
 def _in_words(kind: Any) -> str:
     """Return what a message calls the values of an annotation: `a list (each a number)`."""
-    if get_origin(kind) in _UNIONS:
-        return " or ".join(_in_words(one) for one in get_args(kind) if one is not NoneType)
-    origin, inner = get_origin(kind) or kind, get_args(kind)
-    if origin not in _KINDS:
-        name = origin.__name__
-        made = f" (from {_MADE_BY[name]})" if name in _MADE_BY else ""
-        return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{made}"
-    each = {tuple: "", Iterable: "each ", Sequence: "each "}.get(origin)
-    of = "" if each is None else f" ({each}{', '.join(map(_in_words, inner))})"
-    return f"{_KINDS[origin][1]}{of}"
+    origin, inner = _parts(kind)
+    if origin in (Union, UnionType):
+        return " or ".join(_in_words(one) for one in inner if one is not NoneType)
+    if origin in _KINDS:
+        words = _KINDS[origin][1]
+        return words.format(", ".join(map(_in_words, inner))) if "{" in words else words
+    name = origin.__name__
+    made = f" (from {_MADE_BY[name]})" if name in _MADE_BY else ""
+    return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{made}"
 
 
 def _accepts(kind: Any, value: Any) -> bool:
     """Return whether a value and its elements are what an annotation says."""
-    if get_origin(kind) in _UNIONS:
-        return any(_accepts(one, value) for one in get_args(kind))
-    origin, inner = get_origin(kind) or kind, get_args(kind)
-    if origin in (int, float) and isinstance(value, bool):
-        return False
+    origin, inner = _parts(kind)
+    if origin in (Union, UnionType):
+        return any(_accepts(one, value) for one in inner)
     if isinstance(value, str | os.PathLike) and "\0" in str(value):
         return False
-    if origin in _UNKNOWN or not isinstance(origin, type):
+    if origin is Any:
         return True
-    if origin in (bool, float) and getattr(value, "ndim", None) == 0:  # of NumPy, xarray, …
-        return not isinstance(value, str)
+    if getattr(value, "ndim", None) == 0:  # of NumPy, xarray, …
+        value = value.item()
+    if isinstance(value, bool) and origin in (int, float):
+        return False
     if not isinstance(value, _KINDS.get(origin, (origin,))[0]):
         return False
     if origin not in _KINDS or not inner or not isinstance(value, Collection):
@@ -250,7 +244,6 @@ def _accepts(kind: Any, value: Any) -> bool:
     if isinstance(value, str):  # a list of its letters is never meant
         return False
     if isinstance(value, Mapping):
-        return all(_accepts(inner[1], one) for one in value.values())
-    if origin is tuple and Ellipsis not in inner:
-        return len(inner) == len(value) and all(map(_accepts, inner, value))
-    return all(_accepts(inner[0], one) for one in value)
+        inner, value = inner[1:], value.values()
+    each = inner if origin is tuple else inner[:1] * len(value)
+    return len(each) == len(value) and all(map(_accepts, each, value))

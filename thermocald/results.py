@@ -79,7 +79,7 @@ class Study(Result, studies.Study):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Discovery(Result, discoveries.Discovery):
+class Discovery(discoveries.Discovery, Result):
     """The effects that explain where simulation and measurement disagree.
 
     verdict: `adequate`, `effects_found` or `unexplained`; effects: the effects found, each with
@@ -89,8 +89,6 @@ class Discovery(Result, discoveries.Discovery):
 
     name: str = ""
     before: ThermalModel | None = None
-
-    as_dict = discoveries.Discovery.as_dict
 
     def lines(self) -> list[str]:
         """Return what `thermocald discover` prints."""
@@ -285,11 +283,8 @@ class Calibration(Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FieldCheck(Result, checks.FieldCheck):
+class FieldCheck(checks.FieldCheck, Result):
     """How well a camera sees a test field, what it would calibrate, and what is missing."""
-
-    as_dict = checks.FieldCheck.as_dict
-    lines = checks.FieldCheck.lines
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text."""

@@ -74,10 +74,7 @@ def test_every_public_function_has_an_example():
     assert functions <= names
 
 
-def test_a_series_says_what_it_is(M1):
-    assert repr(M1) == (
-        "<Series rpi-v2.1/M1: 150 epochs, 147 targets, 25.0 to 50.0 °C (reference: temperature)>"
-    )
+def test_a_series_has_a_time_for_each_epoch(M1):
     assert len(M1.time) == len(M1) == 150
     assert M1.time.dtype == np.dtype("datetime64[us]")
 
@@ -312,19 +309,15 @@ def test_a_model_and_a_programme_are_simulated(inside, tmp_path):
     np.testing.assert_allclose(series.truth[0], series.simulation.truth.iop[0])
 
 
-def test_what_is_wrong_is_said(M1, camera):
-    with pytest.raises(UsageError, match="must be one of per_epoch"):
-        M1.calibrate(exterior="still")
-    with pytest.raises(UsageError, match="fahrenheit"):
-        camera.at(95.0)
-    with pytest.raises(DataError, match="there is no such file or folder"):
-        tc.import_photographs("nothing", log="x.csv", testfield="M1/testfield.csv")
-    with pytest.raises(ConfigurationError, match="0×0 px is impossible"):
-        camera.live(size=(0, 0))
-
-
 OUT_OF_BOUNDS = {
+    "must be one of per_epoch": lambda M1, field: M1.calibrate(exterior="still"),
+    "there is no such file or folder": lambda M1, field: tc.import_photographs(
+        "nothing", log="x.csv", testfield="M1/testfield.csv"
+    ),
     "window is -1": lambda M1, field: tc.study(M1, window=-1),
+    "clusters_mm is 3; it must be a list .each a number.": lambda M1, field: tc.reference_study(
+        clusters_mm=3
+    ),
     "grid is 0; it must be from 2 to 9": lambda M1, field: tc.study(M1, grid=0),
     "distance_mm is 0": lambda M1, field: tc.reference_study(distance_mm=0.0),
     "2 labels for 1 series": lambda M1, field: tc.study(M1, labels=["a", "b"]),
@@ -362,6 +355,8 @@ OF_A_CAMERA = {
     "to is 'image'; it must be an InteriorOrientation": lambda camera: camera.at(35.0).undistort(
         [[1, 2]], to="image"
     ),
+    "fahrenheit": lambda camera: camera.at(95.0),
+    "0×0 px is impossible": lambda camera: camera.live(size=(0, 0)),
     "give one time": lambda camera: camera.live().update([0.0, 60.0], 30.0),
     "distance_mm is -1": lambda camera: camera.at(35.0).object_error(-1),
     "image points: must be an array \\(n, 2\\)": lambda camera: camera.at(35.0).undistort(
@@ -411,13 +406,13 @@ def test_every_argument_is_checked():
 
 @pytest.mark.parametrize("message", OUT_OF_BOUNDS)
 def test_an_argument_out_of_bounds_is_refused(inside, M1, message):
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises((UsageError, DataError), match=message):
         OUT_OF_BOUNDS[message](M1, M1.testfield)
 
 
 @pytest.mark.parametrize("message", OF_A_CAMERA)
 def test_what_no_camera_can_answer_is_refused(camera, message):
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises((UsageError, ConfigurationError), match=message):
         OF_A_CAMERA[message](camera)
 
 
@@ -514,15 +509,3 @@ def test_a_script_of_a_user_runs(inside, tmp_path, monkeypatch):
     assert set(files) == {"ros-10.yaml", "ros-40.yaml"}
     assert all("distortion_model: plumb_bob" in text for text in files.values())
     assert files["ros-10.yaml"] != files["ros-40.yaml"]
-
-
-def test_what_a_page_shows_of_python_runs(inside, tmp_path, monkeypatch, recwarn):
-    """A quick page; all are run by tests/docs/test_commands.py."""
-    page = Path(__file__).resolve().parents[2] / "docs/how-to/thermal-model.md"
-    shutil.copy(inside / "camera.yaml", tmp_path / "camera.thermal.yaml")
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
-
-    assert blocks
-    for block in blocks:
-        exec(compile(block, str(page), "exec"), {"__name__": "page"})

@@ -302,12 +302,6 @@ def test_what_the_logger_did_not_measure_is_left_empty(place, values, left):
         assert np.isfinite(at_frame).all()  # between the readings on both sides
 
 
-def test_a_reading_that_leaps_is_told_and_kept(place):
-    log_of(place, [21.0, 21.1, 21.1, 43.7, 21.3, 21.4, 21.5, 21.6])
-    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert "1 reading of 'Temperature' leaping away and back (the first 43.7 °C" in result.stderr
-
-
 @pytest.mark.parametrize(
     ("later", "words"),
     [

@@ -75,6 +75,14 @@ def write_rows(path, head: str, rows: list[str]) -> None:
     path.write_text("\n".join([head, *rows]) + "\n")
 
 
+@pytest.fixture
+def gauge(tmp_path):
+    """A gauge in a folder: its model, log, control points, surface and image points."""
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    return tmp_path
+
+
 def called(folder, *more: object):
     done = call(
         "measure", folder / "points.csv", "--model", folder / "model.yaml", "--log",
@@ -160,21 +168,31 @@ def test_places_on_a_profile_scatter_as_its_survey():
     assert stated[:, 2].min() > 15.0
 
 
-def test_the_level_is_printed(tmp_path):
+def test_the_level_is_printed_and_heights_that_contradict_each_other_are_said(tmp_path):
     level(tmp_path, 1)
     text = measured(tmp_path).stdout
     assert "2023-11-15 04:13:20 UTC, level of 2 places: 138.39" in text
+    assert "contradict" not in text
+    head, moved, *rest = (tmp_path / "points.csv").read_text().splitlines()
+    *begin, y, sx, sy = moved.split(",")
+    moved = ",".join([*begin, f"{float(y) + 30:.1f}", sx, sy])
+    (tmp_path / "points.csv").write_text("\n".join([head, moved, *rest]) + "\n")
+    assert "the places contradict each other" in measured(tmp_path).stdout
 
 
-def test_what_is_printed(tmp_path):
-    """Well checked control points are not doubted."""
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    done = measured(tmp_path, "--json", tmp_path / "places.json")
+def test_what_is_printed(gauge):
+    """Well checked control points are not doubted; a level in another height system is.
+
+    Seen at the Geul: 92.36 m at its gauge is 138.27 m in the control points' heights.
+    """
+    done = measured(gauge, "--json", gauge / "places.json")
     assert re.search(r"3 places; pose from 12 control points, sigma0 \d\.\d\d\n", done.stdout)
     assert re.search(r"\nstone 1 .*313020", done.stdout)
-    document = json.loads((tmp_path / "places.json").read_text())
+    document = json.loads((gauge / "places.json").read_text())
     assert (document["pose"]["unchecked"], document["refused"]) == ([], [])
+    assert "heights" not in done.stderr
+    (gauge / "water.yaml").write_text("level: 92.4\nsd: 0.005\n")
+    assert "water.yaml: is 47 m away from control points" in measured(gauge).stderr
 
 
 @pytest.mark.parametrize(
@@ -193,43 +211,28 @@ def test_what_is_printed(tmp_path):
      ("points.csv", "time,name,x,y,sx,sy\n1700021600,a,1640,1700,0,0.2\n", "must be above 0"),
      ("points.csv", "time,name,x,y,sx,sy\n1600000000,old,1640,1700,0.2,0.2\n", "outside the temp")],
 )  # fmt: skip
-def test_what_cannot_be_measured_is_one_line(tmp_path, file, content, words):
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    (tmp_path / file).write_text(content)
-    done = called(tmp_path)
+def test_what_cannot_be_measured_is_one_line(gauge, file, content, words):
+    (gauge / file).write_text(content)
+    done = called(gauge)
     assert done.returncode in (1, 2)
     assert words in " ".join(done.stderr.split())
 
 
-def test_what_is_doubtful_in_the_log_is_told_and_its_gaps_are_refused(tmp_path):
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    log = tmp_path / "log.csv"
+def test_what_is_doubtful_in_the_log_is_told_and_its_gaps_are_refused(gauge):
+    log = gauge / "log.csv"
     head, *rows = log.read_text().splitlines()
     spiked = [f"{r.split(',')[0]},85.0" if i == 40 else r for i, r in enumerate(rows)]
     log.write_text("\n".join([head, *spiked]) + "\n")
     words = "warning: .*log.csv: 1 reading of 'temperature' given without a measurement"
-    assert re.search(words, measured(tmp_path).stderr)
+    assert re.search(words, measured(gauge).stderr)
     log.write_text("\n".join([head, *rows[:100], *rows[-20:]]) + "\n")
-    done = called(tmp_path)
+    done = called(gauge)
     assert done.returncode == 1
     assert "or in a gap of over ten of its intervals" in done.stderr
 
 
-def test_a_level_in_another_height_system_is_doubtful(tmp_path):
-    """Seen at the Geul: 92.36 m at its gauge is 138.27 m in the control points' heights."""
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    assert "heights" not in measured(tmp_path).stderr
-    (tmp_path / "water.yaml").write_text("level: 92.4\nsd: 0.005\n")
-    assert "water.yaml: is 47 m away from control points" in measured(tmp_path).stderr
-
-
 def of_points(folder, change):
     """Run `measure` after a change {column: text} of each row of gcp.csv."""
-    write_model(folder / "model.yaml")
-    world(folder, 1)
     with (folder / "gcp.csv").open() as file:
         rows = list(csv.DictReader(file))
     with (folder / "gcp.csv").open("w", newline="") as out:
@@ -262,26 +265,15 @@ def beyond_the_camera(_, row):
      (lambda i, r: {} if i else {n: 100 * float(r[n]) for n in "XYZ"}, "g0: is 3"),
      (lambda i, r: {"y": float(r["y"]) + (0, 90, -50, 0, 70, -30)[i % 6]}, "contradict the ot")],
 )  # fmt: skip
-def test_control_points_that_cannot_be_are_one_line_that_says_why(tmp_path, change, words):
-    done = of_points(tmp_path, change)
+def test_control_points_that_cannot_be_are_one_line_that_says_why(gauge, change, words):
+    done = of_points(gauge, change)
     (line,) = done.stderr.strip().splitlines()
     assert (done.returncode, words in line) == (1, True), line
 
 
-def test_standard_deviations_in_another_unit_are_doubted(tmp_path):
-    done = of_points(tmp_path, lambda _, r: {n: 1000 * float(r[n]) for n in ("sX", "sY", "sZ")})
+def test_standard_deviations_in_another_unit_are_doubted(gauge):
+    done = of_points(gauge, lambda _, r: {n: 1000 * float(r[n]) for n in ("sX", "sY", "sZ")})
     assert "far better than their standard deviations say: are sX, sY, sZ in m" in done.stdout
-
-
-def test_heights_of_one_time_that_contradict_each_other_are_said(tmp_path):
-    level(tmp_path, 1)
-    points = (tmp_path / "points.csv").read_text().splitlines()
-    moved = points[1].split(",")
-    moved[3] = f"{float(moved[3]) + 30:.1f}"
-    (tmp_path / "points.csv").write_text(
-        "\n".join([points[0], ",".join(moved), *points[2:]]) + "\n"
-    )
-    assert "the places contradict each other" in measured(tmp_path).stdout
 
 
 def posed(world: World, seen: Observations, camera: Camera):
@@ -388,27 +380,23 @@ def test_what_an_error_may_do_unnoticed_is_what_it_does():
     assert f"by {still.unnoticed_mm:.0f} mm unnoticed" in still.lines()[0]
 
 
-def test_a_row_without_a_temperature_is_left_out_and_the_others_are_measured(tmp_path):
+def test_a_row_without_a_temperature_is_left_out_and_the_others_are_measured(gauge):
     """The thermometer failed for an hour; once, the whole day was refused."""
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    head, *rows = (tmp_path / "log.csv").read_text().splitlines()
+    head, *rows = (gauge / "log.csv").read_text().splitlines()
     hour = range(1000, 1360)
     gap = [r for k, r in enumerate(rows) if k not in hour]
-    (tmp_path / "log.csv").write_text("\n".join([head, *gap]) + "\n")
-    with (tmp_path / "points.csv").open("a") as file:
+    (gauge / "log.csv").write_text("\n".join([head, *gap]) + "\n")
+    with (gauge / "points.csv").open("a") as file:
         file.write(f"{rows[1180].split(',')[0]},in the gap,1640,1700,0.2,0.2\n")
-    done = called(tmp_path, "--json", tmp_path / "places.json")
-    document = json.loads((tmp_path / "places.json").read_text())
+    done = called(gauge, "--json", gauge / "places.json")
+    document = json.loads((gauge / "places.json").read_text())
     assert [place["name"] for place in document["places"]] == ["stone 0", "stone 1", "stone 2"]
     assert [one["line"] for one in document["refused"]] == [5]
     assert "points.csv, line 5: its temperature is not known" in done.stderr
     assert (done.returncode, done.stderr.count("error")) == (1, 1)
 
 
-def test_control_points_seen_while_the_thermometer_failed_are_named(tmp_path):
-    write_model(tmp_path / "model.yaml")
-    world(tmp_path, 1)
-    done = called(tmp_path, "--seen", f"{MORNING - 7200:.0f}")
+def test_control_points_seen_while_the_thermometer_failed_are_named(gauge):
+    done = called(gauge, "--seen", f"{MORNING - 7200:.0f}")
     assert done.returncode == 1
     assert f"--seen {MORNING - 7200:.0f}: the log" in done.stderr

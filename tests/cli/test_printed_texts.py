@@ -58,12 +58,6 @@ def test_a_study_of_a_minute_and_a_path_in_one_piece(minute, undrawn):
     assert report.exists()
 
 
-def test_folders_that_do_not_exist_are_made(minute):
-    out = minute.parent / "exports" / "2026" / "M1.csv"
-    run("export", minute, "--exterior", "series", "-o", out)
-    assert out.read_text().startswith("epoch,frame_time")
-
-
 def test_the_line_of_a_session_stays_one_line(monkeypatch):
     terminal = io.StringIO()
     terminal.isatty = lambda: True

@@ -59,8 +59,10 @@ def test_a_dry_run_prints_a_programme_that_a_session_takes(config, tmp_path):
         (["--until-separated", "creep"], "give two different effects"),
         (["--dry-run"], "--dry-run needs --until-separated"),
         (["--until-separated", "creep,slip", "--max-temperature", "23"], "of warming above"),
+        (["--until-separated", "creep,slip", "--epochs", "50"],
+         "50 epochs of 0.4 s are 0 min; heat needs 15 min"),
     ],
-)
+)  # fmt: skip
 def test_wrong_usage_is_said(config, arguments, said):
     result = run(*arguments)
     assert result.exit_code != 0
@@ -73,11 +75,6 @@ def test_without_a_heater_there_is_nothing_to_plan(config, tmp_path):
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
     result = run("--until-separated", "creep,slip", "--dry-run")
     assert "no output of the configuration heats" in str(result.exception or result.output)
-
-
-def test_a_session_that_is_too_short_is_refused(config):
-    result = answer("session", "start", "--epochs", 50, "--until-separated", "creep,slip")
-    assert "50 epochs of 0.4 s are 0 min; heat needs 15 min" in str(result.exception)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 
 import thermocald as tc
 from tests.commands import succeed
-from thermocald.errors import DataError, OutputError, UsageError
+from thermocald.errors import DataError, UsageError
 
 
 def written(path, seed):
@@ -90,7 +90,6 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
         (["nowhere"], DataError, "nowhere: does not exist"),
         (["RECORDING", "RECORDING"], UsageError, "is the same series as"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
-        (["RECORDING", "--report", "RECORDING/epochs.csv/r.html"], OutputError, "written"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no parameter"),
     ],

@@ -14,8 +14,10 @@ from tests.commands import succeed
 from tests.photogrammetry import network_cases as cases
 from tests.pictures import ORIENTATION, save_photograph
 from thermocald.errors import GeometryError, ThermocaldError, UsageError
+from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.physics.scene import Scene
 from thermocald.store.recording.testfield_file import read_testfield
 
@@ -101,16 +103,12 @@ def test_survey_writes_the_field_and_everything_about_it(photographs, tmp_path):
     )
     assert document["relative_accuracy"] < 1 / 20_000
     assert document["camera"]["c"] == pytest.approx(model.interior.c, rel=2e-4)
-    from thermocald.photogrammetry import camera_files
-
     found = camera_files.read(camera_file)
     assert found.model.interior.c == document["camera"]["c"]
     assert found.covariance[0, 0] == pytest.approx(document["camera"]["sd_c"] ** 2)
 
 
 def test_survey_with_a_known_camera_held(photographs, tmp_path):
-    from thermocald.photogrammetry import camera_files
-
     folder, _, model, scale = photographs
     camera_files.write(model, tmp_path / "camera.xml", "metashape")
     (tmp_path / "distances.csv").write_text(
@@ -180,8 +178,6 @@ def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
     """The orientation in EXIF is for display, not the sensor's: if OpenCV rotated the image, the
     principal point would rotate with it.
     """
-    from thermocald.photogrammetry.targets.image_file import decode_grey
-
     path = tmp_path / "turned.jpg"
     save_photograph(path, {ORIENTATION: 6})
     assert cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape == (64, 48)  # the block is understood

@@ -56,6 +56,8 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),
+        (("study", "M1", "--report", "a.html", "--json", "./a.html"), r"would be \./a\.html"),
+        (("fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h"), "--json: both would be a"),
         # its `--report / --no-report` shares its name with files of other commands
         (("session", "start", "--camera", "a", "--config", "no.yaml"), r"error: no\.yaml: "),
     ],
@@ -157,17 +159,6 @@ def test_every_option_that_says_that_it_writes_is_looked_at():
                 assert (name, one.name) in OUTPUTS
 
 
-def test_one_file_for_two_results_is_refused(tmp_path):
-    words = ("study", "nowhere", "--report", "a.html", "--json", "./a.html")
-    status, lines = _typed(*words, folder=tmp_path)
-    assert (status, lines) == (2, ["error: --report and --json: both would be ./a.html"])
-    status, lines = _typed(
-        "fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h", folder=tmp_path
-    )
-    assert status == 2
-    assert "both would be" in lines[0]
-
-
 def test_outputs_that_can_be(tmp_path):
     (tmp_path / "there").touch()
     for path in (tmp_path / "there", tmp_path / "new" / "deep" / "a.csv", "/dev/null"):
@@ -183,11 +174,12 @@ def test_outputs_that_can_be(tmp_path):
         check_output(tmp_path / "/proc/a.csv")
 
 
-def test_a_file_that_is_no_store_gets_no_page(tmp_path):
+@pytest.mark.parametrize(("file", "said"), [("notes.txt", "is not a"), ("no.db", "does not exist")])
+def test_what_is_no_store_gets_no_page(tmp_path, file, said):
     (tmp_path / "notes.txt").write_text("a gauge")
-    status, lines = _typed("dashboard", "--store", tmp_path / "notes.txt")
+    status, lines = _typed("dashboard", "--store", tmp_path / file)
     assert (status, len(lines)) == (1, 1)
-    assert "notes.txt: is not a store" in lines[0]
+    assert f"{file}: {said}" in lines[0]
 
 
 def test_an_input_in_a_closed_folder_cannot_be_read(monkeypatch):

@@ -102,21 +102,21 @@ def test_a_lag_and_a_delay_that_do_the_same_stay_alternatives(evidence_of, effec
 
 
 @pytest.mark.slow
-def test_a_delay_is_no_lag_because_the_temperature_was_smooth(evidence_of):
-    """A lag smooths the thermometer's noise, so that a smooth image would favour it: d is 10 s."""
-    evidence, _ = evidence_of("time_offset", px=0.3, seed=330)
-    found = discover_series(evidence)
-    assert [e.effect for e in found.effects] == ["time_offset"]
+@pytest.mark.parametrize(
+    ("effect", "px", "seed", "constant"),
+    [("time_offset", 0.3, 330, "d"), ("hysteresis", 0.1, 360, "half_width")],
+)
+def test_what_readings_hide_is_named(evidence_of, effect, px, seed, constant):
+    """A lag smooths the thermometer's noise, so that a smooth image would favour it to a delay.
 
-
-@pytest.mark.slow
-def test_a_play_shorter_than_an_interval_is_named(evidence_of):
-    """The extreme is not read; taking the largest reading for it would exclude every play."""
-    evidence, truth = evidence_of("hysteresis", px=0.1, seed=360)
+    Of a play shorter than an interval the extreme is not read; taking the largest reading for it
+    would exclude every play.
+    """
+    evidence, truth = evidence_of(effect, px=px, seed=seed)
     found = discover_series(evidence)
-    assert [e.effect for e in found.effects] == ["hysteresis"]
-    said = found.effects[0].estimates["half_width"]
-    assert abs(said["value"] - truth["effects"][0][0]["half_width"]) < 3 * said["sd"]
+    assert [e.effect for e in found.effects] == [effect]
+    said = found.effects[0].estimates[constant]
+    assert abs(said["value"] - truth["effects"][0][0][constant]) < 3 * said["sd"]
 
 
 def test_a_lag_as_long_as_the_series_has_no_delay_beside_it(evidence_of):

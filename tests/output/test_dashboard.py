@@ -10,15 +10,20 @@ import subprocess
 import sys
 from urllib.parse import urljoin
 
+import cv2
 import httpx
 import numpy as np
 import pytest
+import yaml
 
+from thermocald.daemon.live_state import LiveState
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.output.dashboard import serve
+from thermocald.output.dashboard.application import build_application
 from thermocald.output.dashboard.view import View
-from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
@@ -98,7 +103,6 @@ class Client:
 @pytest.fixture
 def client_of(folders):
     """token, host → a client of the application."""
-    from thermocald.output.dashboard.application import build_application
 
     def make(token=None, host="127.0.0.1", base="http://127.0.0.1"):
         return Client(build_application(*folders, token, host), base)
@@ -166,12 +170,6 @@ def test_health_and_metrics(client_of, folders):
 
 def test_the_camera_of_now_in_opencv_terms_and_for_ros(client_of, folders):
     """Both describe one camera, with which OpenCV projects as the program does."""
-    import cv2
-    import yaml
-
-    from thermocald.photogrammetry.camera.camera_model import Sensor, project
-    from thermocald.photogrammetry.camera.conversions import opencv_terms
-
     client = client_of()
     assert client.get("/camera.json").status_code == 404
     values = np.array([3.04, 0.012, -0.021, -6e-3, 4e-4, 0, 2e-5, -3e-5, 0, 0])
@@ -201,10 +199,6 @@ def test_the_camera_of_now_in_opencv_terms_and_for_ros(client_of, folders):
 
 def test_a_weak_epoch_of_whose_variance_rounding_left_nothing(folders):
     """A complex number stopped the daemon: its status could not be written."""
-    from thermocald.daemon.live_state import LiveState
-    from thermocald.photogrammetry.camera.camera_model import Sensor
-    from thermocald.photogrammetry.camera.conversions import opencv_terms
-
     values = np.array([3.04, 0.012, -0.021, -6e-3, 0, 0, 0, 0, 0, 0])
     variances = np.array([1e-8, -1e-18, 1e-8, 0, 0, 0, 0, 0, 0, 0])
     terms = opencv_terms(Sensor(3280, 2464, 0.00112), values, np.diag(variances))
@@ -367,21 +361,6 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
             assert json.loads(next(told)[6:]) == {"stopped": 1.7e9}
             assert next(told, None) is None
         assert server.stderr.read() == ""
-
-
-def test_a_series_is_read_page_by_page(client_of, monkeypatch):
-    """Only one page of rows is in memory, and no transaction is open between pages."""
-    from thermocald.output.dashboard import view
-    from thermocald.store.database import columns
-
-    asked = []
-    page = columns.read_page
-    monkeypatch.setattr(view, "_ROWS_AT_ONCE", 100)
-    monkeypatch.setattr(columns, "read_columns", None)
-    monkeypatch.setattr(columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
-    answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
-    assert len(answer.text.splitlines()) == 1201
-    assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]
 
 
 def test_the_table_of_a_series_without_epochs_has_its_header(tmp_path):

@@ -10,18 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+import thermocald as tc
 from tests.cli.test_measure import ORIGIN_M, POSE, write_model
 from tests.commands import call, finish
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError
-from thermocald.output.series_export import opencv_pose, renew_configuration
-from thermocald.photogrammetry.camera.camera_model import (
-    ExteriorOrientation,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.output.series_export import renew_configuration
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.measuring import Line, place_on
 from thermocald.photogrammetry.field.testfield import TestField
 
@@ -99,8 +96,6 @@ def test_the_real_pyorc_projects_as_we_do(tmp_path, pyorc):
     write_model(tmp_path / "model.yaml")
     _, points, _ = renewed(tmp_path)
     read = pyorc.load_camera_config(str(tmp_path / "warm.json"))
-    import thermocald as tc
-
     camera = tc.load_camera(tmp_path / "model.yaml").at(WARM)
     done = renew_configuration(tmp_path / "site.json", camera)
     ours = done.camera.project(
@@ -108,14 +103,6 @@ def test_the_real_pyorc_projects_as_we_do(tmp_path, pyorc):
     )
     assert_projects(read, tmp_path / "warm.json", points / 1000 + ORIGIN_M, ours)
     assert read.gcps["z_0"] == 138.0
-
-
-def test_opencv_pose_is_the_same_camera():
-    pose = ExteriorOrientation.from_array(POSE)
-    rvec, tvec = opencv_pose(pose, np.zeros(3))
-    R, _ = cv2.Rodrigues(rvec)
-    assert -R.T @ tvec * 1000 == pytest.approx(POSE[3:])
-    assert R[2] == pytest.approx(-pose.rotation[:, 2])
 
 
 @pytest.mark.parametrize(
@@ -133,15 +120,6 @@ def test_what_is_missing_is_said(tmp_path, monkeypatch, options, words):
     assert done.returncode in (1, 2)
     assert words in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
-
-
-def test_three_points_are_too_few(tmp_path):
-    write_model(tmp_path / "model.yaml")
-    path, _ = configuration(tmp_path / "site.json", 3)
-    import thermocald as tc
-
-    with pytest.raises(DataError, match="no pose"):
-        renew_configuration(path, tc.load_camera(tmp_path / "model.yaml").at(20.0))
 
 
 @pytest.mark.parametrize(

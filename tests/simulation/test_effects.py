@@ -231,15 +231,6 @@ def test_the_temperature_before_a_series_is_its_first():
         np.testing.assert_allclose(catalogue.get(name).drive(h, **values), T0 + 7.0, rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("values", "reason"),
-    [({}, "'tau' .s. is missing"), ({"tau": 3.0, "width": 1.0}, "no parameter 'width'")],
-)
-def test_bad_parameters(values, reason):
-    with pytest.raises(ConfigurationError, match=reason):
-        ModelEffect("thermal_lag", values)
-
-
 def test_sentences():
     lag, play = catalogue.get("thermal_lag"), catalogue.get("hysteresis")
     sentence = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})

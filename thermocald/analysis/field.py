@@ -60,7 +60,7 @@ _ONE_PLANE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FieldCheck:
     """The result of the check of a test field.
 

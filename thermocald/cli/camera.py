@@ -30,6 +30,7 @@ from thermocald.cli.common import (
     write_parts,
 )
 from thermocald.errors import DataError, UsageError
+from thermocald.numbers import counted
 
 
 def calibrate(
@@ -311,4 +312,4 @@ def measure(
         )  # fmt: skip
     show(found, json)
     if found.refused:
-        raise DataError(f"{points}: {len(found.refused)} rows were left out")
+        raise DataError(f"{points}: {counted(len(found.refused), 'row')} left out")

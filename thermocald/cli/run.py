@@ -158,7 +158,8 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
     if store_["lost"]:
         raise DataError(f"{counted(store_['lost'], 'epoch')} lost: taken but not stored")
     if store_["state"] == "out":
-        raise DataError(f"the store cannot be written; {store_['waiting']} epochs wait in memory")
+        waiting = counted(store_["waiting"], "epoch")
+        raise DataError(f"the store cannot be written; {waiting} waiting in memory")
 
 
 def top(
@@ -282,8 +283,8 @@ def check(
     show(document, json, *document["lines"])
     if damaged := document.get("damaged"):
         raise DataError(
-            f"{source}: {len(damaged)} places are damaged, the first: {damaged[0]}; restore a "
-            "backup, or use what can still be read"
+            f"{source}: {counted(len(damaged), 'place')} damaged, the first: {damaged[0]}; restore "
+            "a backup, or use what can still be read"
         )
     probes = document.get("probes", [])
     failed = [probe["name"] for probe in probes if probe["error"]]

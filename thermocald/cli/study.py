@@ -25,6 +25,7 @@ from thermocald.cli.common import (
     write_parts,
 )
 from thermocald.errors import DataError, UsageError
+from thermocald.numbers import counted
 from thermocald.store.server.connection import is_server
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def export(
     else:
         write_parts(csv_text(parts, style.separator, style.decimal), output)
     for sentence, count in sorted(table.without_result.items()):
-        say(f"{count} epochs without a result: {sentence}")
+        say(f"{counted(count, 'epoch')} without a result: {sentence}")
 
 
 def study(

@@ -64,8 +64,7 @@ class Condensed:
 
     def gains(self, trajectories: Array) -> Array:
         """Return the χ² (G,) that trajectories (rows, G) explain, each in all parameters."""
-        out: Array = np.sum((self.regressors(trajectories) @ self.data) ** 2, axis=1)
-        return out
+        return np.asarray(np.sum((self.regressors(trajectories) @ self.data) ** 2, axis=1))
 
     def whitened(self, trajectories: Array) -> Array:
         """Whiten trajectories (rows, G) in each parameter: (G, k, r)."""
@@ -78,8 +77,7 @@ class Condensed:
         Z = self.whitened(s / np.maximum(np.abs(s).max(axis=0), 1e-300))
         Z /= np.maximum(np.linalg.norm(Z, axis=2, keepdims=True), 1e-9)
         own = Z @ np.swapaxes(Z, 1, 2) + 1e-7 * np.eye(Z.shape[1])
-        out: Array = np.linalg.inv(np.linalg.cholesky(own)) @ Z
-        return out
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(own)) @ Z)
 
     @property
     def power(self) -> float:

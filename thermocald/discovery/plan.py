@@ -206,8 +206,7 @@ def _add_drive(
     if simulation is None:
         e = fitter.series[0]
         return e.with_values(e.values + moved)
-    effect = ModelEffect(term.effect, dict(term.nonlinear))
-    model = replace(simulation.model, effects=(*simulation.model.effects, effect))
+    model = simulation.model.with_effect(ModelEffect(term.effect, dict(term.nonlinear)))
     return reduce_series(_record(replace(simulation, model=model)))
 
 

@@ -37,6 +37,7 @@ from thermocald.discovery.unnamed import (
     say_contradiction,
 )
 from thermocald.discovery.validation import cross_validation
+from thermocald.numbers import enumerated
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
 from thermocald.result import jsonable
@@ -69,7 +70,7 @@ def mount_lines(x: Examination) -> list[str]:
         return []
     moves = "stands still but for knocks"
     if x.mount is not None:
-        sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
+        sizes = enumerated([f"{x.mount.size_px(e):.3f}" for e in x.fitter.series])
         moves = f"moves on its mount by {sizes} px RMS"
     return [
         f"the camera {moves}; this is not counted as an effect",
@@ -124,7 +125,7 @@ def _list_knocks(x: Examination) -> list[dict[str, Any]]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Discovery:
     """The result of a discovery.
 

@@ -162,7 +162,7 @@ class Search:
             key = (candidate.effect, candidate.parameters)
             if key not in self._trials:
                 self._trials[key] = self.scanner.trials(candidate)
-            best = int(np.argmax(scan.gains))
+            best = scan.best
             value = float(candidate.grid[best]) if len(candidate.grid) else None
             penalty = (count + (value is not None)) * each + once
             penalty += 2 * float(np.log(max(self._trials[key], 1.0)))
@@ -293,7 +293,8 @@ class Search:
                     continue
                 time = float(self.fitter.series[s].times[int(np.argmax(gains[s])) + 1])
                 single = (len(term.parameters) + 2) * float(np.log(self.epochs))
-                for own, less in ((((candidate.name, time),), 0.0), (None, single))[: 1 + (s > 0)]:
+                choices = [(((candidate.name, time),), 0.0), (None, single)]
+                for own, less in choices if s > 0 else choices[:1]:  # the first series has it
                     moved = replace(term, fresh=(*term.fresh[:s], own, *term.fresh[s + 1 :]))
                     terms = (*solution.terms[:i], moved, *solution.terms[i + 1 :])
                     penalties = list(solution.penalties)

@@ -120,13 +120,14 @@ def _estimates(result: Photographs, sensor: Sensor) -> str:
     sds = np.sqrt(np.diag(result.covariance)[:3])
     found = zip(IOP_NAMES[:3], result.interior.as_array()[:3], sds, strict=True)
     pitch = sensor.pixel_pitch
-    parts = [
-        f"{parameter_label(name)} is {with_sd(value, float(sd), 'mm')} "
-        f"({with_sd(value / pitch, float(sd) / pitch, 'px')})"
-        for name, value, sd in found
-        if sd > 0
-    ]
-    return enumerated(parts)
+    return enumerated(
+        [
+            f"{parameter_label(name)} is {with_sd(value, float(sd), 'mm')} "
+            f"({with_sd(value / pitch, float(sd) / pitch, 'px')})"
+            for name, value, sd in found
+            if sd > 0
+        ]
+    )
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
@@ -338,7 +339,7 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
 
 
 def _sd(value: float) -> str:
-    return f"{plain(value, 'px', 2)}" if value < 1e300 else "undetermined"
+    return plain(value, "px", 2) if value < 1e300 else "undetermined"
 
 
 def seen_figure(result: FieldCheck) -> Figure:

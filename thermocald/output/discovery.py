@@ -29,7 +29,7 @@ from thermocald.figures import (
     new_drawing,
     tick_text,
 )
-from thermocald.numbers import parameter_label, plain, shortened, with_sd
+from thermocald.numbers import enumerated, parameter_label, plain, shortened, with_sd
 from thermocald.photogrammetry.linalg import best_level
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
@@ -177,24 +177,19 @@ def _without_level(e: ReducedSeries, values: Array) -> Array:
     return values - best_level(e.N, np.einsum("epq,eq->ep", e.N, values))
 
 
-def _model(fit: Fit, series: int) -> Array:
-    C, V, index = fit.designs[series]
-    return np.asarray((C * fit.coefficients[index]) @ V.T)
-
-
 def _of_readings(d: Discovery) -> Array:
     """Return what the noise of the readings does to the parameters (P,): one sd of it."""
     e = d.examination.fitter.series[0]
     T = e.averaged(e.history.temperature())
     T = np.nan_to_num(T - np.nanmean(T))
-    rates = T @ _model(d.base_fit, 0) / max(float(T @ T), 1e-12)
+    rates = T @ d.base_fit.parameters(0) / max(float(T @ T), 1e-12)
     return np.asarray(rates * e.thermometers[e.history.reference].noise)
 
 
 def _trajectory(d: Discovery) -> Figure:
     """Draw measured and modelled image movement over time and temperature, residuals below."""
     e = d.examination.fitter.series[0]
-    base, final = (_model(fit, 0) for fit in (d.base_fit, d.final_fit))
+    base, final = (fit.parameters(0) for fit in (d.base_fit, d.final_fit))
     rests = [_without_level(e, e.values - m) for m in (base, final)]
     found = bool(np.abs(final - base).max() > 0)
     size, U = np.linalg.eigh(e.N.mean(axis=0))
@@ -250,7 +245,7 @@ def _movement(d: Discovery) -> Figure:
     drawn = []
     fits = (d.base_fit,) if d.final_fit is d.base_fit else (d.base_fit, d.final_fit)
     for fit in fits:
-        r = _without_level(e, e.values - _model(fit, 0))
+        r = _without_level(e, e.values - fit.parameters(0))
         _, s, v = np.linalg.svd((r @ U) * np.sqrt(np.maximum(size, 0.0)), full_matrices=False)
         pattern = U[:, keep] @ (v[0][keep] / np.sqrt(size[keep])) * s[0] / np.sqrt(len(r))
         misfit = np.sqrt(np.mean(np.einsum("tij,ej->eti", e.columns[seen], r) ** 2))
@@ -461,7 +456,9 @@ def _candidates(d: Discovery) -> Section:
     x = d.examination
     singles: dict[str, Solution] = {}
     for s in sorted(x.ranking, key=lambda s: s.score):
-        singles.setdefault(_candidate_name(s), s)
+        term = s.terms[-1]
+        at_mount = term.parameters == MOUNT != term.kind.usual
+        singles.setdefault(f"{term.effect} (mount)" if at_mount else term.effect, s)
     noise = x.fitter.series[0].sigma_px
     best = x.best.names[len(x.base.terms) :] if x.adequate else ()
     rows = [(name, s, _left_px(d, s.fit)) for name, s in singles.items()]
@@ -484,11 +481,6 @@ def _candidates(d: Discovery) -> Section:
     return Section("Candidates, and why they were named or rejected", (), (figure,), (), items)
 
 
-def _candidate_name(s: Solution) -> str:
-    term = s.terms[-1]
-    return f"{term.effect} (mount)" if term.parameters == MOUNT != term.kind.usual else term.effect
-
-
 def _left_px(d: Discovery, fit: Fit) -> float:
     """Return the RMS misfit of a fit to M1's image points, px, computed as the gap is."""
     e = d.examination.fitter.series[0]
@@ -504,7 +496,7 @@ def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str
     score = f"(−2 log L plus penalty) is {worse:,.0f} worse"
     if x.adequate and name.split(" ")[0] in best:
         if len(best) > 1:
-            return f"named, together with {' and '.join(n for n in best if n != name)}."
+            return f"named, together with {enumerated([n for n in best if n != name])}."
         return f"named: its misfit of {left:.3f} px is the noise."
     if any(name.split(" ")[0] in r.names for r in x.rivals):
         return f"cannot be excluded: its score {score} only."

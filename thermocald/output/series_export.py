@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from thermocald.photogrammetry.camera.camera_model import EOP, IOP, ExteriorOrie
 from thermocald.photogrammetry.frame.templates import Templates
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import jsonable
+from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -91,7 +91,7 @@ def column_parts(
             suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
             columns[name + suffix] = values if not suffix else np.asarray(values) * factor
         if style.time == "iso":
-            columns["frame_time"] = tuple(map(_iso, part.frame_time.tolist()))
+            columns["frame_time"] = tuple(iso(t, "microseconds") for t in part.frame_time)
         rows = slice(done, done + len(part.number))
         for name, column in (others or {}).items():
             columns[name if name not in columns else f"extra {name}"] = column[rows]
@@ -108,11 +108,6 @@ def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float
     if name in _ANGLES and "deg" in style.units:
         return "_deg", 180.0 / np.pi
     return "", 1.0
-
-
-def _iso(seconds: float) -> str:
-    moment = datetime.fromtimestamp(seconds, UTC)
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def as_json(parts: Iterable[Columns]) -> Iterator[str]:

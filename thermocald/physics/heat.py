@@ -79,8 +79,7 @@ class Course:
         piece = np.clip(np.searchsorted(self.times, t, side=side) - 1, 0, len(self.begin) - 1)
         length = self.times[piece + 1] - self.times[piece]
         share = np.clip((t - self.times[piece]) / np.where(length > 0, length, 1.0), 0.0, 1.0)
-        result: Array = self.begin[piece] + share * (self.end[piece] - self.begin[piece])
-        return result
+        return np.asarray(self.begin[piece] + share * (self.end[piece] - self.begin[piece]))
 
 
 def read_course(

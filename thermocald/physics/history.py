@@ -56,8 +56,7 @@ class Polygon:
 
     def at(self, times: ArrayLike) -> Array:
         """Return the temperature (...,) °C at some times; constant beyond the ends."""
-        result: Array = np.interp(np.asarray(times, dtype=float), self.times, self.values)
-        return result
+        return np.asarray(np.interp(np.asarray(times, dtype=float), self.times, self.values))
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,8 +102,7 @@ def decayed_sums(kept: Array, driven: Array) -> Array:
 
     band = np.ones((2, len(driven)), order="F")
     band[1, :-1] = -kept
-    sums: Array = dtbtrs(band, driven, uplo="L", diag="U")[0]
-    return sums
+    return np.asarray(dtbtrs(band, driven, uplo="L", diag="U")[0])
 
 
 def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
@@ -129,8 +128,7 @@ def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
         + state[left] * decayed
         + slope * (elapsed[:, None] - 1.0 + decayed)
     )
-    shaped: Array = result.reshape(len(at), *v.shape[1:])
-    return shaped
+    return np.asarray(result.reshape(len(at), *v.shape[1:]))
 
 
 def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:  # noqa: ARG001

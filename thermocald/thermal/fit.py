@@ -256,8 +256,7 @@ class HypothesisFitter:
         step = float(np.median(np.diff(history.reading_times[instrument.real])))
         bend = 0.5 * step * self._slope_jump(series)
         shares = evidence.averaged(turns.astype(float))
-        out: Array = shares * np.sqrt(instrument.noise**2 + bend**2)
-        return out
+        return np.asarray(shares * np.sqrt(instrument.noise**2 + bend**2))
 
     def _slope_jump(self, series: int) -> Array:
         """Return the sd (E,) of the reference temperature's rate due to its jumps."""

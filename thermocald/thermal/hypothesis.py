@@ -142,8 +142,7 @@ class Fit:
     def parameters(self, series: int) -> Array:
         """Return the movement (E, P) of the parameters according to the hypothesis, px-scaled."""
         C, V, index = self.designs[series]
-        moved: Array = (C * self.coefficients[index]) @ V.T
-        return moved
+        return np.asarray((C * self.coefficients[index]) @ V.T)
 
     def normals(self, series: Iterable[int] | None = None) -> tuple[Array, Array]:
         """Sum the normal equations A (K, K), c (K,) of all coefficients over some series."""

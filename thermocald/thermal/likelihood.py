@@ -122,8 +122,7 @@ class Weighting:
 
     def left(self, parameters: Array) -> Array:
         """Return the right-hand sides (E, P) after a movement (E, P) of the parameters."""
-        rest: Array = self.b - np.einsum("epq,eq->ep", self.N, parameters)
-        return rest
+        return np.asarray(self.b - np.einsum("epq,eq->ep", self.N, parameters))
 
     def carried(self, trajectories: Array, directions: Array) -> Array:
         """Return L⁻¹ Jᵀ (states, R) of trajectories (E, R) along directions (P, R)."""

@@ -279,7 +279,8 @@ def detect_tremble(evidence: ReducedSeries) -> bool:
     """Return whether all targets jump together from epoch to epoch.
 
     The test uses differences of an order so high that nothing that follows a temperature remains
-    but its kinks, the largest of them: no effect is assumed, and no thermometer's error matters.
+    but its kinks, and leaves the largest differences out: no effect is assumed, and no
+    thermometer's error matters.
     """
     W = find_combinations([evidence])
     d = np.diff((evidence.values @ evidence.N.mean(axis=0) @ W)[evidence.n > 0], _FAST, axis=0)

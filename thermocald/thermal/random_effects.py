@@ -45,14 +45,12 @@ class HiddenTargets:
     @property
     def cross(self) -> Array:
         """The normal equations' block (S, E, P) with the epochs' parameters."""
-        out: Array = self.patterns[self.group][:, :, None] * self.vectors[:, None, :]
-        return out
+        return np.asarray(self.patterns[self.group][:, :, None] * self.vectors[:, None, :])
 
     @property
     def normal(self) -> Array:
         """The diagonal (S,) of the offsets' own normal matrix."""
-        out: Array = self.patterns.sum(axis=1)[self.group] + _LOOSE
-        return out
+        return np.asarray(self.patterns.sum(axis=1)[self.group] + _LOOSE)
 
     def scaled(self, factor: Array | float) -> HiddenTargets:
         """Multiply the weights by a factor, or by a factor (E,) for each epoch."""
@@ -164,5 +162,4 @@ def waves(times: Array, count: int) -> Array:
     E = len(times)
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     u = (u * (E - 1) + 0.5) / E
-    out: Array = np.sqrt(2.0 / E) * np.cos(np.pi * np.arange(1, count + 1) * u[:, None])
-    return out
+    return np.asarray(np.sqrt(2.0 / E) * np.cos(np.pi * np.arange(1, count + 1) * u[:, None]))

@@ -217,14 +217,12 @@ class ReducedSeries:
     def squares(self, rest: Array) -> Array:
         """Return the squares (E,) of a movement (E, P) without its level, per image noise."""
         r = rest - best_level(self.N, np.einsum("epq,eq->ep", self.N, rest))
-        squares: Array = np.einsum("ep,epq,eq->e", r, self.N, r)
-        return squares
+        return np.asarray(np.einsum("ep,epq,eq->e", r, self.N, r))
 
     def left_by_cameras(self, rows: NDArray[np.int64]) -> Array:
         """Return targets' residuals about the free cameras, (E, n, 2) px, used in them or not."""
         misclosure = self.source.grid.points[:, rows] - self.at.predicted[rows]
-        left: Array = misclosure - np.einsum("ek,tik->eti", self.values, self.columns[rows])
-        return left
+        return np.asarray(misclosure - np.einsum("ek,tik->eti", self.values, self.columns[rows]))
 
     def with_values(self, values: Array) -> ReducedSeries:
         """Return the series with other free cameras (E, 19)."""
@@ -361,8 +359,7 @@ def _remove_rates(evidence: ReducedSeries) -> Array:
     c = np.concatenate([evidence.b.sum(axis=0), T @ evidence.b])
     scaled, scale = unit_diagonal(A)
     x = scale * np.linalg.lstsq(scaled, c * scale, rcond=1e-10)[0]
-    left: Array = evidence.values - x[:P] - np.outer(T, x[P:])
-    return left
+    return np.asarray(evidence.values - x[:P] - np.outer(T, x[P:]))
 
 
 def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], float]:

@@ -99,8 +99,7 @@ class Thermometer:
         known = 0.05 * size[i] * width * np.abs(np.sin(2.0 * np.pi * share))
         near = np.abs(times[:, None] - times[None]) <= np.median(width)
         hidden = 0.125 * width * np.max(np.where(near, seen[None], 0.0), axis=1)
-        out: Array = np.where(sharp[i], known, hidden)
-        return out
+        return np.asarray(np.where(sharp[i], known, hidden))
 
     def slope_jump(self, times: Array) -> Array:
         """Return the sd (E,) K/s of the rate at some times due to jumps next to them."""
@@ -238,8 +237,7 @@ def _third_differences(t: Array, y: Array) -> Array:
                 product *= np.where(apart == 0.0, 1e-3, apart)
         total += y[i : i + n] / product
         square += product**-2.0
-    out: Array = total / np.sqrt(square)
-    return out
+    return np.asarray(total / np.sqrt(square))
 
 
 def find_times_between(

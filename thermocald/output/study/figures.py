@@ -13,7 +13,15 @@ import numpy as np
 
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, GREY, PALETTE, Arrows, Curve, Figure, Panel, draw_matrix, thin
-from thermocald.numbers import UNITS, parameter_label, percent, plain, superscript, with_sd
+from thermocald.numbers import (
+    UNITS,
+    enumerated,
+    parameter_label,
+    percent,
+    plain,
+    superscript,
+    with_sd,
+)
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
@@ -102,7 +110,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
         "deviations", "Deviations from the first epoch",
         "Each parameter minus its value in the first epoch. The bands are the 95 % uncertainty of "
         "one epoch's adjustment; a line that leaves its band shows a change."
-        + (f" The principal point has moved {' and '.join(words)}." if words else ""),
+        + (f" The principal point has moved {enumerated(words)}." if words else ""),
         tuple(panels),
     )  # fmt: skip
 
@@ -167,7 +175,7 @@ def _movement_figure(camera: CameraStudy) -> Figure | None:
         "movement", "Movement of the image",
         "Movement of the points of a static scene in the image from the first to the last epoch, "
         "caused by the change of the interior orientation. The largest "
-        f"movement is {' and '.join(words)}. Equal arrows show a shift of the principal point; "
+        f"movement is {enumerated(words)}. Equal arrows show a shift of the principal point; "
         "arrows that point outwards show a longer principal distance.",
         tuple(panels), columns=2,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from thermocald.arrays import eight_bit
 from thermocald.errors import ImageError
 from thermocald.figures import Figure, draw_figure, save
 from thermocald.files import make_folder
-from thermocald.numbers import plain
+from thermocald.numbers import enumerated, plain
 from thermocald.output.study import tables
 from thermocald.output.study.figures import (
     dependence_figure,
@@ -175,7 +175,7 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
     if not changes:
         return ()
     lens = f"f/{settings.f_number:g} and focused at {settings.focus_mm / 1000:g} m"
-    change = f"its depth of field would change by {' and '.join(changes)}"
+    change = f"its depth of field would change by {enumerated(changes)}"
     return (f"If the lens were {lens}, {change}. Neither was measured.",)
 
 

@@ -218,8 +218,7 @@ def _seen(points: Array) -> Array:
     towards /= np.linalg.norm(towards)
     right = np.cross([0.0, 0.0, 1.0], towards)
     right /= np.linalg.norm(right)
-    placed: Array = points @ np.stack([right, np.cross(towards, right)], axis=1)
-    return placed
+    return np.asarray(points @ np.stack([right, np.cross(towards, right)], axis=1))
 
 
 _TARGET_NAME = 0.7

@@ -246,12 +246,8 @@ class Printed:
         """Return the lines that `testfield print` prints."""
         size = f"{self.page[0]:g} × {self.page[1]:g} mm"
         if self.board is not None:
-            return [
-                (
-                    f"{self.folder}: {self.board.name} ({self.board.measures}) on {size}, "
-                    f"{len(self.field)} targets"
-                )
-            ]
+            board = f"{self.board.name} ({self.board.measures})"
+            return [f"{self.folder}: {board} on {size}, {len(self.field)} targets"]
         found = self.as_dict()
         sheets = "1 sheet" if self.is_flat else "3 sheets of a corner (and how to mount it)"
         return [

@@ -218,10 +218,10 @@ _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
 
 
-def iso(seconds: float) -> str:
-    """Return a time as ISO 8601 in UTC, to a millisecond."""
+def iso(seconds: float, digits: str = "milliseconds") -> str:
+    """Return a time as ISO 8601 in UTC; digits: milliseconds or microseconds."""
     moment = datetime.fromtimestamp(float(seconds), UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return moment.isoformat(timespec=digits).replace("+00:00", "Z")
 
 
 def parse_moment(text: str, order: str | None = None) -> datetime | date | time:

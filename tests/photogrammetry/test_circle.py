@@ -102,22 +102,6 @@ def test_the_eccentricity_is_corrected(targets):
     assert np.abs(without[large]).max() > 0.05
 
 
-def test_distortion_across_the_target_counts(targets):
-    """Eccentricity of the perspective alone would leave a bias as large as the noise."""
-    pinhole = PI_CAMERA.interior.with_values(A1=0.0, A2=0.0, B1=0.0, B2=0.0)
-    with_lens, without_lens = (_frontal_map(interior) for interior in (PI_CAMERA.interior, pinhole))
-    assert np.abs(with_lens.second).max() > 5 * np.abs(without_lens.second).max()
-
-
-def _frontal_map(interior):
-    ray = PI_CAMERA.rays(np.array([[250.0, 200.0]]))[0]
-    centre = ray * 1000 / -ray[2]
-    return local_maps(
-        PI_SENSOR, interior.as_array(), AT_ORIGIN.as_array(), centre[None], np.array([[0, 0, 1.0]]),
-        np.array([7.0]),
-    )  # fmt: skip
-
-
 def _sixteen_bit(targets: SingleTargets) -> np.ndarray:
     """Return the clean patches in 16 bit."""
     image = np.full((PI_SENSOR.height, PI_SENSOR.width), 190 * 250, dtype=np.uint16)

@@ -10,7 +10,6 @@ import pytest
 from tests.photogrammetry.exact_rendering import Scene, noisy, rms
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
 from tests.photogrammetry.single_targets import AT_ORIGIN, SIZE, SingleTargets, single_targets
-from thermocald.photogrammetry.frame.tracking import GradientWeights
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.frame_status import NoiseModel
 from thermocald.photogrammetry.targets.outline import local_maps
@@ -122,22 +121,6 @@ def test_noise_that_grows_with_the_light_is_estimated(targets):
         over.append((fit.points - targets.true) / np.sqrt(np.einsum("nii->ni", fit.covariances)))
     assert fit.noise.gain == pytest.approx(0.06, abs=0.015)
     assert 0.9 <= rms(np.array(over)) <= 1.1
-
-
-def test_a_step_with_fixed_weights_is_at_the_bound_and_its_sigmas_are_true(targets):
-    frame = targets.frame(None, 0)
-    plain = np.zeros(len(targets.true), dtype=bool)
-    fit = fit_circles(frame, targets.maps, noise=KNOWN_NOISE)
-    weights = GradientWeights.build(frame, targets.maps, plain, fit.parameters, KNOWN_NOISE)
-    rng = np.random.default_rng(31)
-    over_bound, over_stated = [], []
-    for _ in range(60):
-        step = weights.apply(targets.frame(rng, NOISE))
-        error = step.parameters[:, :2] - targets.true
-        over_bound.append(error / targets.bound(NOISE))
-        over_stated.append(error / np.sqrt(np.einsum("nii->ni", step.covariances)))
-    assert rms(np.array(over_bound)) <= 1.25
-    assert 0.95 <= rms(np.array(over_stated)) <= 1.05
 
 
 def _one(diameter_px: float, at: tuple[float, float], spoil=None, **render):

@@ -171,16 +171,6 @@ def test_pearsons_data_with_yorks_weights():
     assert sd_slope == pytest.approx(0.0579850, abs=5e-6)
 
 
-def test_without_noise_in_x_it_is_least_squares():
-    rng = np.random.default_rng(1)
-    x = rng.uniform(20, 40, 50)
-    y = 3 - 0.2 * x + 0.1 * rng.standard_normal(50)
-    slope, sd_slope, _ = fit_straight_line(x, y, 0.0, 0.1)
-    expected, covariance = np.polyfit(x, y, 1, w=np.full(50, 10.0), cov="unscaled")
-    assert slope == pytest.approx(expected[0])
-    assert sd_slope == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-6)
-
-
 def test_constant_x_is_refused():
     with pytest.raises(ValueError, match="x that varies"):
         fit_straight_line(np.full(5, 20.0), np.arange(5.0), 0.1, 0.1)

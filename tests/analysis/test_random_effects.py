@@ -59,21 +59,6 @@ def test_unknown_values_come_from_the_type():
     assert exact.values == pytest.approx(MEAN, abs=1e-6)
 
 
-def test_shrinking_is_better_than_either_alone():
-    rng = np.random.default_rng(6)
-    shrunk, own, kind = [], [], []
-    for _ in range(80):
-        _, found, C = fleet(rng, 10, 0.1)
-        people = population(found, C)
-        true, seen, C_new = fleet(rng, 1, 1.0)
-        new = people.posterior(seen[0], np.linalg.inv(C_new[0]))
-        shrunk.append(((new.values - true[0]) / SD) ** 2)
-        own.append(((seen[0] - true[0]) / SD) ** 2)
-        kind.append(((people.mean - true[0]) / SD) ** 2)
-    assert np.mean(shrunk) < 0.65 * np.mean(own)
-    assert np.mean(shrunk) < 0.65 * np.mean(kind)
-
-
 @pytest.mark.slow
 def test_only_odd_specimens_are_found():
     rng = np.random.default_rng(7)

@@ -41,11 +41,8 @@ def test_epochs_without_a_result_are_counted(recording):
     assert series.correlations.shape == (8, 10, 10)
     assert [t.name for t in series.thermometers] == ["temperature", "board_temperature"]
     assert 0.02 < series.thermometers[0].sd < 0.12
-
-
-def test_the_thermometers_noise_may_be_given(recording):
-    series = tc.open(recording).measured(thermometer_sd=0.25, free=FREE)
-    assert [t.sd for t in series.thermometers] == [0.25, 0.25]
+    given = tc.open(recording).measured(thermometer_sd=0.25, free=FREE)
+    assert [t.sd for t in given.thermometers] == [0.25, 0.25]
 
 
 def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):

@@ -123,7 +123,8 @@ def test_sigmas_of_the_coordinates_count():
     assert ratio.max() < 1.13
 
 
-def test_gross_errors_are_rejected():
+@pytest.mark.parametrize("nominal", [None, 3.04])
+def test_gross_errors_are_rejected_without_initial_values(nominal):
     rng = np.random.default_rng(6)
     field = scene.corner_field()
     obs = scene.observe(field, rng)
@@ -133,21 +134,11 @@ def test_gross_errors_are_rejected():
     size = np.geomspace(8 * scene.SIGMA_PX, 300, 15)
     angle = rng.uniform(0, 2 * np.pi, 15)
     points[bad] += size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    a = cold_start(
-        scene.SENSOR, field, replace(obs, points=points), AdjustmentSettings(), nominal_c=3.04
-    )
+    spoilt = replace(obs, points=points)
+    a = cold_start(scene.SENSOR, field, spoilt, AdjustmentSettings(), nominal_c=nominal)
     assert a.ok
     assert set(obs.targets[bad].tolist()) <= set(a.rejected)
     assert len(a.rejected) <= 15 + 3
-    assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
-
-
-@pytest.mark.parametrize("nominal", [None, 3.0])
-def test_without_initial_values(nominal):
-    field = scene.corner_field()
-    obs = scene.observe(field, np.random.default_rng(8))
-    a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=nominal)
-    assert a.ok
     assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
 
 
@@ -223,18 +214,9 @@ def test_one_gross_error_among_twelve_targets_is_found_or_the_epoch_has_no_resul
     assert np.sqrt(np.mean(np.square(z), axis=0)) == pytest.approx(np.ones(3), abs=0.2)
 
 
-def test_twelve_clean_targets_pass_the_global_test():
-    field, statuses = scene.corner_field(), []
-    for k in range(100):
-        rng = np.random.default_rng([13, k])
-        o = scene.observe(field, rng).select(rng.choice(140, 12, replace=False))
-        statuses.append(scene.adjusted(field, o).status)
-    assert statuses.count("ok") >= 97
-
-
-@pytest.mark.parametrize(("factor", "most"), [(2.0, 0.45), (3.0, 0.1)])
-def test_noise_larger_than_stated_does_not_pass_by_rejecting_targets(factor, most):
-    """Of epochs with twelve targets and three times the stated noise, 19 % once were `ok`."""
+@pytest.mark.parametrize(("factor", "least", "most"), [(1, 0.96, 1), (2, 0, 0.45), (3, 0, 0.1)])
+def test_only_noise_as_stated_passes_with_twelve_targets(factor, least, most):
+    """By rejecting targets, 19 % of epochs with three times the stated noise once were `ok`."""
     field = scene.corner_field().subset(range(3, 147, 12))
     rng = np.random.default_rng(41)
     passed = []
@@ -242,4 +224,4 @@ def test_noise_larger_than_stated_does_not_pass_by_rejecting_targets(factor, mos
         o = scene.observe(field, rng)
         o.points[:] += np.sqrt(factor**2 - 1) * scene.SIGMA_PX * rng.standard_normal(o.points.shape)
         passed.append(scene.adjusted(field, o).ok)
-    assert np.mean(passed) <= most
+    assert least <= np.mean(passed) <= most

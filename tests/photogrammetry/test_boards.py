@@ -169,77 +169,56 @@ colSpacingMeters: 0.025
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("name", "text", "expected"),
     [
-        (KALIBR, boards.aprilgrid(6, 6, 40.0, 0.3)),
-        (OPENCV, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250")),
-        (CHECKER, boards.chessboard(9, 6, 25.0)),
-        (UNDERSCORES, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250")),
-        (CAPITALS, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250")),
-        ('{"type": "checkerboard", "squaresX": 10, "squaresY": 7, "squareLength": 25}',
+        ("board.yaml", KALIBR, boards.aprilgrid(6, 6, 40.0, 0.3)),
+        ("board.yaml", CHECKER, boards.chessboard(9, 6, 25.0)),
+        *(("board.yaml", text, boards.charuco(11, 8, 30.0, 22.5, "DICT_5X5_250"))
+          for text in (OPENCV, UNDERSCORES, CAPITALS)),
+        ("board.yaml",
+         '{"type": "checkerboard", "squaresX": 10, "squaresY": 7, "squareLength": 25}',
          boards.chessboard(9, 6, 25.0)),
-        ("type: chessboard\ncols: 9\nrows: 6\nsquare_size: 0.025\n", boards.chessboard(9, 6, 25.0)),
+        ("board.yaml", "type: chessboard\ncols: 9\nrows: 6\nsquare_size: 0.025\n",
+         boards.chessboard(9, 6, 25.0)),
+        ("calib.io_charuco_420x297_8x11_34_25_DICT_5X5.pdf", "",
+         boards.charuco(11, 8, 34.0, 25.0, "DICT_5X5_1000")),
+        ("calib.io_checker_200x150_8x11_15.pdf", "", boards.chessboard(10, 7, 15.0)),
+        ("calib.io_checker_A4_7x8_18.5.png", "", boards.chessboard(7, 6, 18.5)),
+        ("calib.io_checker_A4_7x8_18.5", "", boards.chessboard(7, 6, 18.5)),
     ],
 )  # fmt: skip
-def test_files_that_describe_boards(tmp_path, text, expected):
+def test_boards_by_a_file_that_describes_them_or_by_calib_ios_name(tmp_path, name, text, expected):
     """Keys may have underscores and units; a chessboard has one more square than corners."""
-    (tmp_path / "board.yaml").write_text(text)
-    field, description = read_board(tmp_path / "board.yaml")
-    assert " × " in description
+    if text:
+        (tmp_path / name).write_text(text)
+    field, description = read_board(tmp_path / name)
+    assert (" × " if text else "calib.io") in description
     assert field.names == expected.names
     assert field.codes == expected.codes
     assert field.points == pytest.approx(expected.points)
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"),
+    ("name", "text", "reason"),
     [
-        ("calib.io_charuco_420x297_8x11_34_25_DICT_5X5.pdf",
-         boards.charuco(11, 8, 34.0, 25.0, "DICT_5X5_1000")),
-        ("calib.io_checker_200x150_8x11_15.pdf", boards.chessboard(10, 7, 15.0)),
-        ("calib.io_checker_A4_7x8_18.5.png", boards.chessboard(7, 6, 18.5)),
-        ("calib.io_checker_A4_7x8_18.5", boards.chessboard(7, 6, 18.5)),
-    ],
-)  # fmt: skip
-def test_boards_of_calib_io_by_file_name(tmp_path, name, expected):
-    field, description = read_board(tmp_path / name)
-    assert "calib.io" in description
-    assert field.codes == expected.codes
-    assert field.points == pytest.approx(expected.points)
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("calib.io_checker_A4_7x8_1.8.5.pdf", r"1\.8\.5\.pdf"),
+        *(("board.yaml", f"{KALIBR}start_id: {start}\n", r"board\.yaml, key startid")
+          for start in ("abc", "-3", "[1]")),
+        ("board.yaml", KALIBR.replace("0.04", "-0.04"), "tagsize"),
+        ("board.yaml", KALIBR.replace("tagCols: 6", "tagCols: 1e9"), "tagcols"),
+        ("board.yaml", KALIBR.replace("aprilgrid", "circlegrid"), "aprilgrid, checkerboard"),
+        ("board.yaml", OPENCV.replace("5X5_250", "9X9"), "9X9"),
+        ("board.yaml", "[1, 2]", "key: value"),
+        ("calib.io_checker_A4_7x8_1.8.5.pdf", "%PDF-1.4\n", r"1\.8\.5\.pdf"),
         # without the marker size, the option to give is named
-        ("calib.io_charuco_279x215_8x11_24_DICT_4X4.pdf",
+        ("calib.io_charuco_279x215_8x11_24_DICT_4X4.pdf", "",
          "--charuco 11x8 --square 24 with --marker"),
     ],
 )  # fmt: skip
-def test_incomplete_names_of_calib_io_are_refused(tmp_path, name, reason):
-    if "checker" in name:
-        (tmp_path / name).write_bytes(b"%PDF-1.4\n\xff")
+def test_other_files_are_refused(tmp_path, name, text, reason):
+    if text:
+        (tmp_path / name).write_bytes(text.encode() + b"\xff" * text.startswith("%"))
     with pytest.raises(TestFieldError, match=reason):
         read_board(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        *((f"{KALIBR}start_id: {start}\n", r"board\.yaml, key startid")
-          for start in ("abc", "-3", "[1]")),
-        (KALIBR.replace("0.04", "-0.04"), "tagsize"),
-        (KALIBR.replace("tagCols: 6", "tagCols: 1e9"), "tagcols"),
-        (KALIBR.replace("aprilgrid", "circlegrid"), "aprilgrid, checkerboard"),
-        (OPENCV.replace("5X5_250", "9X9"), "9X9"),
-        ("[1, 2]", "key: value"),
-    ],
-)  # fmt: skip
-def test_other_files_are_refused(tmp_path, text, reason):
-    (tmp_path / "board.yaml").write_text(text)
-    with pytest.raises(TestFieldError, match=reason):
-        read_board(tmp_path / "board.yaml")
 
 
 def test_ring_targets_are_numbered_as_in_other_programs(tmp_path):

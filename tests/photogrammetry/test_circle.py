@@ -10,7 +10,6 @@ import pytest
 from tests.photogrammetry.exact_rendering import Scene, noisy, rms
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
 from tests.photogrammetry.single_targets import AT_ORIGIN, SIZE, SingleTargets, single_targets
-from thermocald.photogrammetry.frame.tracking import GradientWeights
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.frame_status import NoiseModel
 from thermocald.photogrammetry.targets.outline import local_maps
@@ -102,22 +101,6 @@ def test_the_eccentricity_is_corrected(targets):
     assert np.abs(without[large]).max() > 0.05
 
 
-def test_distortion_across_the_target_counts(targets):
-    """Eccentricity of the perspective alone would leave a bias as large as the noise."""
-    pinhole = PI_CAMERA.interior.with_values(A1=0.0, A2=0.0, B1=0.0, B2=0.0)
-    with_lens, without_lens = (_frontal_map(interior) for interior in (PI_CAMERA.interior, pinhole))
-    assert np.abs(with_lens.second).max() > 5 * np.abs(without_lens.second).max()
-
-
-def _frontal_map(interior):
-    ray = PI_CAMERA.rays(np.array([[250.0, 200.0]]))[0]
-    centre = ray * 1000 / -ray[2]
-    return local_maps(
-        PI_SENSOR, interior.as_array(), AT_ORIGIN.as_array(), centre[None], np.array([[0, 0, 1.0]]),
-        np.array([7.0]),
-    )  # fmt: skip
-
-
 def _sixteen_bit(targets: SingleTargets) -> np.ndarray:
     """Return the clean patches in 16 bit."""
     image = np.full((PI_SENSOR.height, PI_SENSOR.width), 190 * 250, dtype=np.uint16)
@@ -138,22 +121,6 @@ def test_noise_that_grows_with_the_light_is_estimated(targets):
         over.append((fit.points - targets.true) / np.sqrt(np.einsum("nii->ni", fit.covariances)))
     assert fit.noise.gain == pytest.approx(0.06, abs=0.015)
     assert 0.9 <= rms(np.array(over)) <= 1.1
-
-
-def test_a_step_with_fixed_weights_is_at_the_bound_and_its_sigmas_are_true(targets):
-    frame = targets.frame(None, 0)
-    plain = np.zeros(len(targets.true), dtype=bool)
-    fit = fit_circles(frame, targets.maps, noise=KNOWN_NOISE)
-    weights = GradientWeights.build(frame, targets.maps, plain, fit.parameters, KNOWN_NOISE)
-    rng = np.random.default_rng(31)
-    over_bound, over_stated = [], []
-    for _ in range(60):
-        step = weights.apply(targets.frame(rng, NOISE))
-        error = step.parameters[:, :2] - targets.true
-        over_bound.append(error / targets.bound(NOISE))
-        over_stated.append(error / np.sqrt(np.einsum("nii->ni", step.covariances)))
-    assert rms(np.array(over_bound)) <= 1.25
-    assert 0.95 <= rms(np.array(over_stated)) <= 1.05
 
 
 def _one(diameter_px: float, at: tuple[float, float], spoil=None, **render):

@@ -99,12 +99,10 @@ def test_targets_outside_the_sample_are_adjusted(case):
 def test_processes_do_not_matter(case):
     """Blocks on two processes give the same bits as on one."""
     one, two = (blocked(case, 60, "mount", jobs) for jobs in (1, 2))
-    np.testing.assert_array_equal(two.rows.values, one.rows.values)
-    np.testing.assert_array_equal(two.rows.sd, one.rows.sd)
-    np.testing.assert_array_equal(two.rows.sigma0, one.rows.sigma0)
-    np.testing.assert_array_equal(two.level_sd, one.level_sd)
-    np.testing.assert_array_equal(two.trend_sd, one.trend_sd)
-    assert two.rows.status == one.rows.status
+    for name in ("values", "sd", "sigma0", "status"):
+        np.testing.assert_array_equal(getattr(two.rows, name), getattr(one.rows, name))
+    for name in ("level_sd", "trend_sd"):
+        np.testing.assert_array_equal(getattr(two, name), getattr(one, name))
 
 
 def test_a_knock_between_the_sampled_epochs_is_the_mounts():

@@ -176,6 +176,17 @@ def test_points_on_one_line_determine_no_pose():
     assert r.reason
 
 
+def test_points_seen_at_one_pixel_determine_no_pose():
+    """A camera far away fitted them, or a solver of OpenCV ended in a traceback."""
+    rng = np.random.default_rng(7)
+    for n in (4, 8):
+        _, field, seen = drawn(rng, control_points(n, rng), camera_covariance(), 10.0)
+        seen.points[:] = 900.0
+        r = resect(SENSOR, INTERIOR, camera_covariance(), field, seen)
+        assert r.status == "no_orientation"
+        assert "all seen at one place" in r.reason
+
+
 def test_a_staff_is_read_along_its_line():
     """The height on a staff at 12 m is right, and its sd smaller than that along the water."""
     Q = np.zeros((16, 16))

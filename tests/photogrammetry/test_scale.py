@@ -43,18 +43,6 @@ def found_at(frame, field, scale):
     return len(measure(frame if scale == 1 else small, field).observations)
 
 
-@pytest.fixture(scope="module")
-def aslant(sheet):
-    return frame_from(sheet, "near and aslant")
-
-
-@pytest.mark.slow
-def test_all_targets_of_a_tilted_sheet_are_found_at_every_scale(sheet, aslant):
-    frame, seen = aslant
-    found = [found_at(frame, sheet[0], scale) for scale in (1.0, 0.9, 0.75, 0.5, 0.25)]
-    assert min(found) >= 0.97 * seen >= 50
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("stand", STANDS)
 @pytest.mark.parametrize("noise", [0.0, 2.0])
@@ -68,8 +56,9 @@ def test_fifty_scales(sheet, stand, noise):
 
 
 @pytest.mark.slow
-def test_a_saturated_sheet_is_reported(sheet, aslant):
-    bright = np.clip(aslant[0].astype(float) * 1.6, 0, 255).astype(np.uint8)
+def test_a_saturated_sheet_is_reported(sheet):
+    frame, _ = frame_from(sheet, "near and aslant")
+    bright = np.clip(frame.astype(float) * 1.6, 0, 255).astype(np.uint8)
     status = measure(bright, sheet[0]).status
     assert status.word == "nothing_found"
     assert "saturated" in status.reason

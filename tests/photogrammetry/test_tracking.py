@@ -67,7 +67,6 @@ def no_search(monkeypatch):
     monkeypatch.setattr(tracking, "measure", search)
 
 
-@pytest.mark.slow
 def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search):
     z = []
     for _ in range(15):

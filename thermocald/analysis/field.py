@@ -380,8 +380,7 @@ def _sds(N: Array) -> Array:
     parts = vectors**2 / np.where(undetermined, 1.0, values)
     variance = parts[:, ~undetermined].sum(axis=1)
     lost = (vectors[:, undetermined] ** 2).sum(axis=1) > 1e-6
-    result: Array = np.where(lost, np.inf, np.sqrt(variance) * scale)
-    return result
+    return np.where(lost, np.inf, np.sqrt(variance) * scale)
 
 
 def assess_field(
@@ -456,5 +455,4 @@ def _extend_field(check: FieldCheck, parts: NDArray[np.int64], points: Array) ->
     with np.errstate(divide="ignore"):
         reach = ((centre - check.station.centre) @ axes[2]) / (rays @ axes[2])
     sensible = (reach > 0.4) & (reach < 2.5)
-    result: Array = check.station.centre + rays * np.where(sensible, reach, 1.0)[:, None]
-    return result
+    return check.station.centre + rays * np.where(sensible, reach, 1.0)[:, None]

@@ -72,10 +72,8 @@ def scaled_solve(N: Array, b: Array, ridge: float = 0.0) -> Array:
     """
     scaled, scale = unit_diagonal(N, ridge)
     if b.ndim < N.ndim:
-        x: Array = scale * np.linalg.solve(scaled, (scale * b)[..., None])[..., 0]
-        return x
-    columns: Array = scale[..., None] * np.linalg.solve(scaled, scale[..., None] * b)
-    return columns
+        return scale * np.linalg.solve(scaled, (scale * b)[..., None])[..., 0]
+    return scale[..., None] * np.linalg.solve(scaled, scale[..., None] * b)
 
 
 def explained(N: Array, b: Array, ridge: float = 0.0) -> Array:
@@ -110,8 +108,7 @@ def best_level(N: Array, b: Array) -> Array:
 
 def subtract_level(N: Array, b: Array) -> Array:
     """Return right-hand sides (E, p) reduced by the epochs' common values (`best_level`)."""
-    out: Array = b - N @ best_level(N, b)
-    return out
+    return b - N @ best_level(N, b)
 
 
 def inverse_of_determined(N: Array) -> Array:
@@ -124,12 +121,10 @@ def inverse_of_determined(N: Array) -> Array:
         factor = np.linalg.cholesky(scaled).astype(np.float64, copy=False)
         if factor.diagonal().min() > 1e-6:
             triangle = _inverse_of_triangle(factor)
-            regular: Array = (triangle.T @ triangle) * both
-            return regular
+            return (triangle.T @ triangle) * both
     except np.linalg.LinAlgError:
         pass
-    inverse: Array = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * both
-    return inverse
+    return np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * both
 
 
 def _inverse_of_triangle(L: Array) -> Array:
@@ -148,8 +143,7 @@ def inverse_2x2(M: Array) -> Array:
     """Invert matrices (n, 2, 2) in closed form; NumPy's decompositions take ten times as long."""
     a, b, c, d = (M[:, i, k] for i in (0, 1) for k in (0, 1))
     adjugate = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
-    inverse: Array = adjugate / (a * d - b * c)[:, None, None]
-    return inverse
+    return adjugate / (a * d - b * c)[:, None, None]
 
 
 def stacked_inverses(N: Array) -> tuple[Array, Mask]:
@@ -200,8 +194,7 @@ def correlation_matrix(covariance: Array) -> Array:
     """Return the correlation coefficients (p, p); 0 where a variance is not positive."""
     variance = np.diag(covariance)
     scale = 1.0 / np.sqrt(np.where(variance > 0, variance, np.inf))
-    r: Array = covariance * np.outer(scale, scale)
-    return r
+    return covariance * np.outer(scale, scale)
 
 
 def mad_sd(values: NDArray[np.floating[Any]], axis: int | None = None) -> Any:

@@ -214,21 +214,24 @@ def resection(
     """Return the possible exterior orientations, best first, each after its RMS residual in px.
 
     Points in one plane have two: if the second fits as well as the first, the pose is ambiguous.
-    Other points have one, or none if they contradict each other. Source: Collins and Bartoli
-    (2014), IPPE.
+    Other points have one, or none if they contradict each other or are all at one place. Source:
+    Collins and Bartoli (2014), IPPE.
     """
     X = np.ascontiguousarray(field_points, dtype=float)
     uv = np.asarray(image_points, dtype=float)
     ideal = _ideal(sensor, interior, uv)
     centre, axes, flat = plane_fit(X)
-    if flat:
-        poses = [_exterior(R, t) for R, t in _plane_poses(X, ideal, centre, axes)]
-    else:
-        found, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-        if not found:
-            return []
-        rvec, tvec = cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec)
-        poses = [_exterior(cv2.Rodrigues(rvec)[0], tvec.ravel())]
+    try:
+        if flat:
+            poses = [_exterior(R, t) for R, t in _plane_poses(X, ideal, centre, axes)]
+        else:
+            found, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+            if not found:
+                return []
+            rvec, tvec = cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec)
+            poses = [_exterior(cv2.Rodrigues(rvec)[0], tvec.ravel())]
+    except cv2.error:  # degenerate points fail an assertion of OpenCV's
+        return []
     rms = [float(np.sqrt(np.mean(_residuals(sensor, interior, p, X, uv) ** 2))) for p in poses]
     return sorted(zip(rms, poses, strict=True), key=lambda s: s[0])
 
@@ -293,7 +296,7 @@ def orient(
     candidates = [InteriorOrientation(c) for c in lengths] if interior is None else [interior]
     best = None
     for candidate in candidates if len(points) >= 6 else ():
-        with suppress(GeometryError, cv2.error, IndexError):
+        with suppress(GeometryError, IndexError):
             rms, pose = resection(sensor, candidate, points, image_points)[0]
             if best is None or rms < best[0]:
                 best = (rms, candidate, pose)

@@ -157,8 +157,7 @@ class FieldErrors:
 def _blocks(covariance: Array) -> Array:
     """Return covariances (n, 3), with elements xx, yy, xy, as matrices (n, 2, 2)."""
     xx, yy, xy = covariance.T
-    out: Array = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
-    return out
+    return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
 
 
 Change = Literal["", "outlier", "knock", "slip", "wrong_lens", "change"]
@@ -328,8 +327,7 @@ class OnlineFilter:
     def rates_covariance(self) -> Array:
         """Covariance (3, 3) of `rates`, mm²/K²."""
         n = len(self._free)
-        result: Array = self._P[n:, n:] * np.outer(self._scale[n:], self._scale[n:])
-        return result
+        return self._P[n:, n:] * np.outer(self._scale[n:], self._scale[n:])
 
     def values(self) -> Array:
         """Return the orientation (16,) at the last temperature, with held parameters."""
@@ -388,8 +386,7 @@ class OnlineFilter:
         """
         n = len(self._free)
         moment = np.outer(self._x[n:], self._x[n:]) + self._P[n:, n:]
-        result: Array = self._by_rate @ moment @ self._by_rate.T
-        return result
+        return self._by_rate @ moment @ self._by_rate.T
 
     def _name(self, adjustment: Adjustment, v: Array, S: Array) -> Change:
         """Name the change by the parameters that explain the innovation if only they are free."""

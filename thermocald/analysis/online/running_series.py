@@ -140,7 +140,7 @@ class _Together:
         if self.moved:
             grid = taken_off(grid, self.moved, slice(-1, None))
         seen = grid.targets(self.seen)
-        _, block = self.known.adjusted(seen, epochs, np.array([0.5]))
+        _, block = self.known.adjusted(seen, epochs, np.array([0.5]))  # the last of the series
         return self.epoch(0, block.spread(self.seen, grid.points.shape[1]))
 
 

@@ -132,8 +132,7 @@ class Epochs(Result):
             known = ", ".join(PARAMETER_NAMES)
             raise AttributeError(f"Epochs has no {name!r}; the parameters are {known}")
         table = self.sd if name != column else self.values
-        values: Array = table[:, PARAMETER_NAMES.index(column)]
-        return values
+        return table[:, PARAMETER_NAMES.index(column)]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is pickled: not `without`, a function that holds the observations."""

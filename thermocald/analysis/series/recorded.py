@@ -104,8 +104,7 @@ def _start(
         common = max(statuses, key=statuses.count, default="")
         why = next((r.reason for r in results if r.status == common), "no target was measured")
         raise DataError(f"{source.head.name}: no epoch has a result; most often: {why}")
-    start: Array = np.median(found, axis=0)
-    return start
+    return np.median(found, axis=0)
 
 
 def misplaced_doubts(recording: Recording, rows: Index, values: Array) -> list[str]:

@@ -91,8 +91,7 @@ class Population:
     @property
     def prior(self) -> Array:
         """The covariance (k, k) of one more specimen's true values."""
-        covariance: Array = self.between + self.mean_covariance
-        return covariance
+        return self.between + self.mean_covariance
 
     def posterior(self, values: Array, information: Array, gradient: Array | None = None) -> Shrunk:
         """Return a new specimen from its own estimate, shrunk towards the type.
@@ -108,8 +107,7 @@ class Population:
 
         def moved(between: Array) -> Array:
             other = _posterior(between + self.mean_covariance, information)
-            step: Array = (self.mean + other @ push - found) / _STEP
-            return step
+            return (self.mean + other @ push - found) / _STEP
 
         # effect of the errors of Σ on the values, after Kackar and Harville (1984): of its
         # variances, and of its correlations

@@ -93,8 +93,7 @@ def correct_points(
     r = rays(sensor, along.values[place], points[:, None, :])
     direction = (r / -r[..., 2:])[:, 0]
     corrected = project(sensor, steady, np.zeros(6), direction)
-    _, J, _ = partials(sensor, steady, np.zeros(6), direction)
-    J = J[:, :, :10]
+    J = partials(sensor, steady, np.zeros(6), direction)[1][..., IOP]
     sds = np.sqrt(np.einsum("ncp,npq,ncq->nc", J, along.covariance[place], J, optimize=True))
     return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
 
@@ -118,10 +117,10 @@ def image_corrections(
     points = np.stack([pixels % sensor.width, pixels // sensor.width], axis=1).astype(float)
     ideal = ideal_points(sensor, steady, points)
     direction = np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)
-    _, J, _ = partials(sensor, steady, np.zeros(6), direction)
-    J = J[:, :, :10]
+    J = partials(sensor, steady, np.zeros(6), direction)[1][..., IOP]
     found = []
-    for now in map(along.__getitem__, range(len(along))):
+    for i in range(len(along)):
+        now = along[i]
         seen = project(sensor, now.values, np.zeros(6), direction)
         shift = np.linalg.norm(seen - points, axis=1)
         variance = np.einsum("ncp,pq,ncq->nc", J, now.covariance, J, optimize=True)

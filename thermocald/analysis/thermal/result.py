@@ -133,7 +133,7 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
-_ROUGH = 1.25  # times the noise left over, from which a rate of change was not what readings show
+_ROUGH = 1.25  # times the noise left over, beyond which the readings did not show the true rate
 _SELDOM = 0.05  # bias of a delay by curvature between readings, over their interval
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]

@@ -247,14 +247,12 @@ def rotation(angles: ArrayLike) -> Array:
     r = np.array(rows)
     if a.ndim > 1:
         r = np.ascontiguousarray(np.moveaxis(r, 0, -1))
-    square: Array = r.reshape(*a.shape[:-1], 3, 3)
-    return square
+    return r.reshape(*a.shape[:-1], 3, 3)
 
 
 def _turned(R: Array, eop: Array, points: Array) -> Array:
     """Return camera coordinates (..., 3, n), an order in which later steps write contiguously."""
-    turned: Array = R.swapaxes(-1, -2) @ (points.swapaxes(-1, -2) - eop[..., 3:6, None])
-    return turned
+    return R.swapaxes(-1, -2) @ (points.swapaxes(-1, -2) - eop[..., 3:6, None])
 
 
 def image_to_mm(sensor: Sensor, image_points: ArrayLike) -> Array:

@@ -238,8 +238,7 @@ def cofactor_root(N: Array, unknowns: Index, damping: float = 0.0) -> Array:
             f"the normal matrix is singular (smallest eigenvalue {eigenvalues[0]:.1e}): these "
             f"targets cannot separate {together}"
         )
-    root: Array = scale[:, None] * np.linalg.inv(factor).T
-    return root
+    return scale[:, None] * np.linalg.inv(factor).T
 
 
 def solve(problem: Problem, start: Array, use: Mask) -> Solution:

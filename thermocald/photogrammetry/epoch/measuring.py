@@ -78,6 +78,9 @@ def resect(
     if extent[1] <= _THIN * extent[0]:
         why = "the control points lie on one line, about which the camera can turn: add one beside"
         return failed("no_orientation", why, observations)
+    if (np.ptp(observations.points, axis=0) <= observations.sigmas.max()).all():
+        why = "the control points are all seen at one place in the image; check x, y (px)"
+        return failed("no_orientation", why, observations)
     suspects, pose = None, start
     if pose is None:
         try:

@@ -103,8 +103,7 @@ class Network:
     @property
     def sigmas(self) -> Array:
         """Standard deviations (m, 3) mm of the targets."""
-        result: Array = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
-        return result
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
 
     @property
     def extent(self) -> float:

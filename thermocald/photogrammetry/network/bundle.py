@@ -199,8 +199,7 @@ class BundleAdjustment:
         points = bundle.points[self.rays.target][:, None, :]
         computed = project(self.sensor, bundle.interior, eop, points)[:, 0]
         v = np.einsum("nij,nj->ni", self.rays.whitening, self.rays.points - computed)
-        result: Array = np.where(np.isfinite(v), v, BEHIND)
-        return result
+        return np.where(np.isfinite(v), v, BEHIND)
 
     def solve(self, bundle: Bundle, *, robust: bool = False, iterations: int = 30) -> Bundle:
         """Adjust a bundle to the image points.
@@ -393,8 +392,7 @@ class BundleAdjustment:
         smooth = smooth.reshape(len(squares), 2, 6)
         E = np.concatenate([by_camera[:, :, : len(columns)], bent, smooth], axis=2)
         size = np.sqrt(np.mean(np.sum(E * E, axis=1), axis=0))
-        scaled: Array = E / np.where(size > 0, size, 1.0)
-        return scaled
+        return E / np.where(size > 0, size, 1.0)
 
     def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""

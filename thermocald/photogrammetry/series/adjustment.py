@@ -324,8 +324,7 @@ def _excess(series: SeriesEstimator, values: Array, variances: Array, sound: Mas
         for w in series.windows or (slice(0, len(values)),)
         if sound[w].any() or not series.windows
     ]
-    out: Array = np.mean(parts, axis=0) if parts else np.zeros(values.shape[1])
-    return out
+    return np.mean(parts, axis=0) if parts else np.zeros(values.shape[1])
 
 
 def epoch_variance(unit: Array, redundancy: Array, pooled: float) -> Array:

@@ -73,8 +73,7 @@ class FieldSeries:
     @property
     def used(self) -> Mask:
         """Mask (E, T) of the image points with a residual and a weight."""
-        out: Mask = np.isfinite(self.residuals[..., 0]) & (self.weights[..., 0] > 0)
-        return out
+        return np.isfinite(self.residuals[..., 0]) & (self.weights[..., 0] > 0)
 
     @property
     def w(self) -> Array:
@@ -249,8 +248,7 @@ def _usual_limits(s: FieldSeries, power: Array, there: Mask) -> Array:
     limits = np.full(len(power), float(np.percentile(power[there], _MOST)))
     for board in np.unique(s.boards[there & (s.boards >= 0)]):
         limits[s.boards == board] = np.percentile(power[there & (s.boards == board)], _MOST)
-    out: Array = np.where(there | ~s.used.any(axis=0), np.maximum(OTHERS * limits, GAIN), np.inf)
-    return out
+    return np.where(there | ~s.used.any(axis=0), np.maximum(OTHERS * limits, GAIN), np.inf)
 
 
 def _slow_movement(s: FieldSeries, row: int) -> Array:
@@ -285,8 +283,7 @@ def with_free_cameras(s: FieldSeries) -> FieldSeries:
 def weighted_products(w: Array, a: Array, b: Array) -> Array:
     """Return Σ w a bᵀ (E, p, q) for weights (E, n) and partials (n, p), (n, q)."""
     pairs = (a[:, :, None] * b[:, None, :]).reshape(len(a), -1)
-    out: Array = (w @ pairs).reshape(len(w), a.shape[1], b.shape[1])
-    return out
+    return (w @ pairs).reshape(len(w), a.shape[1], b.shape[1])
 
 
 def cosines(times: Array) -> Array:
@@ -294,8 +291,7 @@ def cosines(times: Array) -> Array:
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     rows = np.cos(np.pi * np.arange(1, _ORDERS + 1)[:, None] * u[None])
     rows = rows - rows.mean(axis=1, keepdims=True)
-    out: Array = np.linalg.qr(rows.T)[0].T
-    return out
+    return np.linalg.qr(rows.T)[0].T
 
 
 def _wanderer(s: FieldSeries, free: FieldSeries, row: int) -> FieldMovement:

@@ -163,8 +163,7 @@ def _remove_leak(trajectory: Array, period: float) -> Array:
     u = np.linspace(-1.0, 1.0, n)
     basis = np.stack([u**k for k in range(1, _LEAK_DEGREE + 1)], axis=1)
     fast, _, _, _ = np.linalg.lstsq(_cosines(basis)[low:], _cosines(trajectory)[low:], rcond=None)
-    clean: Array = trajectory - basis @ fast
-    return clean
+    return trajectory - basis @ fast
 
 
 def _cosines(trajectory: Array) -> Array:
@@ -277,8 +276,7 @@ class Movement:
     def _whitening(self) -> Array:
         """Return T (6, 6) with T · noise · Tᵀ = 1."""
         scaled, scale = unit_diagonal(self.noise)
-        whitening: Array = symmetric_power(scaled, -0.5, 1e-12) * scale
-        return whitening
+        return symmetric_power(scaled, -0.5, 1e-12) * scale
 
     def precision(self) -> Array:
         """Return the inverse covariance (6, 6) of the movements about the shifted mean pose.
@@ -394,8 +392,7 @@ def _without_drift(change: Array) -> Array:
     """Return changes (E - 1, k) between neighbours less the median of those around."""
     padded = np.pad(change, ((_SIDE, _SIDE), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE + 1, axis=0)
-    out: Array = change - np.median(windows, axis=-1)
-    return out
+    return change - np.median(windows, axis=-1)
 
 
 def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:

@@ -190,8 +190,7 @@ def normal_matrices(weights: Array, A: Array) -> Array:
         flat += weights[..., 2] @ xy
     pair = np.empty((k, k), dtype=np.int64)  # an element's column in `flat`
     pair[rows, columns] = pair[columns, rows] = np.arange(len(rows))
-    N: Array = np.take(flat, pair, axis=1)
-    return N
+    return np.take(flat, pair, axis=1)
 
 
 def products(A: Array) -> tuple[Array, Array, Array]:

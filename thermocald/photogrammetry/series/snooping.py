@@ -71,8 +71,7 @@ def _variances(tests: Array, used: Mask) -> Array:
     ordered = np.where(used, tests, np.inf)
     ordered.sort(axis=1)
     middle = ordered[np.arange(len(n)), half]
-    variance: Array = np.where(n > 0, middle, 1.0) / MEDIAN_CHI2
-    return variance
+    return np.where(n > 0, middle, 1.0) / MEDIAN_CHI2
 
 
 def typical_variance(tests: Array, used: Mask) -> float:

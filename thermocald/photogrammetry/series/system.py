@@ -199,8 +199,7 @@ class SeriesSystem:
 
     def used(self, rows: Index | Mask | slice = slice(None)) -> Array:
         """Return the weights (e, T, 3) of some epochs, 0 for points not in use."""
-        used: Array = self.weights[rows] * self.use[rows][..., None]
-        return used
+        return self.weights[rows] * self.use[rows][..., None]
 
     def common_normals(self, count: Array | None = None) -> Array:
         """Return the normal matrix of the common unknowns, with all own parameters reduced.
@@ -292,8 +291,7 @@ class SeriesSystem:
     @property
     def prior_cofactors(self) -> Array:
         """Part (E, p, p) of the own parameters' cofactors that the priors contribute, Q P Q."""
-        part: Array = self.Q @ self.design.own_prior @ self.Q
-        return part
+        return self.Q @ self.design.own_prior @ self.Q
 
     def own_gradient(self, residuals: Array, state: State) -> Array:
         """Return the gradient (E, p) of the own parameters and their priors; 0 at the solution."""

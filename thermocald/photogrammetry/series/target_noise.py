@@ -283,5 +283,4 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) ->
         # The mean counts epochs that scatter more, as when a passer-by hides half of the targets.
         ratio, worth = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0), left
     significant = ratio > 1 + 1.65 * np.sqrt(2 / (worth * n))
-    excess: Array = np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)
-    return excess
+    return np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)

@@ -223,8 +223,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
         part = np.where(use & mask, grey, np.nan)
         empty = ~np.isfinite(part).any(axis=1)
         part[empty] = grey[empty]
-        median: Array = np.nanmedian(part, axis=1)
-        return median
+        return np.nanmedian(part, axis=1)
 
     background = share(depth < -1)
     contrast = share(depth > 1) - background

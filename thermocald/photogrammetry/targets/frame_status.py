@@ -41,8 +41,7 @@ class NoiseModel:
         self, grey: NDArray[np.floating[Any]] | np.floating[Any]
     ) -> NDArray[np.floating[Any]]:
         """Return the variance at grey values, DN², at least that of quantisation."""
-        v: NDArray[np.floating[Any]] = np.maximum(self.floor + self.gain * grey, _QUANTISATION)
-        return v
+        return np.maximum(self.floor + self.gain * grey, _QUANTISATION)
 
     def scaled(self, factor: float) -> NoiseModel:
         """Return the noise model with all variances times a factor."""

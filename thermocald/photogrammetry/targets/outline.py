@@ -263,8 +263,7 @@ def _squared_radius(M: Array, centre: Array, powers: Single) -> Single:
     shift = (M @ centre[:, :, None])[:, :, 0]
     constant = np.where(M[:, 0, 0] > 0, np.sum(shift * centre, axis=1), 2.0)
     by_power = [M[:, 0, 0], 2 * M[:, 0, 1], M[:, 1, 1], *(-2 * shift.T), constant]
-    squared: Single = np.stack(by_power, axis=1).astype(np.float32) @ powers
-    return squared
+    return np.stack(by_power, axis=1).astype(np.float32) @ powers
 
 
 def _background_and_contrast(image: Image, maps: LocalMap) -> Array:
@@ -375,8 +374,7 @@ def _moments(
     cross = x1 * y - x * y1
 
     def integral(values: Array) -> Array:
-        total: Array = np.add.reduceat(values, first)
-        return total
+        return np.add.reduceat(values, first)
 
     area = integral(cross) / 2
     length = integral(np.hypot(x1 - x, y1 - y))

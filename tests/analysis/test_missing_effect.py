@@ -151,6 +151,20 @@ def test_inside_the_family_nothing_is_missing():
         assert not f.model.misses_an_effect
 
 
+@pytest.mark.slow
+def test_a_misfit_too_small_for_an_effect_is_stated(tmp_path):
+    """The preset's distortion also drifts: 0.015 px, which no 95 % band leaves out."""
+    recording, page = tmp_path / "M1", tmp_path / "page.html"
+    run("simulate", "--preset", "rpi-v2.1-heating", "--seed", "31", "-o", recording)
+    fitted = run(
+        "fit", recording, "-o", tmp_path / "m.yaml", "--effect", "permanent_set", "--report", page
+    )
+    left = "smooth trajectories of 0.01"
+    assert "valid from" in fitted.stdout
+    assert f"left over: {left}" in fitted.stdout
+    assert f"Left over: {left}" in page.read_text()
+
+
 def test_the_commands_report_it(tmp_path):
     for k, name in enumerate(("M1", "M2")):
         simulated(k, name, listed=(ModelEffect(*CASES["lag"]),)).write(tmp_path / name)

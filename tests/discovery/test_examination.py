@@ -279,3 +279,21 @@ def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
     rows = found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]
     assert "rate of temperature" in [row["what"] for row in rows]
     assert "<svg" in report_html(found, "long")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [32, 35])
+def test_two_small_effects_are_no_motion_of_the_mount(seed, tmp_path):
+    """The distortion of the preset's camera drifts radially and by decentering.
+
+    The mount's six coefficients imitate these together better than one of them fits alone.
+    """
+    found = tc.discover(tc.simulate("rpi-v2.1-heating", seed=seed, out=tmp_path / "M1"))
+
+    (entry,) = [e for e in found.effects if e.effect in ("mount_motion", "decentering_drift")]
+    listed = [entry.effect, *(a["effect"] for a in entry.alternatives)]
+    assert {32: "decentering_drift", 35: "decentering_drift+radial_distortion_drift"}[
+        seed
+    ] in listed
+    assert (entry.effect == "decentering_drift") == (seed == 32)
+    assert "radial_distortion_drift" not in listed

@@ -246,7 +246,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     kept = len(base.terms)
     base_adequacy = examine_all(fitter, base.fit)
     best, ranking, seen = base, list[Solution](), list[Solution]()
-    frontier = [base]
+    frontier, larger = [base], base
     complete = False
     for level in range(1, _EFFECTS + 1):
         beside = " or ".join(", ".join(s.names) for s in frontier) if level > 1 else "the base"
@@ -261,6 +261,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         seen += grown
         if complete:
             equal = [s for s in frontier if s.score < best.score + criteria.BAND]
+            larger = min(grown, key=by_score, default=best)
             grown = [s for s in grown if _may_replace(base, best, equal, s)]
         if not grown:
             break
@@ -276,10 +277,15 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         if complete or level == 1:  # the best solutions, one per set of names
             sets = {tuple(sorted(s.names)): s for s in sorted(grown, key=lambda s: -s.score)}
             frontier = sorted(sets.values(), key=by_score)[:_WIDTH]
-    # rejected larger combinations are no rivals
-    seen = [s for s in seen if len(s.terms) <= len(best.terms)]
+    # a larger combination that was rejected is a rival if two effects in it do better than one here
+    seen = [s for s in seen if len(s.terms) <= len(best.terms) or _does_better(s, best)]
     if len(best.terms) > kept:
+        decides = _does_better(larger, best, by=criteria.BAND)
         best, seen = _compare_ties(search, best, seen)
+        if decides:  # its last effect is too small for a name, but shows which tie is right
+            ties = [s for s in seen if s.score < best.score + criteria.BAND]
+            inside = [s for s in ties if set(s.names) < set(larger.names)]
+            best = min(inside, key=by_score, default=best)
         # The likelihood takes all trajectories of the temperature as equally probable. A lag
         # smooths the thermometer's noise, a delay does not, so a smooth image would always favour
         # a lag: only the fit decides.
@@ -318,7 +324,10 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
         different = sorted(s.names) != sorted(best.names)
         if different and close and s.names not in [r.names for r in out]:
             out.append(s)
-    return tuple(out)
+    # a larger one says nothing new if it contains another
+    more = [s for s in out if len(s.terms) > len(best.terms)]
+    said = [s for s in more if any(set(r.names) < set(s.names) for r in (best, *out))]
+    return tuple(s for s in out if s not in said)
 
 
 def _compare_ties(
@@ -330,12 +339,20 @@ def _compare_ties(
         return best, seen
     fitter = search.fitter
     again: list[Solution] = []
-    for s in sorted(close.values(), key=by_score)[:6]:
+    near = sorted(close.values(), key=by_score)
+    small = [s for s in near if len(s.terms) <= len(best.terms)]
+    large = [s for s in near if s not in small]
+    for s in (*small[:6], *large[:2]):
         objective = fitter.suit_thermometers(s.fit)
         again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
-    again.sort(key=by_score)
+    first = min(again[: len(small)], key=by_score)
     others = [s for s in seen if s.terms not in close]
-    return again[0], [*again, *others]
+    return first, [*sorted(again, key=by_score), *others]
+
+
+def _does_better(larger: Solution, best: Solution, by: float = 0.0) -> bool:
+    """Test whether a larger combination without one of the best one's effects scores better."""
+    return larger.score < best.score - by and not set(best.names) <= set(larger.names)
 
 
 def _may_replace(

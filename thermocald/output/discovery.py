@@ -383,8 +383,8 @@ def _effect(effect: EffectFound) -> Section:
     if excluded:
         text.append("These data cannot exclude the following alternatives.")
     items = [
-        (a["effect"], (f"its score is {a['score_difference']:.1f} worse. To separate them: "
-         f"{a['experiment']}."))
+        (a["effect"], (f"its score is {abs(d := a['score_difference']):.1f} "
+         f"{'worse' if d >= 0 else 'better'}. To separate them: {a['experiment']}."))
         for a in excluded
     ]  # fmt: skip
     if alike := dict.fromkeys(a["effect"] for a in effect.alternatives if a.get("resembles")):

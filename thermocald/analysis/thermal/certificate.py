@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.thermal.model_text import describe_small_misfit
 from thermocald.figures import BAND, Curve, Figure, Panel
 from thermocald.numbers import UNITS, parameter_label, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
@@ -94,7 +95,9 @@ def _assess_misfit(document: Mapping[str, Any]) -> str:
             f"An effect is missing: the residuals have smooth trajectories{size}. They are "
             "included in the standard deviations, and no 95 % band is given."
         )
-    return "The residuals are no larger than the noise."
+    if left := describe_small_misfit(document):
+        return f"Left over: {left}."
+    return "The residuals have no smooth trajectories beyond the noise."
 
 
 def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:

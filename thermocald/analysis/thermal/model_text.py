@@ -9,6 +9,7 @@ from thermocald.numbers import with_sd
 from thermocald.physics.formula import say_together
 from thermocald.physics.model import SURE
 from thermocald.store.recording.sense import doubt_lines
+from thermocald.thermal.criteria import NEGLIGIBLE_PX, SIGNIFICANT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,6 +18,17 @@ if TYPE_CHECKING:
 _UNSEEN = 0.5
 """A parameter with a larger weight of the type counts as the type's."""
 _UNKNOWN = {"": (math.nan, math.nan)}
+
+
+def describe_small_misfit(document: Mapping[str, Any]) -> str:
+    """Return what a significant misfit is that is too small to be a missing effect, "" if none."""
+    sigmas, left = document.get("significance_sigmas") or 0.0, document.get("misfit_px") or 0.0
+    if document.get("effect_missing") or sigmas < SIGNIFICANT or left < NEGLIGIBLE_PX:
+        return ""
+    return (
+        f"smooth trajectories of {left:.3f} px ({sigmas:.0f} standard deviations), small beside "
+        "the noise; the standard deviations include them"
+    )
 
 
 def model_lines(document: Mapping[str, Any]) -> list[str]:
@@ -51,6 +63,8 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         )
     else:
         lines.append(f"  valid from {low:g} to {high:g} °C, {T0}")
+        if left := describe_small_misfit(document):
+            lines.append(f"  left over: {left}; thermocald discover looks for the cause")
     sure = document.get("distortion_sigmas")
     if sure is not None and document["distortion"] == "image":
         lines.append(

@@ -1,0 +1,136 @@
+"""Jumps of a series: a knock of the mount, a slip of a lens, and what happened in a gap.
+
+The trajectory may have jumps, if the mount was knocked or a lens slipped. A jump that the
+perspective attributes to the interior orientation is the camera's; every other one is a step of the
+mount's mean pose, estimated from the jump itself. In a gap the camera may drift: only the
+perspective shows whether the mount moved, and by how much.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermocald.photogrammetry.linalg import inverse_of_determined, mad_sd
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermocald.arrays import Array
+
+    Step = tuple[Array, Array]
+    """A step (k,) of the pose and the weights (k,) of what is known of it."""
+
+
+_LARGE = 8.0  # robust standard deviations of the change between neighbours
+_LASTING = 0.5  # share of the change that must remain
+SIDE = 8  # epochs before and after a jump that give its step
+_MOST = 8  # jumps examined
+_LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
+_EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
+_SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
+
+
+def find_jumps(
+    trajectory: Array, M: Array, g: Array, gaps: Sequence[int]
+) -> tuple[Array, dict[int, Step], Array]:
+    """Find the mount's jumps in a trajectory (E, k), in units of its noise.
+
+    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; gaps:
+    the first epoch after each gap. Returns the trajectory without any jumps, what is known of the
+    mount's by their first epoch, and the covariance (k, k) of a step in a gap that shows none.
+    """
+    jumps: dict[int, Step]
+    left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
+    # in a gap the camera drifts, too: only the perspective shows how far the mount moved
+    for row in gaps:
+        step, _ = _step(left, row)
+        left[row:] -= step
+        jumps[row] = np.zeros_like(step), _loose(step)
+    for row, (moved, V) in zip(gaps, estimate_steps(M, g, jumps), strict=True):
+        if _chi2(moved, V) < _SHOWN:
+            del jumps[row]
+            hidden = max(hidden, V, key=np.trace)
+    noise = np.maximum(mad_sd(_without_drift(np.diff(left, axis=0)), axis=0), np.sqrt(2.0))
+    examined = {*gaps}
+    while len(examined) < _MOST + len(gaps) and len(left) >= 4 * SIDE:
+        change = _without_drift(np.diff(left, axis=0))
+        size = np.abs(change) / noise
+        for row in examined:
+            size[row - 1] = 0.0
+        worst = int(size.max(axis=1).argmax())
+        row, column = worst + 1, int(size[worst].argmax())
+        if size[worst, column] < _LARGE:
+            break
+        examined.add(row)
+        step, factor = _step(left, row)
+        lasting = _step(left, row, 1)[0][column]  # a spike is no jump
+        if abs(lasting) < _LASTING * abs(change[worst, column]):
+            continue
+        left[row:] -= step
+        if jump := _find_mover(row, step, factor * noise**2 / 2, M, g):
+            jumps[row] = jump
+    return left, dict(sorted(jumps.items())), hidden
+
+
+def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[Array, Array]]:
+    """Estimate the steps (k,) of the pose at some epochs, and their covariances (k, k).
+
+    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps, in order of time.
+    """
+    k = g.shape[1]
+    starts = [0, *jumps]
+    sums = [M[row:].sum(axis=0) for row in starts]
+    each = range(len(starts))
+    N = np.block([[sums[max(i, j)] for i in each] for j in each])
+    right = np.concatenate([g[row:].sum(axis=0) for row in starts])
+    for j, (step, weights) in enumerate(jumps.values(), start=1):
+        own = np.arange(j * k, (j + 1) * k)
+        N[own, own] += weights
+        right[own] += weights * step
+    Q = inverse_of_determined(N)
+    found = (Q @ right).reshape(-1, k)
+    Q = Q.reshape(len(starts), k, len(starts), k)
+    return [(found[j], Q[j, :, j]) for j in each[1:]]
+
+
+def _without_drift(change: Array) -> Array:
+    """Return changes (E - 1, k) between neighbours less the median of those around."""
+    padded = np.pad(change, ((SIDE, SIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * SIDE + 1, axis=0)
+    return change - np.median(windows, axis=-1)
+
+
+def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
+    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's.
+
+    apart: number of epochs on both sides that do not count.
+    """
+    t = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory))) - row
+    t = t[(t < -apart) | (t >= apart)]
+    estimator = np.linalg.pinv(np.column_stack([np.ones(len(t)), t, t >= 0]))[2]
+    return estimator @ trajectory[row + t], float(estimator @ estimator)
+
+
+def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:
+    """Return what is known of a jump of the pose; None if the camera jumped.
+
+    step, variance (k,): of the trajectory. If the perspective excludes neither that the mount
+    jumped nor that the camera did, it alone shows how far.
+    """
+    ((moved, V),) = estimate_steps(M, g, {row: (step, np.zeros_like(step))})
+    if _chi2(moved, V) > _EXCLUDED:
+        return step, 1.0 / variance
+    if _chi2(step - moved, V + np.diag(variance)) > _EXCLUDED:
+        return None
+    return np.zeros_like(step), _loose(step)
+
+
+def _loose(step: Array) -> Array:
+    """Return the weights (k,) of a step that is hardly larger than this change of the image."""
+    return np.full_like(step, 1.0 / max(_LOOSE * float(step @ step), 1e-12))
+
+
+def _chi2(difference: Array, covariance: Array) -> float:
+    return float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)

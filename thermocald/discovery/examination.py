@@ -228,7 +228,8 @@ def _search_beside_knocks(
         say("alongside a knock of the mount")
         base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
         again = _search_standing(search, base, jobs)
-        if again.adequate:
+        # beside steps with six free coefficients each, several effects could imitate anything
+        if again.adequate and len(again.best.terms) <= len(base.terms) + 1:
             return replace(again, knocks=knocks, as_slips=(False,) * len(knocks))
     return None
 
@@ -345,7 +346,7 @@ def _compare_ties(
     for s in (*small[:6], *large[:2]):
         objective = fitter.suit_thermometers(s.fit)
         again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
-    first = min(again[: len(small)], key=by_score)
+    first = min(again[: len(small[:6])], key=by_score)
     others = [s for s in seen if s.terms not in close]
     return first, [*sorted(again, key=by_score), *others]
 

@@ -17,7 +17,7 @@ from thermocald.photogrammetry.linalg import inverse_of_determined, mad_sd
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
     Step = tuple[Array, Array]
     """A step (k,) of the pose and the weights (k,) of what is known of it."""
@@ -27,6 +27,7 @@ _LARGE = 8.0  # robust standard deviations of the change between neighbours
 _LASTING = 0.5  # share of the change that must remain
 SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
+_ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from both
 _LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
 _EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
@@ -56,7 +57,7 @@ def find_jumps(
     examined = {*gaps}
     while len(examined) < _MOST + len(gaps) and len(left) >= 4 * SIDE:
         change = _without_drift(np.diff(left, axis=0))
-        size = np.abs(change) / noise
+        size = np.where(_is_abrupt(np.diff(left, axis=0)), np.abs(change) / noise, 0.0)
         for row in examined:
             size[row - 1] = 0.0
         worst = int(size.max(axis=1).argmax())
@@ -100,6 +101,20 @@ def _without_drift(change: Array) -> Array:
     padded = np.pad(change, ((SIDE, SIDE), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * SIDE + 1, axis=0)
     return change - np.median(windows, axis=-1)
+
+
+def _is_abrupt(change: Array) -> Mask:
+    """Return whether changes (E - 1, k) between neighbours stand out from those next to them.
+
+    Where a camera warms up steeply, each change is large, but a little smaller than the last.
+    """
+    usual, next_to = np.empty_like(change), np.empty_like(change)
+    usual[1:-1] = (change[:-2] + change[2:]) / 2
+    usual[0], usual[-1] = 2 * change[1] - change[2], 2 * change[-2] - change[-3]
+    next_to[1:-1] = np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
+    next_to[0], next_to[-1] = np.abs(change[1]), np.abs(change[-2])
+    stands_out: Mask = np.abs(change - usual) > _ABRUPT * next_to
+    return stands_out
 
 
 def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:

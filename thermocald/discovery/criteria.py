@@ -20,6 +20,7 @@ SET_SHARE = 0.95  # share of its best set's promise at which another set of para
 BAND = 14.0  # a solution with a score worse by less is not excluded: odds of 1 to 1,100
 DRIVES_BAND = 120.0  # the same in χ², for one drive in place of another. Scored
 LEFT_SHARE = 0.03  # share of the base model's misfit; a model that leaves less is adequate. Scored
+LEFT_PX = 0.025  # a third of the noise; a larger misfit shows, whatever the base model left. Scored
 FURTHER_PX = 0.005  # least size of an effect beside an adequate model: an eighth of the noise
 FURTHER_SHARE = 0.15  # the same, as a share of the first effect; less refines that one. Scored
 CURVATURE_PX = 0.001  # accuracy of the projection's curvature where the image moves by 10 px

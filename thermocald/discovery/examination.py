@@ -229,7 +229,8 @@ def _search_beside_knocks(
         base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
         again = _search_standing(search, base, jobs)
         # beside steps with six free coefficients each, several effects could imitate anything
-        if again.adequate and len(again.best.terms) <= len(base.terms) + 1:
+        effects = [term for term in again.best.terms if term not in base.terms]
+        if again.adequate and len(effects) <= 1:
             return replace(again, knocks=knocks, as_slips=(False,) * len(knocks))
     return None
 
@@ -387,7 +388,7 @@ def _measure_px(without: Solution, with_it: Solution) -> float:
 def _is_adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
     """Test whether a solution leaves no misfit, or next to none of the base model's."""
     return all(
-        a.adequate or a.misfit_px < criteria.LEFT_SHARE * b.misfit_px
+        a.adequate or a.misfit_px < min(criteria.LEFT_SHARE * b.misfit_px, criteria.LEFT_PX)
         for a, b in zip(now, base, strict=True)
     )
 

@@ -140,18 +140,20 @@ class Pipeline:
     def submit(self, frame: Frame) -> None:
         """Queue a frame; returns at once."""
         with self._changed:
-            frames = [item.frame for item in self._items]
-            held = sum(
-                len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
-            )
-            # a machine may stall for seconds before no further frame may wait
-            full = len(frames) > _MOST_WAITING or held > _MOST_BYTES
-            if len(frames) > 2 * _DEPTH and full:
+            if len(self._items) > 2 * _DEPTH and self._is_full():
                 self._lose("frames cannot be stored fast enough")
                 return
             self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
             self.next_number += 1
             self._changed.notify_all()
+
+    def _is_full(self) -> bool:
+        """Return whether no further frame may wait; a machine may stall for seconds before that."""
+        frames = [item.frame for item in self._items]
+        held = sum(
+            len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
+        )
+        return len(frames) > _MOST_WAITING or held > _MOST_BYTES
 
     def _lose(self, why: str) -> None:
         self.lost += 1

@@ -339,17 +339,17 @@ def _compare_ties(
     close = {s.terms: s for s in seen if s.score < best.score + 60.0}
     if len({s.names for s in close.values()}) < 2:
         return best, seen
-    fitter = search.fitter
-    again: list[Solution] = []
-    near = sorted(close.values(), key=by_score)
-    small = [s for s in near if len(s.terms) <= len(best.terms)]
-    large = [s for s in near if s not in small]
-    for s in (*small[:6], *large[:2]):
-        objective = fitter.suit_thermometers(s.fit)
-        again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
-    first = min(again[: len(small[:6])], key=by_score)
-    others = [s for s in seen if s.terms not in close]
-    return first, [*sorted(again, key=by_score), *others]
+
+    def compare(solutions: list[Solution], most: int) -> list[Solution]:
+        again = []
+        for s in sorted(solutions, key=by_score)[:most]:
+            objective = search.fitter.suit_thermometers(s.fit)
+            again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
+        return sorted(again, key=by_score)
+
+    small = compare([s for s in close.values() if len(s.terms) <= len(best.terms)], 6)
+    large = compare([s for s in close.values() if len(s.terms) > len(best.terms)], 2)
+    return small[0], [*small, *large, *(s for s in seen if s.terms not in close)]
 
 
 def _does_better(larger: Solution, best: Solution, by: float = 0.0) -> bool:

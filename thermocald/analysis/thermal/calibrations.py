@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 from scipy.special import chdtri
 
 from thermocald.analysis.camera.camera import CameraDifference
+from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry import camera_files
@@ -28,6 +29,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.physics.model import BASES, RATED, ThermalModel, choose_basis, distortion_along
+from thermocald.store.logger.dialect import to_celsius
 from thermocald.store.recording.reader import interpolate_readings
 
 if TYPE_CHECKING:
@@ -192,7 +194,7 @@ def fit_calibrations(
     }}  # fmt: skip
     doubts = [
         f"every calibration is at {T.min():.0f} °C or more: are their temperatures in {unit}?"
-        for unit, C in (("fahrenheit", (T - 32.0) / 1.8), ("kelvin", T - 273.15))
+        for unit, C in ((name, to_celsius(T, unit)) for name, unit in OTHER_UNITS.items())
         if T.min() > _HOT_C and C.min() > -_WARM_C and C.max() < _WARM_C
     ]
     fitted = {

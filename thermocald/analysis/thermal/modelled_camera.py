@@ -17,6 +17,7 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
+from thermocald.store.logger.dialect import to_celsius
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
+OTHER_UNITS = {"fahrenheit": "degF", "kelvin": "K"}
 _REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
 _MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 
@@ -69,7 +71,7 @@ class Validity:
 
     def other_unit(self, T: float) -> str:
         """Return the unit in which a temperature would be inside; "" if there is none."""
-        units = {"fahrenheit": (T - 32.0) / 1.8, "kelvin": T - 273.15}
+        units = {name: to_celsius(np.asarray(T), unit) for name, unit in OTHER_UNITS.items()}
         return next((name for name, C in units.items() if self.low <= C <= self.high), "")
 
     def check(self, temperatures: Array, extrapolate: bool) -> Array:

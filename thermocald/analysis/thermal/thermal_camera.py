@@ -344,9 +344,10 @@ class ThermalCamera(Result):
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
-            noise = temperature_sd**2 * noise_share(t - begin, part.times)
-            drive = self.model.drive(part)
-            found = self._orientation(part, drive, noise if temperature_sd else None, steady)
+            noise = None
+            if temperature_sd:
+                noise = temperature_sd**2 * noise_share(t - begin, part.times)
+            found = self._orientation(part, self.model.drive(part), noise, steady)
             values.append(found[0])
             covariance.append(found[1])
         return Along(

@@ -56,8 +56,9 @@ def find_jumps(
     noise = np.maximum(mad_sd(_without_drift(np.diff(left, axis=0)), axis=0), np.sqrt(2.0))
     examined = {*gaps}
     while len(examined) < _MOST + len(gaps) and len(left) >= 4 * SIDE:
-        change = _without_drift(np.diff(left, axis=0))
-        size = np.where(_is_abrupt(np.diff(left, axis=0)), np.abs(change) / noise, 0.0)
+        every = np.diff(left, axis=0)
+        change = _without_drift(every)
+        size = np.where(_is_abrupt(every), np.abs(change) / noise, 0.0)
         for row in examined:
             size[row - 1] = 0.0
         worst = int(size.max(axis=1).argmax())

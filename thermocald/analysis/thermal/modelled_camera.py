@@ -23,11 +23,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from thermocald.arrays import Array
+    from thermocald.physics.history import History
     from thermocald.physics.model import ThermalModel
 
 
 OTHER_UNITS = {"fahrenheit": "degF", "kelvin": "K"}
 _REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
+_STEP = 1e-3  # relative step of a parameter for its derivative
 _MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 
 
@@ -174,6 +176,63 @@ def steady_camera(
             for key, row in own:
                 add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
     return SteadyCamera(model, names, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
+
+
+def predict_orientations(
+    model: ThermalModel,
+    names: tuple[str, ...],
+    of_names: Array,
+    history: History,
+    drive: Array,
+    noise: Array | None = None,
+    steady: Array | None = None,
+    driven: Mapping[tuple[str, float], Array] | None = None,
+) -> tuple[Array, Array]:
+    """Return a model's interior orientations (E, 10) and their covariances (E, 10, 10).
+
+    names: of the parameters with covariance `of_names`; drive (E,) °C: what the rates follow; noise
+    (E,) K²: variance of a reading; steady: derivatives (10, p) of the camera whose difference is
+    wanted; driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
+    """
+    linear = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
+    for effect in model.effects:
+        if not catalogue.get(effect.name).is_drive:
+            linear = linear + model.influence(effect.name, history)
+    J = np.zeros((*linear.shape, len(names)))
+    for i, name in enumerate(names):
+        group, key = name.rsplit(".", 1)  # a formula may contain dots
+        if group == "interior":
+            J[:, IOP_NAMES.index(key), i] = 1.0
+        elif group == "rates":
+            J[:, IOP_NAMES.index(key), i] = drive - model.T0
+        elif not catalogue.get(group).is_drive:
+            up, down = (moved_model(model, name, s).influence(group, history) for s in (1.0, -1.0))
+            J[:, :, i] = (up - down) / (2.0 * _step(model, name))
+        else:
+            if driven is None:
+                up, down = (moved_model(model, name, s).drive(history) for s in (1.0, -1.0))
+            else:
+                up, down = driven[name, 1.0], driven[name, -1.0]
+            slope = (up - down) / (2.0 * _step(model, name))
+            J[:, :, i] = slope[:, None] * model.rate_vector
+    J = model.carried_derivatives(linear, J, names)
+    if steady is not None:
+        J -= steady
+    covariance: Array = np.einsum("epi,ij,eqj->epq", J, of_names, J, optimize=True)
+    if noise is not None:
+        rates = np.broadcast_to(model.rate_vector[:, None], (len(J), 10, 1))
+        slope = model.carried_derivatives(linear, rates)
+        covariance += noise[:, None, None] * slope * np.swapaxes(slope, 1, 2)
+    return model.carried(linear), covariance
+
+
+def moved_model(model: ThermalModel, name: str, sign: float) -> ThermalModel:
+    """Return the model with one parameter moved by the step of its difference quotient."""
+    return model.with_values({name: model.value(name) + sign * _step(model, name)})
+
+
+def _step(model: ThermalModel, name: str) -> float:
+    return _STEP * max(abs(model.value(name)), 1e-9)
 
 
 def widened(covariance: Array, variance: Array) -> Array:

@@ -32,7 +32,9 @@ from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
+    moved_model,
     noise_share,
+    predict_orientations,
     require_known,
     require_sd,
     steady_camera,
@@ -62,7 +64,6 @@ USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _NEEDED = 6  # readings that the present effects follow from, besides two of each channel
 _CHUNK = 20_000  # times predicted at once
-_STEP = 1e-3  # relative step of a parameter for its derivative
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
@@ -347,7 +348,10 @@ class ThermalCamera(Result):
             noise = None
             if temperature_sd:
                 noise = temperature_sd**2 * noise_share(t - begin, part.times)
-            found = self._orientation(part, self.model.drive(part), noise, steady)
+            drive = self.model.drive(part)
+            found = predict_orientations(
+                self.model, self.parameters, self.covariance, part, drive, noise, steady
+            )
             values.append(found[0])
             covariance.append(found[1])
         return Along(
@@ -381,59 +385,6 @@ class ThermalCamera(Result):
                 outside = np.maximum(outside, beyond)
                 drift = drift + np.abs(beyond[:, None] * own)
         return outside, variance + drift**2
-
-    def _orientation(
-        self,
-        history: History,
-        drive: Array,
-        noise: Array | None = None,
-        steady: Array | None = None,
-        driven: Mapping[tuple[str, float], Array] | None = None,
-    ) -> tuple[Array, Array]:
-        """Return the interior orientation (E, 10) and its covariance (E, 10, 10).
-
-        drive (E,) °C: what the rates follow; noise (E,) K²: variance of a reading; driven:
-        {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
-        """
-        model = self.model
-        linear = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
-        for effect in model.effects:
-            if not catalogue.get(effect.name).is_drive:
-                linear = linear + model.influence(effect.name, history)
-        J = np.zeros((*linear.shape, len(self.parameters)))
-        for i, name in enumerate(self.parameters):
-            group, key = name.rsplit(".", 1)  # a formula may contain dots
-            if group == "interior":
-                J[:, IOP_NAMES.index(key), i] = 1.0
-            elif group == "rates":
-                J[:, IOP_NAMES.index(key), i] = drive - model.T0
-            elif not catalogue.get(group).is_drive:
-                up, down = (self._moved(name, s).influence(group, history) for s in (1.0, -1.0))
-                J[:, :, i] = (up - down) / (2.0 * self._step(name))
-            else:
-                if driven is None:
-                    up, down = (self._moved(name, s).drive(history) for s in (1.0, -1.0))
-                else:
-                    up, down = driven[name, 1.0], driven[name, -1.0]
-                slope = (up - down) / (2.0 * self._step(name))
-                J[:, :, i] = slope[:, None] * model.rate_vector
-        J = model.carried_derivatives(linear, J, self.parameters)
-        if steady is not None:
-            J -= steady
-        covariance: Array = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
-        if noise is not None:
-            rates = np.broadcast_to(model.rate_vector[:, None], (len(J), 10, 1))
-            slope = model.carried_derivatives(linear, rates)
-            covariance += noise[:, None, None] * slope * np.swapaxes(slope, 1, 2)
-        return model.carried(linear), covariance
-
-    def _step(self, name: str) -> float:
-        """Return the step of a parameter for its difference quotient."""
-        return _STEP * max(abs(self.model.value(name)), 1e-9)
-
-    def _moved(self, name: str, sign: float) -> ThermalModel:
-        """Return the model with one parameter moved by a step."""
-        return self.model.with_values({name: self.model.value(name) + sign * self._step(name)})
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
@@ -505,7 +456,7 @@ class LiveCamera:
         self._maps: Maps | None = None
         drives = {name for name, _ in model.drives}
         self._moved = {
-            (name, sign): thermal._moved(name, sign).followers()
+            (name, sign): moved_model(model, name, sign).followers()
             for name in thermal.parameters
             for sign in (1.0, -1.0)
             if name.split(".")[0] in drives
@@ -545,7 +496,9 @@ class LiveCamera:
         driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
         history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
-        values, covariance = thermal._orientation(history, drive, driven=driven)
+        values, covariance = predict_orientations(
+            model, thermal.parameters, thermal.covariance, history, drive, driven=driven
+        )
         C = widened(covariance, drift)[0]
         self._now = Camera(model.sensor, row[0], values[0], C, float(beyond), model.camera)
         return self._now

@@ -15,7 +15,7 @@ from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.recording import observation_file, parquet_table
+from thermocald.store.recording import observation_file
 from thermocald.store.recording import reader as module
 from thermocald.store.recording.reader import open_recording, read_recording
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
@@ -237,7 +237,7 @@ def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     first = list(open_recording(recording_path).iter_epochs())
     assert len(list(long_from_nothing.glob("*.parquet"))) == 1
-    monkeypatch.setattr(parquet_table, "_parse", None)
+    monkeypatch.setattr(observation_file, "_parse", None)
     second = list(open_recording(recording_path).iter_epochs())
     for a, b, c in zip(from_text, first, second, strict=True):
         assert same(a.observations, b.observations)
@@ -273,8 +273,8 @@ def test_without_a_place_for_the_copy_the_text_is_read(
     expected = list(open_recording(recording_path).iter_epochs())
     (copy,) = long_from_nothing.glob("*.parquet")
     copy.unlink()
-    monkeypatch.setattr(parquet_table, "_cache", lambda: Path("/proc/nowhere"))
-    monkeypatch.setattr(parquet_table.shutil, "disk_usage", raise_full)
+    monkeypatch.setattr(observation_file, "_cache", lambda: Path("/proc/nowhere"))
+    monkeypatch.setattr(observation_file.shutil, "disk_usage", raise_full)
     for a, b in zip(expected, open_recording(recording_path).iter_epochs(), strict=True):
         assert same(a.observations, b.observations)
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _MAX_EXACT_INTEGER = 2**53
 _LONGEST_HEADER = 200_000
+_MOST_COLUMNS = 1000
 _LEFT_EMPTY = "; leave the field empty if there is none"
 
 
@@ -38,8 +39,7 @@ class Table:
     columns: the names in the header, in their order.
     """
 
-    seeks = False
-    _head, _most_columns = ", line 1", 1000
+    _head = ", line 1"
 
     def __init__(
         self,
@@ -52,9 +52,9 @@ class Table:
         self._text = text
         self._error = error
         self.columns = self._header()
-        if (count := len(self.columns)) > self._most_columns:
+        if (count := len(self.columns)) > _MOST_COLUMNS:
             raise error(
-                f"{path}{self._head}: has {count} columns; at most {self._most_columns} are read"
+                f"{path}{self._head}: has {count} columns; at most {_MOST_COLUMNS} are read"
             )
         for name in self.columns:
             if name and self.columns.count(name) > 1:
@@ -71,7 +71,7 @@ class Table:
     ) -> Iterator[Chunk]:
         """Yield the rows below the header, at most `rows` at a time; empty lines are skipped.
 
-        columns, epochs (first, last): what is needed; a table that `seeks` leaves out the rest.
+        columns, epochs (first, last): what is needed; a Parquet file leaves out the rest.
         """
         del columns, epochs
         first = 0

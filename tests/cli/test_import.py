@@ -178,7 +178,7 @@ def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path,
     """Tested with the readers that both commands use for --log and the points."""
     from thermocald.analysis.thermal.correction import row_blocks
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.columns import LogOptions
+    from thermocald.store.logger.dialect import LogOptions
     from thermocald.store.logger.temperatures import read_log
 
     ours, foreign = tmp_path / "ours.csv", tmp_path / "foreign.csv"

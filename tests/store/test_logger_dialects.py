@@ -9,7 +9,7 @@ import pytest
 
 from thermocald.errors import DataError
 from thermocald.store.logger.clock import DeviceClock, time_zone
-from thermocald.store.logger.columns import LogOptions
+from thermocald.store.logger.dialect import LogOptions
 from thermocald.store.logger.temperatures import read_log
 
 START = datetime(2026, 7, 6, 13, 55, tzinfo=UTC)

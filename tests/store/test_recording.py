@@ -16,8 +16,8 @@ from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.recording import observation_file
-from thermocald.store.recording import reader as module
 from thermocald.store.recording.reader import open_recording, read_recording
+from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -56,8 +56,9 @@ def test_head_keeps_interior_and_unknown_keys(tmp_path, field, head, make_epoch)
 
 def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
     whole = read_recording(recording_path).epochs
-    monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
-    monkeypatch.setattr(module.Table.chunks, "__defaults__", (7, None, None))  # epochs span chunks
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    monkeypatch.setattr(observation_file, "_parse_once", lambda table: table)
+    monkeypatch.setattr(Table.chunks, "__defaults__", (7, None, None))  # epochs span chunks
     streamed = list(open_recording(recording_path).iter_epochs())
     assert [e.number for e in streamed] == [e.number for e in whole]
     for a, b in zip(streamed, whole, strict=True):
@@ -224,7 +225,6 @@ def test_files_as_windows_writes_them(recording_path):
 @pytest.fixture
 def long_from_nothing(tmp_path, monkeypatch):
     """Treat every recording as long; return the test's folder for the user's cache."""
-    monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "thermocald"

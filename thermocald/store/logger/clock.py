@@ -26,7 +26,7 @@ AMBIGUOUS = ("refuse", "order", "earlier", "later")
 """How to treat the repeated hour: refuse it, use the order of the rows, or take one."""
 
 _OFFSET = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?", re.IGNORECASE)
-_ERROR = re.compile(r"([+-]?)(?:(\d+):)?(\d+):(\d+(?:\.\d+)?)|([+-]?)(\d+(?:\.\d+)?)s?")
+_ERROR = re.compile(r"([+-]?)(?:(?:(\d+):)?(\d+):)?(\d+(?:\.\d+)?)s?")
 _LARGEST_OFFSET_H = 14
 
 
@@ -50,10 +50,7 @@ def time_zone(text: str) -> tzinfo:
 
 def stated_zones(text: str) -> dict[str, tzinfo]:
     """Return the zones that a column's head names, such as GMT+01:00, UTC or EST and EDT."""
-    return {
-        name: time_zone(name) if name[-1].isdigit() else _zone(name.upper())
-        for name in _STATED_ZONE.findall(text)
-    }
+    return {name: _zone(name.upper()) for name in _STATED_ZONE.findall(text)}
 
 
 def clock_error(text: str) -> float:
@@ -67,10 +64,8 @@ def clock_error(text: str) -> float:
             f"clock error {text!r}: give +HH:MM:SS if the clock was ahead, -HH:MM:SS if it was "
             "behind, or seconds"
         )
-    sign, hours, minutes, seconds, sign_s, only = found.groups()
-    if only is not None:
-        return -float(only) if sign_s == "-" else float(only)
-    total = int(hours or 0) * 3600 + int(minutes) * 60 + float(seconds)
+    sign, hours, minutes, seconds = found.groups()
+    total = int(hours or 0) * 3600 + int(minutes or 0) * 60 + float(seconds)
     return -total if sign == "-" else total
 
 
@@ -282,8 +277,7 @@ def _month_to_number(text: str) -> str:
 
 def _date(found: re.Match[str], order: str | None) -> date:
     if found["compact"]:
-        text = found["compact"]
-        return date(int(text[:4]), int(text[4:6]), int(text[6:]))
+        return date.fromisoformat(found["compact"])
     a, b, c = (int(found[part]) for part in "abc")
     if len(found["a"]) == 4:
         return date(a, b, c)
@@ -311,8 +305,6 @@ def _time(found: re.Match[str]) -> time:
 
 
 def _zone(text: str) -> tzinfo:
-    if not text[-1].isdigit():
-        return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT
-    sign = -1 if "-" in text else 1
-    digits = re.sub(r"\D", "", text)
-    return timezone(sign * timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0)))
+    if text[-1].isdigit():
+        return time_zone(text)
+    return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT

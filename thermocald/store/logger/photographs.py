@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.store.logger.clock import DeviceClock
-    from thermocald.store.logger.columns import LogOptions
+    from thermocald.store.logger.dialect import LogOptions
 
 
 SOURCES = ("exif", "name", "file")

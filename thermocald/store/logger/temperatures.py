@@ -24,21 +24,19 @@ from thermocald.store.logger.clock import (
     stated_zones,
     whole_seconds,
 )
-from thermocald.store.logger.columns import (
-    OTHER_NAME,
-    LogOptions,
-    find_date_order,
-    find_temperature_columns,
-    find_time_columns,
-    quoted,
-    require_columns,
-)
 from thermocald.store.logger.dialect import (
+    OTHER_NAME,
     OUR_TIMES,
     TIME_NAME,
     UNIT_BEHIND,
     LoggerFile,
+    LogOptions,
+    find_date_order,
+    find_temperature_columns,
+    find_time_columns,
     open_log,
+    quoted,
+    require_columns,
     stated_unit,
     to_celsius,
     without_unit,

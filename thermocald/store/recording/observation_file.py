@@ -21,6 +21,7 @@ import time
 from bisect import bisect_left, bisect_right
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -115,24 +116,26 @@ def grid_runs(epochs: int, targets: int, windows: Sequence[slice] | None) -> Ite
 
 
 class ObservationFile:
-    """The observations' file of a recording; numbers (E,): those of epochs.csv, increasing."""
+    """The observations' file of a recording; numbers (E,): those of epochs.csv, increasing.
+
+    is_long: whether it is read in parts, as its observations are too many for memory.
+    """
 
     def __init__(
         self, path: Path, field: TestField, numbers: NDArray[np.int64], sensor: Sensor
     ) -> None:
-        if path.suffix == ".parquet":
-            self._table: Table = ParquetTable(path, REQUIRED)
-        else:
-            self._table = Table(path, REQUIRED)
-            if path.stat().st_size >= LONG_FROM_BYTES:
-                self._table = _parse_once(self._table)
+        is_text = path.suffix != ".parquet"
+        table = (Table if is_text else ParquetTable)(path, REQUIRED)
+        self.is_long = path.stat().st_size >= LONG_FROM_BYTES
+        self._table = _parse_once(table) if is_text and self.is_long else table
         self._field, self._numbers, self._sensor = field, numbers, sensor
         self._has_covariances = "sxy" in self._table.columns
         extras = [n for n in self._table.columns if n not in {*REQUIRED, "sxy", ""}]
         self._quality = self._table.numeric(extras)
 
-    def load(self) -> ObservationRows:
-        """Return all observations sorted by epoch; the file may have them in any order."""
+    @cached_property
+    def _whole(self) -> ObservationRows:
+        """All observations sorted by epoch; the file may have them in any order."""
         parts = [self._read(chunk, self._quality) for chunk in self._table.chunks()]
         whole = ObservationRows.join(parts) if parts else self._no_rows()
         del parts
@@ -142,10 +145,14 @@ class ObservationFile:
         return whole
 
     def stream(self, window: slice) -> Iterator[Observations]:
-        """Yield the observations of the epochs in a window of epochs.csv, in constant memory.
+        """Yield the observations of the epochs in a window of epochs.csv.
 
-        Raises RecordingError if the rows are not in the order of their epochs.
+        A long file is read in constant memory. Raises RecordingError if its rows are not in the
+        order of their epochs.
         """
+        if not self.is_long:
+            yield from map(self._whole.of_epoch, range(window.start, window.stop))
+            return
         for rows, first, stop in self._blocks([window], self._quality):
             self._refuse_duplicates(rows)
             for epoch in range(first, stop):

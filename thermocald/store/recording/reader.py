@@ -16,7 +16,7 @@ from thermocald.names import FileFolder
 from thermocald.numbers import counted
 from thermocald.photogrammetry.series.normals import runs
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
-from thermocald.store.recording.observation_file import LONG_FROM_BYTES, ObservationFile
+from thermocald.store.recording.observation_file import ObservationFile
 from thermocald.store.recording.sense import pairing_doubts, reading_doubts, time_doubts, time_fault
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield, require_millimetres
@@ -135,20 +135,14 @@ class Recording:
     @cached_property
     def epochs(self) -> list[Epoch]:
         """All epochs with their observations, which are read at the first access."""
-        if not self.has_observations:
-            return [self._epoch(i, None) for i in range(len(self))]
-        rows = self._observation_file.load()
-        return [self._epoch(i, rows.of_epoch(i)) for i in range(len(self))]
+        return list(self.iter_epochs())
 
     def iter_epochs(self, window: slice = slice(None)) -> Iterator[Epoch]:
         """Yield the epochs, or some of them (from 0).
 
-        A long recording (`is_long`) is read in constant memory; the rows of its observations must
-        be in the order of the epochs.
+        A long file of observations is read in constant memory; its rows must be in the order of the
+        epochs.
         """
-        if "epochs" in self.__dict__ or (self.has_observations and not self.is_long):
-            yield from self.epochs[window]
-            return
         rows = range(len(self))[window]
         part = slice(rows.start, rows.stop)
         seen = self._observation_file.stream(part) if self.has_observations else repeat(None)
@@ -185,8 +179,6 @@ class Recording:
         """Return the observations of one epoch (from 0); None for a recording without any."""
         if not self.has_observations:
             return None
-        if "epochs" in self.__dict__ or not self.is_long:
-            return self.epochs[row].observations
         return next(self._observation_file.stream(slice(row, row + 1)))
 
     def doubts(self) -> list[str]:
@@ -207,7 +199,7 @@ class Recording:
                 f"{counted(len(repeated), 'frame')} listed in several epochs, the first "
                 f"{repeated[0]}"
             )
-        if self.has_observations and not self.is_long:
+        if self.has_observations and not self._observation_file.is_long:
             first: dict[bytes, int] = {}
             twice, last = [], 0
             for epoch in self.epochs:
@@ -229,22 +221,11 @@ class Recording:
         rows = [i for i, frame in enumerate(self.columns.frames) if frame and ok[i]]
         return [(i, self.path / self.columns.frames[i]) for i in rows[:1] + rows[1:][-1:]]
 
-    @property
-    def is_long(self) -> bool:
-        """Whether the observations are read in parts, as they are too many for memory."""
-        path = self._observation_path  # a file that is gone is reported when it is read
-        return self.has_observations and path.exists() and path.stat().st_size >= LONG_FROM_BYTES
-
-    @property
-    def _observation_path(self) -> Path:
-        parquet = self.path / "observations.parquet"
-        return parquet if parquet.exists() else self.path / "observations.csv"
-
     @cached_property
     def _observation_file(self) -> ObservationFile:
-        return ObservationFile(
-            self._observation_path, self.testfield, self.columns.numbers, self.camera.sensor
-        )
+        parquet = self.path / "observations.parquet"
+        path = parquet if parquet.exists() else self.path / "observations.csv"
+        return ObservationFile(path, self.testfield, self.columns.numbers, self.camera.sensor)
 
 
 def open_recording(path: Path) -> Recording:
@@ -365,11 +346,8 @@ def interpolate_readings(
     frames = np.asarray(frame_times, dtype=float)
     times, values = np.asarray(reading_times, dtype=float), np.asarray(readings, dtype=float)
     good = np.isfinite(times) & np.isfinite(values)
-    if not good.all():
-        times, values = times[good], values[good]
-    if (np.diff(times) <= 0).any():
-        times, unique = np.unique(times, return_index=True)
-        values = values[unique]
+    times, unique = np.unique(times[good], return_index=True)
+    values = values[good][unique]
     if len(times) < 2:
         # one reading gives the temperature at its own time only
         only = float(values[0]) if len(values) else np.nan

@@ -6,6 +6,7 @@ import csv
 import math
 import os
 import shutil
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Self
 
 from thermocald.errors import RecordingError
@@ -17,6 +18,7 @@ from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
     from typing import Any, TextIO
 
@@ -52,20 +54,17 @@ class RecordingWriter:
         require_channels(self._head.channels, str(self.path), RecordingError)
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise RecordingError(f"{self.path}: exists already; choose another name or remove it")
-        try:
+        with self._in_words():
             shutil.rmtree(self._partial, ignore_errors=True)
             self._partial.mkdir(parents=True)
-            head = dump_yaml(head_document(self._head))
-            (self._partial / "recording.yaml").write_text(head, encoding="utf-8")
-            (self._partial / "testfield.csv").write_text(
-                testfield_csv(self._field), encoding="utf-8"
-            )
+            for name, text in (
+                ("recording.yaml", dump_yaml(head_document(self._head))),
+                ("testfield.csv", testfield_csv(self._field)),
+            ):
+                (self._partial / name).write_text(text, encoding="utf-8")
             self._epochs = self._new("epochs.csv")
             names = ["epoch", "frame_time", "temperature_time", *self._head.channels, "frame"]
             csv.writer(self._epochs, lineterminator="\n").writerow(names)
-        except OSError as cause:
-            self._abandon()
-            raise self._failed(cause) from cause
         return self
 
     def append(
@@ -78,42 +77,34 @@ class RecordingWriter:
         if self._epochs is None:
             raise RecordingError(f"{self.path}: the writer is not open")
         self._refuse_backwards(epoch)
-        try:
+        with self._in_words():
             frame = self._keep_frame(epoch, image)
-            row: list[object] = [epoch.number, f"{epoch.frame_time:.6f}"]
-            row.append(_number(epoch.temperature_time, ".6f"))
-            row += [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
-            csv.writer(self._epochs, lineterminator="\n").writerow([*row, frame])
+            times = f"{epoch.frame_time:.6f}", _number(epoch.temperature_time, ".6f")
+            read = [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
+            row = [epoch.number, *times, *read, frame]
+            csv.writer(self._epochs, lineterminator="\n").writerow(row)
             if epoch.observations is not None:
                 self._write_observations(epoch.number, epoch.observations)
-        except OSError as cause:
-            raise self._failed(cause) from cause
         self._last = epoch
         if math.isfinite(epoch.temperature_time):
             self._last_reading = epoch.temperature_time
 
     def keep_readings(self, readings: TemperatureLog) -> None:
         """Write every reading of a log, not only those of the epochs."""
-        try:
-            with self._new(READINGS) as file:
-                file.writelines(csv_text([{"time": readings.times, **readings.channels}]))
-        except OSError as cause:
-            raise self._failed(cause) from cause
+        with self._in_words(), self._new(READINGS) as file:
+            file.writelines(csv_text([{"time": readings.times, **readings.channels}]))
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._abandon()
             return
-        try:
+        with self._in_words():
             for file in (self._epochs, self._observations):
                 if file is not None:
                     file.flush()
                     os.fsync(file.fileno())
                     file.close()
             self._partial.rename(self.path)
-        except OSError as cause:
-            self._abandon()
-            raise self._failed(cause) from cause
 
     def _refuse_backwards(self, epoch: Epoch) -> None:
         """Raise RecordingError for an epoch that `open_recording` would refuse."""
@@ -139,11 +130,17 @@ class RecordingWriter:
                     file.close()
         shutil.rmtree(self._partial, ignore_errors=True)
 
-    def _failed(self, cause: OSError) -> RecordingError:
-        failed = cannot_write(self.path, cause)
-        error = RecordingError(f"{failed}; the part written so far was removed")
-        error.exit_status = failed.exit_status
-        return error
+    @contextmanager
+    def _in_words(self) -> Iterator[None]:
+        """After an OSError, remove what was written and raise a RecordingError that says why."""
+        try:
+            yield
+        except OSError as cause:
+            self._abandon()
+            failed = cannot_write(self.path, cause)
+            error = RecordingError(f"{failed}; the part written so far was removed")
+            error.exit_status = failed.exit_status
+            raise error from cause
 
     def _keep_frame(self, epoch: Epoch, image: bytes | NDArray[Any] | None) -> str:
         if image is None and epoch.frame is None:

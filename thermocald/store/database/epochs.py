@@ -178,7 +178,10 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     """Insert one epoch with its details, in the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
-    parts = _detail_parts(epoch.number, result.covariance, seen)
+    covariance = [] if result.covariance is None else [(0, pack_covariance(result.covariance))]
+    packed = b"" if seen is None else pack_observations(seen)
+    cuts = range(0, len(packed), _PART_BYTES)
+    parts = [*covariance, *((1 + i, packed[c : c + _PART_BYTES]) for i, c in enumerate(cuts))]
     row: dict[str, Any] = {
         "series_id": series,
         "number": epoch.number,
@@ -208,20 +211,6 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", details).rowcount
     if parts and kept != len(parts):
         raise sqlite3.IntegrityError("a foreign trigger keeps rows out of detail; drop it")
-
-
-def _detail_parts(
-    number: int, covariance: Array | None, seen: Observations | None
-) -> list[tuple[int, bytes]]:
-    """Return covariance and observations as numbered parts of the table `detail`."""
-    parts = [] if covariance is None else [(0, pack_covariance(covariance))]
-    if seen is not None:
-        data = pack_observations(seen)
-        cuts = range(0, len(data), _PART_BYTES)
-        if len(cuts) >= _PARTS:
-            raise StoreError(f"epoch {number}: {len(seen)} observations are too many to store")
-        parts += [(1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
-    return parts
 
 
 def select_epochs(

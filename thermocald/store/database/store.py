@@ -122,12 +122,12 @@ class Store(SeriesReader):
     def last_epoch(self, series: StoredSeries) -> int | None:
         """Return the number of the last epoch, after which to resume; None without epochs."""
         found = self._value("SELECT max(number) FROM epoch WHERE series_id = ?", series.id)
-        if found is not None and not isinstance(found, int):
-            raise columns.DamageError(
-                f"{self.path}: the store is damaged: an epoch of {series.head.series} has the "
-                f"number {found!r}; restore a backup"
-            )
-        return found
+        if found is None or isinstance(found, int):
+            return found
+        raise StoreError(
+            f"{self.path}: the store is damaged: an epoch of {series.head.series} has the number "
+            f"{found!r}; restore a backup"
+        )
 
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool
@@ -140,23 +140,14 @@ class Store(SeriesReader):
         whole = not first and last is None
         missing, size, first = 0, _EPOCHS_AT_ONCE, first or 1
         while size == _EPOCHS_AT_ONCE:
-            page: list[StoredEpoch] = []
-            failed: StoreError | None = None
-            try:
-                with self._reads("epochs") as connection:
-                    found = epochs.select_epochs(
-                        connection, series.id, first, last, details=details
-                    )
-                    page.extend(islice(found, _EPOCHS_AT_ONCE))
-                    del found
-            except StoreError as error:
-                failed = error
+            with self._reads("epochs") as connection:
+                found = epochs.select_epochs(connection, series.id, first, last, details=details)
+                page = list(islice(found, _EPOCHS_AT_ONCE))
+                del found
             for stored in page:
                 missing += max(0, stored.epoch.number - first)
                 first = stored.epoch.number + 1
                 yield stored
-            if failed is not None:
-                raise failed
             size = len(page)
         if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - first)):
             log.warning(

@@ -221,7 +221,6 @@ class ServerWriter(Connected):
         self.station = station
         self.store = UUID(store)
         self._sent: set[UUID] = set()
-        self._days: set[int] = set()
         # {table: {column: type}} on the server, read once as every batch needs it
         self._tables: dict[str, dict[str, str]] = {}
         try:
@@ -246,13 +245,9 @@ class ServerWriter(Connected):
         keys = {id_: series_key(self.station, self.store, one) for id_, one in series.items()}
         ready = [self._row(table, row, keys) for row in rows]
         needed = {row["series_id"] for row in rows if row.get("series_id") is not None}
-        days: set[int] = set()
-        if table == "epoch":
-            times = (row["frame_time"] for row in rows)
-            # a clock that was not set gives a time without a month's table
-            days = {
-                int(t // _DAY_S) for t in times if _PLAUSIBLE[0] <= t <= _PLAUSIBLE[1]
-            } - self._days
+        times = (row["frame_time"] for row in rows if table == "epoch")
+        # a clock that was not set gives a time without a month's table
+        days = {t // _DAY_S for t in times if _PLAUSIBLE[0] <= t <= _PLAUSIBLE[1]}
         with self._transaction(f"{len(rows)} {table}s were not sent") as connection:
             for id_ in sorted(needed):
                 if keys[id_] not in self._sent:
@@ -265,7 +260,6 @@ class ServerWriter(Connected):
             self._insert(connection, table, ready)
         # only what was committed counts as done
         self._sent.update(keys[id_] for id_ in needed)
-        self._days |= days
 
     def write_frame(self, series: StoredSeries, frame: KeptFrame, data: bytes) -> None:
         """Insert the file of one epoch's frame; the server checks its SHA-256."""

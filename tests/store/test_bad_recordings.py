@@ -59,7 +59,21 @@ CELLS = [
     ("testfield.csv", 3, "target", "", "every target needs a name"),
     ("testfield.csv", 3, "sX", "-1", "must not be negative"),
     ("testfield.csv", 4, "diameter", "0", "above 0 mm"),
-]
+    # numbers that nothing measures
+    *(("observations.csv", 5, column, value, "px is on no image")
+      for column, value in (("x", "1e308"), ("y", "-1e308"), ("x", "1e7"))),
+    *(("observations.csv", 5, column, value, "px is impossible")
+      for column, value in (("sx", "1e-300"), ("sy", "1e300"), ("sx", "5e-324"), ("sy", "1e-9"))),
+    *(("testfield.csv", 13, column, value, "must be between 1e-09 and 10000 mm")
+      for column, value in (("sX", "1e-300"), ("sX", "2e7"), ("sZ", "5e-324"))),
+    *(("testfield.csv", 13, column, value, "must be within 1e+09 mm")
+      for column, value in (("X", "1e308"), ("diameter", "1e300"))),
+    *(("epochs.csv", 6, column, value, "Write seconds since 1970")
+      for column, value in (("frame_time", "1e300"), ("frame_time", "1e11"))),
+    ("epochs.csv", 6, "frame_time", "1.6e12", "are they ms?"),
+    ("epochs.csv", 6, "temperature_time", "1.6e15", "are they µs?"),
+    ("epochs.csv", 6, "frame_time", "1.6e18", "are they ns?"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("file", "line", "column", "value", "message"), CELLS)
@@ -103,6 +117,11 @@ def in_kelvin(path) -> None:
         set_field(path, line, "temperature", "294.5")
 
 
+def at_one_time(path) -> None:
+    for line in range(2, 7):
+        set_field(path, line, "frame_time", "1600000000")
+
+
 def without_its_end(path) -> None:
     path.write_text(path.read_text().rpartition(",")[0])
 
@@ -114,6 +133,7 @@ FILES = {
         "readings.csv", lambda path: path.write_text(
             "time,temperature,board_temperature\n1600000000,20,294.5\n1600000001,20,294.6\n"),
         r"line 2, column board_temperature: seems to be in kelvin"),
+    "one time": ("epochs.csv", at_one_time, "all epochs have the same time"),
     "semicolons": (
         "epochs.csv", lambda path: path.write_text(path.read_text().replace(",", ";")),
         "separate the columns with commas"),
@@ -199,6 +219,12 @@ HEADS = [
     ("name: small", "name: small\nname: other", "is duplicated"),
     ("name: small", "name: !!bool x", "no YAML"),
     ("name: small", "name: [small", "recording.yaml, line"),
+    ("interval: 10.0", "interval: 1.0e-300", "interval: is 1e-300 s; it must be at least"),
+    ("interval: 10.0", "interval: 1.0e+300", "interval: is 1e+300 s; it is at most"),
+    ("pixel_pitch: 0.00112", "pixel_pitch: 1.0e-300", "key camera.pixel_pitch"),
+    ("principal_distance: 3.04", "principal_distance: 1.0e+300", "it is at most"),
+    ("principal_distance: 3.04", "principal_distance: 1.0e-300", "it must be at least"),
+    ("resolution: 0.0625", "resolution: 1.0e-300", "it must be at least"),
 ]
 
 

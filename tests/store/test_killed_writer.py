@@ -19,7 +19,7 @@ def test_a_killed_writer_loses_at_most_the_epoch_in_hand(forker, store_path, hea
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(5)
-    for _ in range(6):
+    for _ in range(3):
         said = kill_one(forker, store_path, list, rng)
         with Store.open(store_path) as store:
             assert store.examine().damaged == ()

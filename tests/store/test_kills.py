@@ -17,7 +17,6 @@ import pytest
 
 from tests.daemon.conftest import make_recording
 from tests.daemon.forking import Forked, Forker
-from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
@@ -51,20 +50,6 @@ DAEMON = textwrap.dedent(
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     return make_recording(tmp_path_factory.mktemp("kills") / "small", 6)
-
-
-@pytest.fixture(scope="module")
-def other_device(tmp_path_factory):
-    """Return a folder on another device than that of the tests, or skip."""
-    for place in ("/dev/shm", "/var/tmp", str(Path.home())):
-        folder = Path(place)
-        if folder.is_dir() and folder.stat().st_dev != tmp_path_factory.getbasetemp().stat().st_dev:
-            made = folder / f"thermocald-kills-{os.getpid()}"
-            made.mkdir()
-            yield made
-            shutil.rmtree(made)
-            return
-    pytest.skip("there is one device only")
 
 
 def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> list[Forked]:
@@ -139,23 +124,7 @@ def kill_one(forker: Forker, store: Path, start, rng) -> int:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind):
-    _kill_often(forker, store_path, head, field, recording, kind)
-
-
-def test_links_over_devices(forker, other_device, tmp_path, head, field, recording):
-    """The store is on one device, its name on another, and the writer only knows the name."""
-    real = other_device / "real.db"
-    name = tmp_path / "named.db"
-    name.symlink_to(real)
-    with pytest.raises(OSError, match="cross-device"):
-        os.link(other_device, tmp_path / "hard")
-    _kill_often(forker, name, head, field, recording, "replay")
-    assert real.is_file()
-    assert name.is_symlink()
-
-
-def _kill_often(forker, store_path, head, field, recording, kind) -> None:
-    times = -(-KILLS // (len(KINDS) + 1))
+    times = -(-KILLS // len(KINDS))
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(len(kind))
@@ -181,17 +150,3 @@ def _kill_often(forker, store_path, head, field, recording, kind) -> None:
             assert values == [float(number) for number in numbers]
         before = len(numbers)
     assert reported > times
-
-
-def test_a_name_that_lacks_the_wal_is_not_read_as_whole(forker, store_path, head, field):
-    """After a kill, a hard link shows the store without the -wal of the other name."""
-    with Store.open(store_path, "append", durable=False) as store:
-        store.create_series(head, field)
-    rng = np.random.default_rng(1)
-    said = kill_one(forker, store_path, list, rng)
-    other = store_path.with_name("other.db")
-    os.link(store_path, other)
-    with pytest.raises(StoreError, match="another of its names"):
-        Store.open(other)
-    with Store.open(store_path) as store:
-        assert store.last_epoch(next(iter(store.all_series()))) >= said

@@ -16,7 +16,11 @@ from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.recording import observation_file
-from thermocald.store.recording.reader import open_recording, read_recording
+from thermocald.store.recording.reader import (
+    interpolate_readings,
+    open_recording,
+    read_recording,
+)
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 from thermocald.store.recording.writer import RecordingWriter
@@ -162,7 +166,7 @@ def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):
         return size
 
     peak(2)  # imports
-    assert peak(600) < peak(60) + 50_000
+    assert peak(300) < peak(30) + 25_000
 
 
 @pytest.mark.parametrize(("camera", "rows"), [(0, 11116), (1, 9392), (2, 8272), (6, 14024)])
@@ -281,3 +285,28 @@ def test_without_a_place_for_the_copy_the_text_is_read(
 
 def raise_full(_: object) -> None:
     raise OSError(28, "No space left on device")
+
+
+NONE = np.nan
+TENS = np.arange(0.0, 100.0, 10.0)
+# times of frames, times of readings, readings, temperatures at the frames
+INTERPOLATED = {
+    "a ramp is exact between readings, and just outside": (
+        TENS, TENS + 3.0, 20.3 + 0.1 * TENS, 20 + 0.1 * TENS),
+    "missing readings are passed over": (
+        [10.0, 40.0], TENS[:6], [20.0, NONE, 22.0, 23.0, NONE, 25.0], [21.0, 24.0]),
+    "a long gap is not filled": (
+        [15.0, 500.0, 1000.0, 1015.0], [0.0, 10.0, 20.0, 1000.0, 1010.0, 1020.0],
+        [0.0, 0.1, 0.2, 10.0, 10.1, 10.2], [0.15, NONE, 10.0, 10.15]),
+    "no guess far outside": ([-50.0, 100.0], [0.0, 10.0, 20.0], [1.0, 2.0, 3.0], [NONE, NONE]),
+    "no readings": ([0.0, 1.0], [], [], [NONE, NONE]),
+    "nothing but missing ones": ([0.0, 1.0], [0.0, 1.0], [NONE, NONE], [NONE, NONE]),
+    "one reading holds for its instant": ([5.0, 6.0], [5.0], [21.0], [21.0, NONE]),
+    "two readings at one instant are one": ([1.0], [0.0, 0.0, 2.0], [1.0, 1.0, 3.0], [2.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", INTERPOLATED)
+def test_temperatures_at_the_frames(case):
+    frames, times, readings, expected = INTERPOLATED[case]
+    assert interpolate_readings(frames, times, readings) == pytest.approx(expected, nan_ok=True)

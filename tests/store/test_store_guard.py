@@ -87,7 +87,7 @@ def test_at_the_end_a_lock_is_waited_for(guard, keep):
     other = sqlite3.connect(guard.path, isolation_level=None, check_same_thread=False)
     other.execute("BEGIN IMMEDIATE")
     keep(1)
-    threading.Timer(1.5, other.close).start()
+    threading.Timer(0.8, other.close).start()
     guard.close()
     assert guard.lost == 0
     with Store.open(guard.path) as store:

@@ -174,24 +174,6 @@ def test_files_that_are_none(recording_path, file, content):
         read_recording(recording_path)
 
 
-def test_every_cut_through_observations_is_an_error_or_a_shorter_recording(recording_path):
-    path = recording_path / "observations.csv"
-    whole = path.read_bytes()
-    read, refused = 0, 0
-    for size in range(0, len(whole), 37):
-        path.write_bytes(whole[:size])
-        complete = whole[:size].count(b"\n")
-        try:
-            recording = read_recording(recording_path)
-        except RecordingError:
-            refused += 1
-        else:
-            read += 1
-            assert complete - 1 <= sum(len(e.observations) for e in recording.epochs) <= complete
-    assert read > 0
-    assert refused > 50
-
-
 def test_lines_are_counted_past_quoted_line_ends_and_blank_lines(recording_path):
     path = recording_path / "testfield.csv"
     header, *rows = path.read_text().splitlines()

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import string
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thermocald.errors import ThermocaldError
-from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.testfield_file import read_testfield
 
@@ -93,30 +90,3 @@ def test_any_testfield(tmp_path, content):
     except ThermocaldError as error:
         message = str(error)
     assert not message or "field.csv" in message
-
-
-@QUICK
-@given(data=st.data())
-def test_any_damage_to_a_store(filled_file, tmp_path, data):
-    whole = filled_file.read_bytes()
-    at = data.draw(st.integers(0, len(whole) - 1))
-    put = data.draw(st.binary(min_size=1, max_size=200))
-    path = tmp_path / "damaged.db"
-    path.write_bytes(whole[:at] + put + whole[at + len(put) :])
-    message = ""
-    try:
-        with Store.open(path) as store:
-            for series in store.all_series():
-                store.series_columns(series, ["epoch", "c", "status", "temperature"])
-                list(store.epochs(series))
-            store.events()
-    except ThermocaldError as error:
-        message = str(error)
-    assert not message or any(word in message for word in ("damaged.db", "store", "broken"))
-
-
-@pytest.fixture
-def filled_file(filled, tmp_path):
-    store, _ = filled
-    store.close()
-    return Path(shutil.copy(store.path, tmp_path / "copy.db"))

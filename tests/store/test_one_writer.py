@@ -41,25 +41,22 @@ def daemon(path):
 
 
 def as_called(path, tmp_path, kind):
+    """Return another name of the store."""
     other = tmp_path / "other.db"
-    if kind == "link":
+    if kind == "same":
+        return path
+    if kind == "way round":
+        return tmp_path / "../" / tmp_path.name / "kept.db"
+    if kind == "folder's link":
+        (tmp_path / "folder").symlink_to(tmp_path, target_is_directory=True)
+        return tmp_path / "folder/kept.db"
+    if kind == "link to link":
         other.symlink_to(path)
-    elif kind == "link to link":
-        (tmp_path / "between.db").symlink_to(path)
-        other.symlink_to(tmp_path / "between.db")
-    elif kind == "hard link":
-        os.link(path, other)
-    elif kind == "hard link in another folder":
+        path, other = other, tmp_path / "between.db"
+    if kind == "hard link in another folder":
         other = tmp_path / "snapshot/kept.db"
         other.parent.mkdir()
-        os.link(path, other)
-    elif kind == "folder's link":
-        (tmp_path / "folder").symlink_to(tmp_path, target_is_directory=True)
-        other = tmp_path / "folder/kept.db"
-    elif kind == "way round":
-        other = tmp_path / "../" / tmp_path.name / "kept.db"
-    else:
-        other = path
+    (os.link if kind.startswith("hard") else os.symlink)(path, other)
     return other
 
 

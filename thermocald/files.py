@@ -333,8 +333,6 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
         raise error(f"{path}{where}: {cause.problem or cause.context}") from cause
     except yaml.YAMLError as cause:
         raise error(f"{path}: is no YAML: {' '.join(str(cause).split())}") from cause
-    except RecursionError as cause:
-        raise error(f"{path}: is nested too deeply") from cause
     except _CONSTRUCTION as cause:
         raise error(f"{path}: holds a value that is no YAML: {cause}") from cause
     if document is None:

@@ -37,7 +37,7 @@ def same(a: Observations, b: Observations) -> bool:
 def test_written_recording_is_read_as_it_was(recording_path, field, head, make_epoch):
     recording = read_recording(recording_path)
     assert (recording.head.name, recording.series, recording.head.interval) == ("small", "M1", 10.0)
-    assert (recording.camera, dict(recording.channels)) == (head.camera, dict(head.channels))
+    assert (recording.camera, dict(recording.head.channels)) == (head.camera, dict(head.channels))
     assert recording.testfield.names == field.names
     assert np.array_equal(recording.testfield.points, field.points)
     assert np.array_equal(recording.testfield.diameters, field.diameters, equal_nan=True)

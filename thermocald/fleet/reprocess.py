@@ -221,7 +221,7 @@ def calibrate_block(block: Block) -> Outcome:
     sds = np.array([r.sd for r in results])
     temperatures = {
         name: recording.columns.at_frame(name)[block.first : block.stop]
-        for name in recording.channels
+        for name in recording.head.channels
     }
     columns: dict[str, Any] = {
         "camera": [camera.name] * len(epochs),

@@ -334,24 +334,14 @@ class SeriesColumns:
         chunks = self._chunks[-MERGED:]
         if len(chunks) < MERGED or any(size != 8 * CHUNK for _, size, *_ in chunks):
             return
-        start = chunks[0][0]
-        columns: dict[str, Array] = {}
-        for name, first, *row, data, kept in self._connection.execute(
-            "SELECT name, first_row, last_number, last_id, data, checksum FROM column_chunk "
-            "WHERE series_id = ? AND first_row >= ?",
-            (self._series, start),
-        ):
-            _require_chunk(kept, self._series, name, first, *row, data)
-            column = columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
-            column[first - start :][:CHUNK] = np.frombuffer(data)
-        if late := self._late_rows(len(self._chunks) - MERGED):
-            renewed = _columns(self._connection, late, None)
-            for name in renewed:
-                columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
-            _overwrite(columns, columns["number"].copy(), renewed)
-        self._connection.execute(
-            "DELETE FROM column_chunk WHERE series_id = ? AND first_row >= ?", (self._series, start)
-        )
+        late = _columns(self._connection, self._late_rows(len(self._chunks) - MERGED), None)
+        start, which = chunks[0][0], "column_chunk WHERE series_id = ? AND first_row >= ?"
+        found = self._connection.execute(f"SELECT name FROM {which}", (self._series, start))
+        columns = {name: np.empty(MERGED * CHUNK) for name in {*(n for (n,) in found), *late}}
+        for name, column in columns.items():
+            self._fill(name, column, start)
+        _overwrite(columns, columns["number"].copy(), late)
+        self._connection.execute(f"DELETE FROM {which}", (self._series, start))
         insert_chunk(self._connection, self._series, start, self.last_number, columns)
         self._find_chunks()
 
@@ -369,20 +359,21 @@ class SeriesColumns:
             before = last
         return rows
 
-    def _fill(self, name: str, column: Array) -> None:
-        """Copy a column's chunks into `column` (rows,), NaN for chunks without it."""
+    def _fill(self, name: str, column: Array, start: int = 0) -> None:
+        """Copy a column's chunks from a row on into `column`, NaN for chunks without it."""
         target = column.data.cast("B")  # copies faster than NumPy assigns
         sizes = {first: size for first, size, *_ in self._chunks}
         done = 0
         for first, *row, data, kept in self._connection.execute(
             "SELECT first_row, last_number, last_id, data, checksum FROM column_chunk "
-            "WHERE series_id = ? AND name = ? ORDER BY first_row",
-            (self._series, name),
+            "WHERE series_id = ? AND name = ? AND first_row >= ? ORDER BY first_row",
+            (self._series, name, start),
         ):
             if sizes.get(first) != len(data):
                 raise _ChunkError(f"a chunk of column {name} is broken")
             _require_chunk(kept, self._series, name, first, *row, data)
-            column[done:first] = np.nan
-            target[8 * first : 8 * first + len(data)] = data
-            done = first + len(data) // 8
+            at = first - start
+            column[done:at] = np.nan
+            target[8 * at : 8 * at + len(data)] = data
+            done = at + len(data) // 8
         column[done:] = np.nan

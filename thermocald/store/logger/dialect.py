@@ -351,9 +351,8 @@ def _join_units(row: list[str], width: int) -> list[str]:
 def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
     values = [value for row in rows for value in row]
     comma = sum(bool(_COMMA_NUMBER.fullmatch(v)) for v in values)
-    if separator == ",":
-        return "," if any(_COMMA_NUMBER.fullmatch(v) for v in values) else "."
-    return "," if comma > sum(bool(_POINT_NUMBER.fullmatch(v)) for v in values) else "."
+    point = sum(bool(_POINT_NUMBER.fullmatch(v)) for v in values if separator != ",")
+    return "," if comma > point else "."
 
 
 _TEMPERATURE_NAME = re.compile(

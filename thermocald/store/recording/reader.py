@@ -15,14 +15,14 @@ from thermocald.errors import RecordingError
 from thermocald.names import FileFolder
 from thermocald.numbers import counted
 from thermocald.photogrammetry.series.normals import runs
-from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
+from thermocald.store.recording.head import CameraSpec, Head, read_head
 from thermocald.store.recording.observation_file import ObservationFile
 from thermocald.store.recording.sense import pairing_doubts, reading_doubts, time_doubts, time_fault
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield, require_millimetres
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
@@ -123,10 +123,6 @@ class Recording:
     @property
     def camera(self) -> CameraSpec:
         return self.head.camera
-
-    @property
-    def channels(self) -> Mapping[str, Channel]:
-        return self.head.channels
 
     def extra_columns(self) -> dict[str, tuple[str, ...]]:
         """Return the unknown columns of epochs.csv, as text."""
@@ -265,9 +261,9 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     extra = [n for n in table.columns if n and n not in {*required, "temperature_time", "frame"}]
     timed = [n for n in ("temperature_time",) if n in table.columns]
     found = table.read(["epoch"], ["frame_time"], [*timed, *channels], ["frame", *extra])
-    if not found:
-        raise RecordingError(f"{table.path}: holds no epochs")
     numbers, frame_time = found["epoch"], found["frame_time"]
+    if not len(numbers):
+        raise RecordingError(f"{table.path}: holds no epochs")
     table.check(
         "epoch",
         np.diff(numbers, prepend=-1) <= 0,
@@ -325,13 +321,13 @@ def _read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     """Read a `readings.csv`. Raises RecordingError naming line and column."""
     table = Table(path, ["time", *channels])
     columns = table.read(numbers=["time"], optional=channels)
-    times = columns.pop("time", np.empty(0))
+    times = columns.pop("time")
     table.check("time", np.diff(times, prepend=-np.inf) <= 0, "times must increase")
     if fault := time_fault(times):
         table.fail(fault[0], "time", fault[1])
     for name, values in columns.items():
         _check_celsius(table, name, values)
-    return TemperatureLog(times, {name: columns.get(name, np.empty(0)) for name in channels})
+    return TemperatureLog(times, columns)
 
 
 def interpolate_readings(

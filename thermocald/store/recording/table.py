@@ -95,20 +95,20 @@ class Table:
         texts: Sequence[str] = (),
     ) -> dict[str, Any]:
         """Return whole columns by name; optional: numbers that may be empty, which become NaN."""
-        parts: dict[str, list[Any]] = {}
+        parts: dict[str, list[Any]] = {n: [] for n in (*integers, *numbers, *optional, *texts)}
         for chunk in self.chunks():
             for name in integers:
-                parts.setdefault(name, []).append(chunk.integers(name))
+                parts[name].append(chunk.integers(name))
             for name in (*numbers, *optional):
-                found = chunk.numbers(name, empty_is_nan=name in optional)
-                parts.setdefault(name, []).append(found)
+                parts[name].append(chunk.numbers(name, empty_is_nan=name in optional))
             # chunk by chunk: the garbage collector would traverse a list of a year's texts
             for name in texts:
-                parts.setdefault(name, []).append(chunk.text(name))
+                parts[name].append(chunk.text(name))
         return {
-            name: tuple(chain.from_iterable(found)) if name in texts else np.concatenate(found)
+            name: tuple(chain.from_iterable(found)) if name in texts
+            else np.concatenate(found or [np.empty(0)])
             for name, found in parts.items()
-        }
+        }  # fmt: skip
 
     def numeric(self, names: Sequence[str]) -> list[str]:
         """Return the columns that begin with numbers or are empty; they are read until it shows."""

@@ -36,6 +36,8 @@ _SMALLEST_FIELD_IN_PRINCIPAL_DISTANCES = 5.0
 _MOST_LINES = 20_000
 _MOST_ROWS = 1000
 _LARGEST_BYTES = 5_000_000
+_KINDS = ("aprilgrid", "april_grid", "checkerboard", "chessboard", "checker", "charuco",
+          "charucoboard")  # fmt: skip
 _SYNONYMS = {
     "columns": ("squaresx", "numsquaresx", "cols", "columns", "boardcols", "numcols", "ncols",
                 "width", "boardwidth", "targetcols", "tagcols"),
@@ -81,7 +83,7 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
     found = table.read(
         (), [n for n in _NUMBERS if n != "diameter"], ["diameter"], ["target", *given]
     )
-    names = [text.strip() for text in found.get("target", ())]
+    names = [text.strip() for text in found["target"]]
     first: dict[str, int] = {}
     for row, name in enumerate(names):
         if not name:
@@ -90,8 +92,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             table.fail(row, "target", f"{name[:40]!r} must be printable")
         if first.setdefault(name, row) != row:
             table.fail(row, "target", f"target {name!r} is duplicated")
-    columns = {name: found.get(name, np.empty(0)) for name in _NUMBERS}
-    for column, numbers in columns.items():
+    for column in _NUMBERS:
+        numbers = found[column]
         table.check(column, abs(numbers) > _LARGEST_MM, f"must be within {_LARGEST_MM:g} mm")
         if column == "diameter":
             table.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
@@ -114,9 +116,9 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
         raise TestFieldError(f"{table.path}: holds no targets")
     return TestField.build(
         names,
-        np.array([columns["X"], columns["Y"], columns["Z"]]).T,
-        np.array([columns["sX"], columns["sY"], columns["sZ"]]).T,
-        columns["diameter"].tolist(),
+        np.array([found[name] for name in "XYZ"]).T,
+        np.array([found[name] for name in ("sX", "sY", "sZ")]).T,
+        found["diameter"].tolist(),
         kinds,
         [code.strip() for code in found.get("code", empty)],
     )
@@ -180,8 +182,13 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
     kind = str(plain.get("targettype", plain.get("type", ""))).lower()
     if not kind and any(k in plain for k in _SYNONYMS["dictionary"]):
         kind = "charuco"
-    if kind in ("aprilgrid", "april_grid"):
-        columns, rows = board.count("columns"), board.count("rows")
+    if kind not in _KINDS:
+        wrong = f"{kind!r} is unknown" if kind else "is missing"
+        raise TestFieldError(
+            f"{path}, key target_type: {wrong}; give aprilgrid, checkerboard, charuco or chessboard"
+        )
+    columns, rows = board.count("columns"), board.count("rows")
+    if kind.startswith("april"):
         size = 1e3 * board.number("tagsize", "m", above=0.0, high=1e6)
         spacing = board.number("tagspacing", "1", above=0.0, high=1e6)
         start = next((key for key in ("startid", "lowid") if plain.get(key) is not None), None)
@@ -192,33 +199,26 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
             f"{spacing * size:g} mm apart"
         )
     if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in plain:
-        columns, rows = board.count("columns"), board.count("rows")
         wide = 1e3 * board.number("colspacingmeters", "m", above=0.0, high=1e6)
         high = 1e3 * board.number("rowspacingmeters", "m", above=0.0, high=1e6)
         field = boards.chessboard(columns, rows, wide, high, sigma=sigma)
         return field, f"Kalibr's checkerboard of {columns} × {rows} corners, {wide:g} × {high:g} mm"
-    if kind in ("charuco", "charucoboard", "checkerboard", "chessboard", "checker"):
-        columns, rows = board.count("columns"), board.count("rows")
-        square = board.length("square")
-        if "charuco" not in kind:
-            if {"squaresx", "numsquaresx"} & set(plain):  # one more than corners
-                columns, rows = columns - 1, rows - 1
-            field = boards.chessboard(columns, rows, square, sigma=sigma)
-            return field, f"{whose} chessboard of {columns} × {rows} inner corners, {square:g} mm"
-        marker = board.length("marker")
-        key = board.find_key("dictionary")
-        if plain.get(key) is None:
-            raise board.fail(key, f"is missing; the file has {', '.join(plain)[:200]}")
-        name = _dictionary(path, plain[key])
-        legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
-        field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
-        return field, (
-            f"{whose} ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
-            f"{marker:g} mm of {name}"
-        )
-    wrong = f"{kind!r} is unknown" if kind else "is missing"
-    raise TestFieldError(
-        f"{path}, key target_type: {wrong}; give aprilgrid, checkerboard, charuco or chessboard"
+    square = board.length("square")
+    if "charuco" not in kind:
+        if {"squaresx", "numsquaresx"} & set(plain):  # one more than corners
+            columns, rows = columns - 1, rows - 1
+        field = boards.chessboard(columns, rows, square, sigma=sigma)
+        return field, f"{whose} chessboard of {columns} × {rows} inner corners, {square:g} mm"
+    marker = board.length("marker")
+    key = board.find_key("dictionary")
+    if plain.get(key) is None:
+        raise board.fail(key, f"is missing; the file has {', '.join(plain)[:200]}")
+    name = _dictionary(path, plain[key])
+    legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
+    field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
+    return field, (
+        f"{whose} ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
+        f"{marker:g} mm of {name}"
     )
 
 
@@ -313,5 +313,5 @@ def read_distances(path: Path) -> list[Distance]:
     """Read measured distances from a CSV with a, b, length, sigma mm. Raises UsageError."""
     names = ("a", "b", "length", "sigma")
     found = Table(path, names, UsageError).read(numbers=names[2:], texts=names[:2])
-    rows = zip(*(found.get(name, ()) for name in names), strict=True)
+    rows = zip(*(found[name] for name in names), strict=True)
     return [Distance(a.strip(), b.strip(), float(mm), float(sd)) for a, b, mm, sd in rows]

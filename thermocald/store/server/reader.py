@@ -19,7 +19,6 @@ from uuid import UUID, uuid5
 import numpy as np
 
 from thermocald import __version__
-from thermocald.errors import StoreVersionError
 from thermocald.store.database.epochs import (
     latest_epochs,
     series_row,
@@ -290,11 +289,6 @@ class ServerWriter(Connected):
         for name, value in row.items():
             if name in _LOCAL[table]:
                 continue
-            if name not in columns:
-                raise StoreVersionError(
-                    f"{self.address}: the store's {table}s have a column {name!r} that the server "
-                    "lacks; run `thermocald server init` with this program's version"
-                )
             if name == "clock_trusted":
                 value = bool(value)
             # PostgreSQL's text cannot hold NUL, which a broken device may send in a note

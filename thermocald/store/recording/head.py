@@ -131,24 +131,21 @@ def _channels(top: _Reader) -> dict[str, Channel]:
 def head_document(head: Head) -> dict[str, Any]:
     """Return the mapping that `recording.yaml` holds; it can be written as JSON if `extra` can."""
     sensor, interior = head.camera.sensor, head.camera.interior
+    camera = {
+        "name": head.camera.name, "width": sensor.width, "height": sensor.height,
+        "pixel_pitch": sensor.pixel_pitch, "principal_distance": head.camera.principal_distance,
+        "interior": interior and asdict(interior),
+    }  # fmt: skip
+    temperatures = {
+        name: _known({"unit": "degC", "resolution": channel.resolution})
+        for name, channel in head.channels.items()
+    }
     document = {
         "format": FORMAT, "name": head.name, "series": head.series, "interval": head.interval,
-        "camera": {
-            "name": head.camera.name, "width": sensor.width, "height": sensor.height,
-            "pixel_pitch": sensor.pixel_pitch, "principal_distance": head.camera.principal_distance,
-            "interior": interior and asdict(interior),
-        },
-        "temperatures": {
-            name: {"unit": "degC", "resolution": channel.resolution}
-            for name, channel in head.channels.items()
-        } or None,
+        "camera": _known(camera), "temperatures": temperatures or None,
     }  # fmt: skip
     return {**_known(document), **head.extra}
 
 
 def _known(mapping: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: _known(value) if isinstance(value, dict) else value
-        for key, value in mapping.items()
-        if value is not None
-    }
+    return {key: value for key, value in mapping.items() if value is not None}

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.errors import StoreError, StoreFullError
-from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
 from thermocald.numbers import counted
 from thermocald.store.database import columns, epochs
@@ -173,7 +172,7 @@ class Store(SeriesReader):
     ) -> dict[str, NDArray[Any]]:
         source = {name: _chunk_name(name, series) for name in names}
         with self._reads("columns") as connection:
-            found = columns.read_columns(connection, series.id, [*dict.fromkeys(source.values())])
+            found = columns.SeriesColumns(connection, series.id).read(sorted({*source.values()}))
         return {name: found[source[name]] for name in names}
 
     def column_pages(
@@ -189,7 +188,7 @@ class Store(SeriesReader):
         after, size = -1, rows
         while size == rows:
             with self._reads("columns") as connection:
-                found = columns.read_page(connection, series.id, wanted, after, rows)
+                found = columns.SeriesColumns(connection, series.id).read_page(wanted, after, rows)
             yield {name: found[source[name]] for name in names}
             size = len(found["number"])
             after = int(found["number"][-1]) if size else after
@@ -277,10 +276,7 @@ class Store(SeriesReader):
         Raises StoreError, or OutputError if the target cannot be written.
         """
         with in_words(self.path, f"the copy {target} cannot be made"):
-            try:
-                copy_database(self._db, target)
-            except OSError as error:
-                raise cannot_write(target, error) from error
+            copy_database(self._db, target)
 
     @contextmanager
     def _reads(self, what: str) -> Iterator[sqlite3.Connection]:

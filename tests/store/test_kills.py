@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import textwrap
@@ -23,7 +22,7 @@ from tests.store.small import write_recording
 from thermocald.errors import RecordingError, StoreError, StoreFullError
 from thermocald.store.database.store import Store
 
-KILLS = 300
+KILLS = 150
 _TAKEOVER_S = 0.2  # for a second daemon after the first was killed, as it would write on for ever
 # As a daemon stores epochs: through its guard; prints after each what it reported as stored.
 DAEMON = textwrap.dedent(
@@ -63,30 +62,17 @@ def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> l
         return forker.start(folder, *map(str, arguments), script=script)
 
     other = store.with_name(f"other-{k}.db")
-    link = store.with_name(f"link-{k}.db")
     if kind == "hard link":
         os.link(store, other)
         return [writes("replay", recording, "--store", other)]
-    if kind == "soft link":
-        link.symlink_to(store)
-        return [writes("replay", recording, "--store", link)]
-    if kind == "copies":
-        for name in (store.name, f"{store.name}-wal", f"{store.name}-shm"):
-            if (source := store.with_name(name)).exists():
-                shutil.copy(source, other.with_name(name.replace(store.name, other.name)))
-        return []
     if kind == "second daemon":
         return [writes("daemon", store, script=DAEMON)]
-    if kind == "replay":
-        return [writes("replay", recording, "--store", store)]
-    if kind == "run":
-        return [writes("run", "--recording", recording, "--store", store, "--fast")]
     if kind == "readers":
         return [writes("check", store), writes("backup", store, other)]
     return []
 
 
-KINDS = ["alone", "hard link", "soft link", "copies", "second daemon", "replay", "run", "readers"]
+KINDS = ["alone", "hard link", "second daemon", "readers"]
 
 
 def kill_one(forker: Forker, store: Path, start, rng) -> int:

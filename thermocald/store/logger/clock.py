@@ -114,38 +114,30 @@ class DeviceClock:
                     )
                 twice.append(i)
         if twice:
-            self._resolve_repeated(seconds, moments, twice, where)
+            repeated = [moments[i] for i in twice]
+            seconds[twice] = self._choose(repeated, seconds[twice], where(twice[0]))
         return seconds - self.ahead
 
-    def _resolve_repeated(
-        self,
-        seconds: Array,
-        moments: Sequence[datetime],
-        twice: list[int],
-        where: Callable[[int], str],
-    ) -> None:
-        """Choose one of the two times of each moment that exists twice, in place."""
-        first = twice[0]
-        moment = moments[first]
-        again = f"{where(first)}: {moment:%Y-%m-%d %H:%M:%S} exists twice in {self.zone}"
+    def _choose(self, moments: Sequence[datetime], earlier: Array, where: str) -> Array:
+        """Return the times (n,) s that moments mean which exist twice; earlier: the first ones."""
+        again = f"{where}: {moments[0]:%Y-%m-%d %H:%M:%S} exists twice in {self.zone}"
         if self.ambiguous == "refuse":
             raise DataError(
                 f"{again} (clocks were put back): give --ambiguous order if the rows are in the "
                 "order of time, else --ambiguous earlier or later"
             )
         if self.ambiguous == "earlier":
-            return
-        later = np.array([moments[i].replace(tzinfo=self.zone, fold=1).timestamp() for i in twice])
+            return earlier
+        later = np.array([m.replace(tzinfo=self.zone, fold=1).timestamp() for m in moments])
         if self.ambiguous == "later":
-            seconds[twice] = later
-            return
-        back = [k for k in range(1, len(twice)) if seconds[twice[k]] < seconds[twice[k - 1]]]
+            return later
+        back = np.flatnonzero(np.diff(earlier) < 0) + 1
         if len(back) != 1:
             raise DataError(
                 f"{again}, and the order of the rows does not show which is meant (time runs back "
                 f"{len(back)} times, not once): give --ambiguous earlier or later"
             )
-        seconds[twice[back[0] :]] = later[back[0] :]
+        return np.concatenate([earlier[: back[0]], later[back[0] :]])
 
 
 def device_clock(

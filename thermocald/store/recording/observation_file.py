@@ -38,7 +38,6 @@ from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from typing import NoReturn
 
     from numpy.typing import NDArray
 
@@ -318,12 +317,10 @@ class ParquetTable(Table):
         finally:
             pyarrow.default_memory_pool().release_unused()
 
-    def fail(self, row: int, column: str | None, message: str) -> NoReturn:
-        """Raise RecordingError for one row (from 0) and column."""
-        if self._original is not None:
-            self._original.fail(row, column, message)
-        where = f"{self.path}, row {row + 1}"
-        raise RecordingError(f"{where}{f', column {column}' if column else ''}: {message}")
+    def _where(self, row: int) -> str:
+        return (
+            f"{self.path}, row {row + 1}" if self._original is None else self._original._where(row)
+        )
 
 
 class ColumnChunk(Chunk):

@@ -133,10 +133,11 @@ class Table:
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise the error for one row (counted from 0 below the header) and column."""
-        where = f"{self.path}, line {self._line(row)}"
-        if column is not None:
-            where += f", column {column}"
-        raise self._error(f"{where}: {message}")
+        of = "" if column is None else f", column {column}"
+        raise self._error(f"{self._where(row)}{of}: {message}")
+
+    def _where(self, row: int) -> str:
+        return f"{self.path}, line {self._line(row)}"
 
     def _open(self) -> TextIO:
         if self._text is not None:

@@ -15,13 +15,12 @@ from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.recording import observation_file
+from thermocald.store.recording import observation_file, table
 from thermocald.store.recording.reader import (
     interpolate_readings,
     open_recording,
     read_recording,
 )
-from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -62,7 +61,7 @@ def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
     whole = read_recording(recording_path).epochs
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     monkeypatch.setattr(observation_file, "_parse_once", lambda table: table)
-    monkeypatch.setattr(Table.chunks, "__defaults__", (7, None, None))  # epochs span chunks
+    monkeypatch.setattr(table, "_ROWS", 7)  # epochs span chunks
     streamed = list(open_recording(recording_path).iter_epochs())
     assert [e.number for e in streamed] == [e.number for e in whole]
     for a, b in zip(streamed, whole, strict=True):

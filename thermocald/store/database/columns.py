@@ -159,10 +159,9 @@ def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:
             yield f"a chunk of column {row[2]} (its epochs are read one by one instead)"
 
 
-def _chunk_checksum(
-    series: int, name: str, first_row: int, last: int, last_id: int, data: bytes
-) -> int:
-    return row_checksum((series, first_row, last, last_id), (name,), data)
+def _chunk_checksum(series: int, name: str, *row: Any) -> int:
+    *numbers, data = row
+    return row_checksum((series, *numbers), (name,), data)
 
 
 def _require_chunk(kept: int, series: int, name: str, *row: Any) -> None:

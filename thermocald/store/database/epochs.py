@@ -19,7 +19,6 @@ import math
 import sqlite3
 import struct
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -36,7 +35,6 @@ from thermocald.store.database.columns import (
     checked_chunks,
     examined_rows,
     insert_row,
-    read_epochs,
     require_checksum,
     row_checksum,
 )
@@ -211,22 +209,6 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", details).rowcount
     if parts and kept != len(parts):
         raise sqlite3.IntegrityError("a foreign trigger keeps rows out of detail; drop it")
-
-
-def select_epochs(
-    connection: sqlite3.Connection,
-    series: int,
-    first: int = 0,
-    last: int | None = None,
-    *,
-    details: bool = True,
-) -> Iterator[StoredEpoch]:
-    """Yield epochs `first` to `last` (numbers), each in its latest revision.
-
-    details: False leaves out observations and covariances. Raises StoreError for damage.
-    """
-    rows = read_epochs(connection, series, first, last)
-    return latest_epochs(rows, partial(read_details, connection) if details else None)
 
 
 def latest_epochs(

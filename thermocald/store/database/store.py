@@ -12,6 +12,7 @@ import logging
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Self
 
@@ -140,9 +141,11 @@ class Store(SeriesReader):
         missing, size, first = 0, _EPOCHS_AT_ONCE, first or 1
         while size == _EPOCHS_AT_ONCE:
             with self._reads("epochs") as connection:
-                found = epochs.select_epochs(connection, series.id, first, last, details=details)
+                rows = columns.read_epochs(connection, series.id, first, last)
+                detail = partial(epochs.read_details, connection) if details else None
+                found = epochs.latest_epochs(rows, detail)
                 page = list(islice(found, _EPOCHS_AT_ONCE))
-                del found
+                del found, rows
             for stored in page:
                 missing += max(0, stored.epoch.number - first)
                 first = stored.epoch.number + 1
@@ -378,8 +381,8 @@ class Store(SeriesReader):
     ) -> None:
         """Store a later calibration of an epoch; observations: None if unchanged; extra: added."""
         with self._transaction(f"the calibration of epoch {number} was not stored"):
-            found = epochs.select_epochs(self._db, series.id, number, number, details=False)
-            if (then := next(found, None)) is None:
+            rows = columns.read_epochs(self._db, series.id, number, number)
+            if (then := next(epochs.latest_epochs(rows, None), None)) is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
             stored = StoredEpoch(
                 replace(then.epoch, observations=observations),

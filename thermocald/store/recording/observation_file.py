@@ -291,12 +291,9 @@ class ParquetTable(Table):
             raise RecordingError(f"{self.path}: is not readable as Parquet: {cause}") from cause
 
     def chunks(
-        self,
-        rows: int = _ROWS,
-        columns: Sequence[str] | None = None,
-        epochs: tuple[int, int] | None = None,
+        self, columns: Sequence[str] | None = None, epochs: tuple[int, int] | None = None
     ) -> Iterator[ColumnChunk]:
-        """Yield at most `rows` rows at a time of `columns` and, if groups allow, of `epochs`."""
+        """Yield at most _ROWS rows at a time of `columns` and, if groups allow, of `epochs`."""
         pyarrow = _pyarrow()
         first = 0
         try:
@@ -308,7 +305,7 @@ class ParquetTable(Table):
                         file.metadata, self.columns.index("epoch"), epochs
                     )
                 for group in groups:  # one call for all groups would hold them all in memory
-                    for batch in file.iter_batches(rows, [group], columns):
+                    for batch in file.iter_batches(_ROWS, [group], columns):
                         if len(batch):
                             yield ColumnChunk(self, first, batch)
                             first += len(batch)
@@ -406,7 +403,7 @@ def _parse(table: Table, target: Path) -> None:
     pyarrow = _pyarrow()
     from pyarrow import csv
 
-    if next(table.chunks(1), None) is None:
+    if next(table.chunks(), None) is None:
         raise ValueError("no rows")
     names = [name for name in table.columns if name]
     kinds = dict.fromkeys(names, pyarrow.string())

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _MAX_EXACT_INTEGER = 2**53
 _LONGEST_HEADER = 200_000
 _MOST_COLUMNS = 1000
+_ROWS = 8192  # of a chunk
 _LEFT_EMPTY = "; leave the field empty if there is none"
 
 
@@ -64,12 +65,9 @@ class Table:
                 raise error(self._missing(name))
 
     def chunks(
-        self,
-        rows: int = 8192,
-        columns: Sequence[str] | None = None,
-        epochs: tuple[int, int] | None = None,
+        self, columns: Sequence[str] | None = None, epochs: tuple[int, int] | None = None
     ) -> Iterator[Chunk]:
-        """Yield the rows below the header, at most `rows` at a time; empty lines are skipped.
+        """Yield the rows below the header, at most _ROWS at a time; empty lines are skipped.
 
         columns, epochs (first, last): what is needed; a Parquet file leaves out the rest.
         """
@@ -81,7 +79,7 @@ class Table:
             content = map(tuple, filter(None, reader))
             try:
                 next(content, None)
-                while block := list(islice(content, rows)):
+                while block := list(islice(content, _ROWS)):
                     yield Chunk(self, first, block)
                     first += len(block)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:

@@ -21,7 +21,7 @@ from thermocald.store.recording.head import parse_head
 from thermocald.store.server.connection import Connected
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
@@ -174,13 +174,13 @@ class FleetReader(Connected):
         for _, found in groupby(series, key=lambda one: (one.station, one.camera)):
             every = list(found)
             newest = every[-1]
-            low = _extreme(min, (one.low for one in every))
-            high = _extreme(max, (one.high for one in every))
+            low = min((one.low for one in every if one.low is not None), default=math.nan)
+            high = max((one.high for one in every if one.high is not None), default=math.nan)
             camera = FleetCamera(
                 newest.station, newest.camera, newest.name, heads[newest.key],
                 json.loads(newest.identity), newest.last,
                 sum(one.epochs for one in every), sum(one.results for one in every),
-                _extreme(max, (one.last_ok for one in every)),
+                max((one.last_ok for one in every if one.last_ok is not None), default=math.nan),
                 (low, high) if math.isfinite(low) else None,
             )  # fmt: skip
             owned.append((camera, every))
@@ -268,8 +268,3 @@ class FleetReader(Connected):
                 [i, *s] for i, one in enumerate(every) for _, s in sorted(samples[one.key].items())
             ]
             camera.samples = np.array(rows, dtype=float).reshape(-1, 9)
-
-
-def _extreme(of: Callable[[list[float]], float], values: Iterable[float | None]) -> float:
-    known = [v for v in values if v is not None and not math.isnan(v)]
-    return of(known) if known else math.nan

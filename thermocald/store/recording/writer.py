@@ -45,8 +45,8 @@ class RecordingWriter:
         self._head = head
         self._field = testfield
         self._partial = path.absolute().with_name(f".{path.absolute().name}.partial")
-        self._epochs: TextIO | None = None
-        self._observations: TextIO | None = None
+        self._files: dict[str, TextIO] = {}
+        self._columns: list[str] = []  # of observations
         self._last: Epoch | None = None
         self._last_reading = -math.inf
 
@@ -62,9 +62,8 @@ class RecordingWriter:
                 ("testfield.csv", testfield_csv(self._field)),
             ):
                 (self._partial / name).write_text(text, encoding="utf-8")
-            self._epochs = self._new("epochs.csv")
             names = ["epoch", "frame_time", "temperature_time", *self._head.channels, "frame"]
-            csv.writer(self._epochs, lineterminator="\n").writerow(names)
+            self._epochs = self._new("epochs.csv", names)
         return self
 
     def append(
@@ -74,15 +73,12 @@ class RecordingWriter:
 
         Without `image`, the frame that the epoch names is copied.
         """
-        if self._epochs is None:
-            raise RecordingError(f"{self.path}: the writer is not open")
         self._refuse_backwards(epoch)
         with self._in_words():
             frame = self._keep_frame(epoch, image)
             times = f"{epoch.frame_time:.6f}", _number(epoch.temperature_time, ".6f")
             read = [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
-            row = [epoch.number, *times, *read, frame]
-            csv.writer(self._epochs, lineterminator="\n").writerow(row)
+            self._epochs.writerow([epoch.number, *times, *read, frame])
             if epoch.observations is not None:
                 self._write_observations(epoch.number, epoch.observations)
         self._last = epoch
@@ -91,19 +87,19 @@ class RecordingWriter:
 
     def keep_readings(self, readings: TemperatureLog) -> None:
         """Write every reading of a log, not only those of the epochs."""
-        with self._in_words(), self._new(READINGS) as file:
-            file.writelines(csv_text([{"time": readings.times, **readings.channels}]))
+        with self._in_words():
+            (text,) = csv_text([{"time": readings.times, **readings.channels}])
+            (self._partial / READINGS).write_text(text, encoding="utf-8")
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._abandon()
             return
         with self._in_words():
-            for file in (self._epochs, self._observations):
-                if file is not None:
-                    file.flush()
-                    os.fsync(file.fileno())
-                    file.close()
+            for file in self._files.values():
+                file.flush()
+                os.fsync(file.fileno())
+                file.close()
             self._partial.rename(self.path)
 
     def _refuse_backwards(self, epoch: Epoch) -> None:
@@ -118,16 +114,19 @@ class RecordingWriter:
         if epoch.temperature_time < self._last_reading:
             raise RecordingError(f"{where}: the time of its temperature runs backwards")
 
-    def _new(self, name: str) -> TextIO:
-        return (self._partial / name).open("w", encoding="utf-8", newline="")
+    def _new(self, name: str, columns: list[str]) -> Any:
+        """Return the CSV writer of a new table."""
+        self._files[name] = (self._partial / name).open("w", encoding="utf-8", newline="")
+        rows = csv.writer(self._files[name], lineterminator="\n")
+        rows.writerow(columns)
+        return rows
 
     def _abandon(self) -> None:
-        for file in (self._epochs, self._observations):
-            if file is not None:
-                try:
-                    file.close()
-                except OSError:  # a full disk fails the flush too; the file is removed below
-                    file.close()
+        for file in self._files.values():
+            try:
+                file.close()
+            except OSError:  # a full disk fails the flush too; the file is removed below
+                file.close()
         shutil.rmtree(self._partial, ignore_errors=True)
 
     @contextmanager
@@ -171,12 +170,9 @@ class RecordingWriter:
             columns["sxy"] = seen.covariances
         if len(seen):
             columns |= seen.quality
-        if self._observations is None:
-            self._observations = self._new("observations.csv")
+        if not self._columns:
             self._columns = list(columns)
-            csv.writer(self._observations, lineterminator="\n").writerow(
-                ["epoch", "target", *columns]
-            )
+            self._observations = self._new("observations.csv", ["epoch", "target", *columns])
         if added := [name for name in columns if name not in self._columns]:
             self._add_columns(added)
         names = [self._field.names[i] for i in seen.targets.tolist()]
@@ -186,22 +182,18 @@ class RecordingWriter:
             else [_ABSENT.get(name, "")] * len(seen)
             for name in self._columns
         ]
-        rows = csv.writer(self._observations, lineterminator="\n")
-        rows.writerows(zip([number] * len(seen), names, *cells, strict=True))
+        self._observations.writerows(zip([number] * len(seen), names, *cells, strict=True))
 
     def _add_columns(self, names: list[str]) -> None:
         """Add columns to the rows of observations written so far."""
-        assert self._observations is not None
-        self._observations.close()
+        self._files["observations.csv"].close()
         before = self._partial / "observations.before"
         (self._partial / "observations.csv").rename(before)
-        self._observations = self._new("observations.csv")
-        rows = csv.writer(self._observations, lineterminator="\n")
         absent = [_ABSENT.get(name, "") for name in names]
         with before.open(encoding="utf-8", newline="") as file:
             written = csv.reader(file)
-            rows.writerow([*next(written), *names])
-            rows.writerows([*row, *absent] for row in written)
+            self._observations = self._new("observations.csv", [*next(written), *names])
+            self._observations.writerows([*row, *absent] for row in written)
         before.unlink()
         self._columns += names
 

@@ -222,15 +222,11 @@ class ServerWriter(Connected):
         self._sent: set[UUID] = set()
         # {table: {column: type}} on the server, read once as every batch needs it
         self._tables: dict[str, dict[str, str]] = {}
-        try:
-            for table, column, kind in self._query(
-                "SELECT table_name, column_name, udt_name FROM information_schema.columns "
-                "WHERE table_schema = 'public' ORDER BY ordinal_position"
-            ):
-                self._tables.setdefault(table, {})[column] = kind
-        except BaseException:
-            self.close()
-            raise
+        for table, column, kind in self._query(
+            "SELECT table_name, column_name, udt_name FROM information_schema.columns "
+            "WHERE table_schema = 'public' ORDER BY ordinal_position"
+        ):
+            self._tables.setdefault(table, {})[column] = kind
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]

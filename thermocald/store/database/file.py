@@ -398,10 +398,9 @@ def open_copy(
             copy = Path(folder) / "copy.db"
             _copy_files(path, wal, copy)
             with closing(_connect(copy, "rw")) as connection:
-                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
                 if change is not None:
                     change(connection)
-                connection.execute("PRAGMA journal_mode = DELETE")
+                connection.execute("PRAGMA journal_mode = DELETE")  # moves the -wal into the file
             opened = _connect(copy, "ro&immutable=1")
             # SQLite opens the file only now, before the folder is removed
             opened.execute("SELECT 1 FROM sqlite_master").fetchone()

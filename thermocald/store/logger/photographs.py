@@ -178,14 +178,14 @@ def find_copies(paths: Sequence[Path]) -> dict[int, int]:
 
     Files that cannot be read are ignored.
     """
-    of_size: dict[int, list[int]] = {}
     first: dict[bytes, int] = {}
     copies = {}
+    sizes = [path.stat().st_size if path.is_file() else -1 for path in paths]
+    alike = Counter(sizes)
     for i, path in enumerate(paths):
-        with suppress(OSError):
-            of_size.setdefault(path.stat().st_size, []).append(i)
-    for i in sorted(i for alike in of_size.values() if len(alike) > 1 for i in alike):
-        with suppress(OSError), paths[i].open("rb") as file:
+        if alike[sizes[i]] == 1:
+            continue
+        with suppress(OSError), path.open("rb") as file:
             key = hashlib.file_digest(file, "sha256").digest()
             if (known := first.setdefault(key, i)) != i:
                 copies[i] = known

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
@@ -140,10 +141,10 @@ class Table:
     def _open(self) -> TextIO:
         if self._text is not None:
             return io.StringIO(self._text, newline="")
+        # reading a link to a device might never end
+        if os.path.exists(self.path) and not os.path.isfile(self.path):
+            raise self._error(f"{self.path}: is not a file")
         try:
-            # reading a link to a device might never end
-            if self.path.exists() and not self.path.is_file():
-                raise self._error(f"{self.path}: is not a file")
             return self.path.open(newline="", encoding="utf-8-sig")
         except (OSError, ValueError) as cause:  # ValueError: a NUL character in the path
             why = getattr(cause, "strerror", cause)

@@ -404,7 +404,6 @@ def _camera_of(
     file: a camera file, used instead of EXIF; pitch, distance mm: used instead of EXIF's; dry_run:
     an unknown pixel pitch is noted, not an error.
     """
-    notes: list[str] = []
     if file is not None:
         known = read_camera(file, pitch)
         if (known.sensor.width, known.sensor.height) != (photograph.width, photograph.height):
@@ -412,8 +411,8 @@ def _camera_of(
                 f"{file}: is of {known.sensor.width} × {known.sensor.height} px, the photographs "
                 f"have {photograph.width} × {photograph.height}"
             )
-        notes += doubt_lines(pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch))
-        return known, notes
+        return known, doubt_lines(pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch))
+    notes: list[str] = []
     if distance is None and photograph.focal_length is not None:
         distance = photograph.focal_length
         notes.append(f"camera: principal distance {distance:g} mm from EXIF (--principal-distance)")

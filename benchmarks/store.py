@@ -27,13 +27,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.database.columns import (
-    CHUNK,
-    MERGED,
-    SeriesColumns,
-    insert_chunk,
-    latest_columns,
-)
+from thermocald.store.database.columns import CHUNK, MERGED, SeriesColumns
 from thermocald.store.database.epochs import insert_epoch
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
@@ -110,18 +104,19 @@ def fill_columns(path: Path, epochs: int) -> None:
         store._db.execute("BEGIN")
         for i in range(min(epochs, size)):
             _insert_row(store, series.id, i, rng)
-        SeriesColumns(store._db, series.id).build()
+        columns = SeriesColumns(store._db, series.id)
+        columns.build()
         if chunks > 1:
-            first = latest_columns(store._db, series.id, -1)
+            first = columns.latest(-1)
             for k in range(1, chunks):
                 later = {name: rng.permutation(column) for name, column in first.items()}
                 later["number"] = first["number"] + k * size
                 for name in ("frame_time", "temperature_time"):
                     later[name] = first[name] + 10.0 * k * size
-                insert_chunk(store._db, series.id, k * size, (k + 1) * size - 1, later)
+                columns.insert(k * size, (k + 1) * size - 1, later)
             for i in range(chunks * size, epochs):
                 _insert_row(store, series.id, i, rng)
-            SeriesColumns(store._db, series.id).build()
+            columns.build()
         store._db.execute("COMMIT")
 
 

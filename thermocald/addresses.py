@@ -163,7 +163,9 @@ class CleanFormatter(logging.Formatter):
 def is_loopback(host: str) -> bool:
     """Return whether a server that binds to a name or address is reached from this machine only."""
     address = _address(_plain(host))
-    return _plain(host) == "localhost" if address is None else _is_loopback(address)
+    if address is None:
+        return _plain(host) == "localhost"
+    return (getattr(address, "ipv4_mapped", None) or address).is_loopback
 
 
 class HostNames:
@@ -190,10 +192,7 @@ class HostNames:
                 return False
         if port and not (port.isascii() and port.isdigit() and int(port) < 65536):
             return False
-        address = _address(_plain(text))
-        if address is not None and _is_loopback(address):
-            return True
-        return (address or _plain(text)) in self._known
+        return is_loopback(text) or (_address(_plain(text)) or _plain(text)) in self._known
 
     def allow_origin(self, header: str) -> bool:
         """Return whether an `Origin` header names this page."""
@@ -214,8 +213,3 @@ def _address(text: str) -> Address | None:
         return ipaddress.ip_address(text)
     except ValueError:
         return None
-
-
-def _is_loopback(address: Address) -> bool:
-    mapped = getattr(address, "ipv4_mapped", None)
-    return (mapped or address).is_loopback

@@ -314,11 +314,11 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     Raises `error`, which names the file and if possible the line, if the file is missing, is no
     YAML, holds a key twice, or holds something other than a mapping with text keys.
     """
+    if os.path.exists(path) and not os.path.isfile(path):  # False, too, in a closed folder
+        raise error(f"{path}: is not a file")
+    if os.path.exists(path) and path.stat().st_size > _MOST_BYTES:
+        raise error(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB")
     try:
-        if path.exists() and not path.is_file():
-            raise error(f"{path}: is not a file")
-        if path.exists() and path.stat().st_size > _MOST_BYTES:
-            raise error(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as cause:
         what = "is not UTF-8 text" if isinstance(cause, UnicodeDecodeError) else cause
@@ -333,8 +333,6 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
         raise error(f"{path}{where}: {cause.problem or cause.context}") from cause
     except yaml.YAMLError as cause:
         raise error(f"{path}: is no YAML: {' '.join(str(cause).split())}") from cause
-    except RecursionError as cause:
-        raise error(f"{path}: is nested too deeply") from cause
     except _CONSTRUCTION as cause:
         raise error(f"{path}: holds a value that is no YAML: {cause}") from cause
     if document is None:

@@ -28,7 +28,7 @@ from thermocald.series import (
     source_of,
 )
 from thermocald.store.logger.clock import device_clock
-from thermocald.store.logger.columns import LogOptions, log_options
+from thermocald.store.logger.dialect import LogOptions, log_options
 
 if TYPE_CHECKING:
     from thermocald.analysis.camera.camera import CameraDifference
@@ -362,8 +362,7 @@ def survey_testfield(
     from thermocald.photogrammetry.survey import survey
     from thermocald.photogrammetry.targets.image_file import decode_grey
     from thermocald.store.logger.photographs import find_copies
-    from thermocald.store.recording.board_file import read_distances
-    from thermocald.store.recording.testfield_file import write_testfield
+    from thermocald.store.recording.testfield_file import read_distances, write_testfield
 
     measured = [] if scale is None else [Distance(*scale, scale_sd)]
     if distances is not None:

@@ -45,7 +45,7 @@ def stored(tmp_path_factory, forker):
             yield replace(epoch, observations=replace(epoch.observations, points=points))
 
     path = folder / "spoilt"
-    head = Head("spoilt", "M1", 10.0, taken.camera, taken.channels)
+    head = Head("spoilt", "M1", 10.0, taken.camera, taken.head.channels)
     write_recording(path, head, field, spoilt())
     cameras = [
         replayed_camera(path, name=key, calibration={**PLAIN, **changed})

@@ -50,7 +50,7 @@ def store(tmp_path_factory, forker):
     cameras = []
     for name in HAPPENS:
         path = folder / f"{name}-recording"
-        head = Head(name, "M1", 10.0, taken.camera, taken.channels)
+        head = Head(name, "M1", 10.0, taken.camera, taken.head.channels)
         write_recording(path, head, field, changed(name))
         cameras.append(replayed_camera(
             path, name=name, thermometers=[f"t-{name}"], calibration={"exterior": "series"}

@@ -110,7 +110,7 @@ def test_the_recording_of_the_how_to_is_read(tmp_path, measured):
         (tmp_path / "frames" / f"000{i}.jpg").touch()
     recording = read_recording(tmp_path)
     assert [e.frame.name for e in recording.epochs] == ["0001.jpg", "0002.jpg", "0003.jpg"]
-    assert list(recording.channels) == ["housing"]
+    assert list(recording.head.channels) == ["housing"]
     assert recording.has_observations == measured
 
 

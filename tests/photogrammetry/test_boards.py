@@ -16,7 +16,7 @@ from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets import boards, markers
-from thermocald.store.recording.board_file import read_board, read_rings
+from thermocald.store.recording.testfield_file import read_board, read_rings
 
 CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
 

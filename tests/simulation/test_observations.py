@@ -105,7 +105,7 @@ def test_a_written_recording_is_read(tmp_path):
     s.write(tmp_path / "r", advance=done.append)
     recording = read_recording(tmp_path / "r")
     assert sum(done) == len(recording.epochs) == 12
-    assert list(recording.channels) == ["temperature", "board_temperature"]
+    assert list(recording.head.channels) == ["temperature", "board_temperature"]
     assert recording.head.extra["simulated"]["seed"] == 1
     for epoch, seen in zip(recording.epochs, s.observations(), strict=True):
         np.testing.assert_allclose(epoch.observations.points, seen.points, atol=1e-5)

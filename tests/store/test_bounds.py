@@ -27,6 +27,7 @@ READ = textwrap.dedent(
     """
     import sys
     from pathlib import Path
+    from thermocald.store.recording import observation_file
     import thermocald.store.recording.reader as module
 
     def peak_mb():
@@ -35,7 +36,8 @@ READ = textwrap.dedent(
 
     before = peak_mb()
     if sys.argv[2] == "stream":
-        module.LONG_FROM_BYTES = 0
+        observation_file.LONG_FROM_BYTES = 0
+        observation_file._parse_once = lambda table: table
         epochs = module.open_recording(Path(sys.argv[1])).iter_epochs()
     else:
         epochs = module.read_recording(Path(sys.argv[1])).epochs

@@ -34,15 +34,6 @@ def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):
     assert (stored.extra, stored.clock_trusted, stored.revision) == ({"blur": 3.5}, True, 0)
 
 
-def test_series_travels_with_the_data(filled, field, head):
-    store, series = filled
-    found = store.find_series("rpi", "M1")
-    assert (found.id, found.head, found.start) == (series.id, head, "cold")
-    assert found.identity == {"serial": "x1"}
-    assert found.testfield.names == field.names
-    assert np.array_equal(found.testfield.points, field.points)
-
-
 def test_columns_have_names_and_nan_where_nothing_is(filled, make_result):
     store, series = filled
     store.append(series, Epoch(30, 1.6e9 + 300, np.nan), EpochResult("too_few_targets", "only 2"))

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 import string
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thermocald.errors import ThermocaldError
-from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import open_recording, read_recording
+from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.testfield_file import read_testfield
 
 FILES = ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
 QUICK = settings(
-    max_examples=60,
+    max_examples=40,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -46,35 +43,13 @@ yaml_like = st.recursive(
 )
 
 
-def only_our_errors(path: Path, file: str) -> None:
-    try:
-        read_recording(path)
-        list(open_recording(path).iter_epochs())
-    except ThermocaldError as error:
-        message = str(error)
-    else:
-        return
-    assert file in message or "nothing to calibrate from" in message
-    assert "\n" not in message
-
-
-@pytest.mark.parametrize("file", FILES)
-@QUICK
-@given(content=st.one_of(st.binary(max_size=300), tables.map(lambda t: t.encode(errors="ignore"))))
-def test_any_bytes(recording_path, file, content):
-    whole = (recording_path / file).read_bytes()
-    (recording_path / file).write_bytes(content)
-    only_our_errors(recording_path, file)
-    (recording_path / file).write_bytes(whole)
-
-
 @pytest.mark.parametrize("file", FILES)
 @QUICK
 @given(data=st.data())
 def test_any_bytes_within_a_good_file(recording_path, file, data):
     whole = (recording_path / file).read_bytes()
     at = data.draw(st.integers(0, len(whole)))
-    gone = data.draw(st.integers(0, 40))
+    gone = data.draw(st.one_of(st.integers(0, 40), st.just(len(whole))))
     put = data.draw(
         st.one_of(st.binary(max_size=12), cells.map(lambda c: c.encode(errors="ignore")))
     )
@@ -94,7 +69,13 @@ def test_any_yaml(recording_path, value, key):
     path = recording_path / "recording.yaml"
     whole = path.read_text()
     path.write_text(whole + f"\n{key}2: {value}\n" if key == "x" else f"{key}: {value}\n" + whole)
-    only_our_errors(recording_path, "recording.yaml")
+    message = "recording.yaml"
+    try:
+        read_recording(recording_path)
+    except ThermocaldError as error:
+        message = str(error)
+    assert "recording.yaml" in message
+    assert "\n" not in message
     path.write_text(whole)
 
 
@@ -109,30 +90,3 @@ def test_any_testfield(tmp_path, content):
     except ThermocaldError as error:
         message = str(error)
     assert not message or "field.csv" in message
-
-
-@QUICK
-@given(data=st.data())
-def test_any_damage_to_a_store(filled_file, tmp_path, data):
-    whole = filled_file.read_bytes()
-    at = data.draw(st.integers(0, len(whole) - 1))
-    put = data.draw(st.binary(min_size=1, max_size=200))
-    path = tmp_path / "damaged.db"
-    path.write_bytes(whole[:at] + put + whole[at + len(put) :])
-    message = ""
-    try:
-        with Store.open(path) as store:
-            for series in store.all_series():
-                store.series_columns(series, ["epoch", "c", "status", "temperature"])
-                list(store.epochs(series))
-            store.events()
-    except ThermocaldError as error:
-        message = str(error)
-    assert not message or any(word in message for word in ("damaged.db", "store", "broken"))
-
-
-@pytest.fixture
-def filled_file(filled, tmp_path):
-    store, _ = filled
-    store.close()
-    return Path(shutil.copy(store.path, tmp_path / "copy.db"))

@@ -13,7 +13,7 @@ import pytest
 
 from tests.commands import call
 from tests.fleet.conftest import address, cluster, server, template  # noqa: F401
-from thermocald.errors import ServerError, StoreError, StoreVersionError
+from thermocald.errors import OutputError, ServerError, StoreError, StoreVersionError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store import schema
 from thermocald.store.database import file
@@ -107,7 +107,7 @@ def test_after_a_downgrade_the_copy_that_serves_is_named(version_1, monkeypatch)
 
 def test_without_room_for_the_copy_nothing_is_changed(version_1, version_2, monkeypatch):
     def full(*_):
-        raise OSError(28, "No space left on device")
+        raise OutputError("No space left on device")
 
     monkeypatch.setattr(file, "copy_database", full)
     with pytest.raises(StoreError, match="nothing was changed"):

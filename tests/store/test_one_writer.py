@@ -7,14 +7,12 @@ import os
 import shutil
 import socket
 import stat
-import subprocess
-import sys
 
 import pytest
 import yaml
 
 from tests.commands import call
-from tests.daemon.conftest import ENVIRONMENT, make_recording
+from tests.daemon.conftest import make_recording
 from tests.store.small import create_small_series, small_epoch, stored_numbers
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError
@@ -43,25 +41,22 @@ def daemon(path):
 
 
 def as_called(path, tmp_path, kind):
+    """Return another name of the store."""
     other = tmp_path / "other.db"
-    if kind == "link":
+    if kind == "same":
+        return path
+    if kind == "way round":
+        return tmp_path / "../" / tmp_path.name / "kept.db"
+    if kind == "folder's link":
+        (tmp_path / "folder").symlink_to(tmp_path, target_is_directory=True)
+        return tmp_path / "folder/kept.db"
+    if kind == "link to link":
         other.symlink_to(path)
-    elif kind == "link to link":
-        (tmp_path / "between.db").symlink_to(path)
-        other.symlink_to(tmp_path / "between.db")
-    elif kind == "hard link":
-        os.link(path, other)
-    elif kind == "hard link in another folder":
+        path, other = other, tmp_path / "between.db"
+    if kind == "hard link in another folder":
         other = tmp_path / "snapshot/kept.db"
         other.parent.mkdir()
-        os.link(path, other)
-    elif kind == "folder's link":
-        (tmp_path / "folder").symlink_to(tmp_path, target_is_directory=True)
-        other = tmp_path / "folder/kept.db"
-    elif kind == "way round":
-        other = tmp_path / "../" / tmp_path.name / "kept.db"
-    else:
-        other = path
+    (os.link if kind.startswith("hard") else os.symlink)(path, other)
     return other
 
 
@@ -72,19 +67,18 @@ KINDS = [
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording, kind):
+def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording, kind, forker):
     other = as_called(path, tmp_path, kind)
     words = ["replay", recording, "--store", other]
     if kind == "hard link in another folder":  # in a process of its own, like a second daemon
-        done = subprocess.run(
-            [sys.executable, "-m", "thermocald", *words],
-            env=ENVIRONMENT, cwd=tmp_path, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        status = forker.start(tmp_path, *map(str, words)).wait()
+        said = (tmp_path / "log.txt").read_text()
     else:
         done = call(*words, folder=tmp_path)
-    assert done.returncode == 1
-    assert "another thermocald process writes to it" in done.stderr
-    assert "Traceback" not in done.stderr
+        status, said = done.returncode, done.stderr
+    assert status == 1
+    assert "another thermocald process writes to it" in said
+    assert "Traceback" not in said
     daemon.close()
     for name in {path, other} - {tmp_path / "other.db"}:
         assert stored_numbers(name) == list(range(1, 24))

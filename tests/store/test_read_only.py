@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import tempfile
@@ -42,6 +43,14 @@ def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_
     for path in (read_only, tmp_path / "link.db"):
         assert numbers(path) == list(range(1, 15))
     assert set(Path(tempfile.gettempdir()).glob("thermocald-*")) == before
+
+
+def test_a_name_that_lacks_the_wal_is_not_read_as_whole(with_wal):
+    """After a kill, a hard link shows the store without the -wal of the other name."""
+    other = with_wal.with_name("other.db")
+    os.link(with_wal, other)
+    with pytest.raises(StoreError, match="another of its names"):
+        Store.open(other)
 
 
 def test_without_a_wal_it_is_read_in_place(with_wal, monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 
 import thermocald as tc
 from tests.commands import call
-from thermocald.errors import RecordingError, TestFieldError
+from thermocald.errors import RecordingError
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
 
@@ -20,7 +20,7 @@ SIZE = "width: 3280, height: 2464"
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    """A warming camera before a field of 147 targets, 40 epochs."""
+    """A warming camera before a field of 49 targets, 40 epochs."""
     path = tmp_path_factory.mktemp("sense") / "whole"
     assert (
         call("simulate", "--preset", "rpi-v2.1-heating", "--seed", 1, "--out", path).returncode == 0
@@ -28,6 +28,9 @@ def simulated(tmp_path_factory):
     for name in ("epochs.csv", "observations.csv"):
         header, *rows = (path / name).read_text().splitlines()
         rows = [row for row in rows if int(row.split(",")[0]) <= 40]
+        if name == "observations.csv":
+            some = {row.split(",")[1] for row in rows[:147:3]}
+            rows = [row for row in rows if row.split(",")[1] in some]
         (path / name).write_text("\n".join([header, *rows]) + "\n")
     return path
 
@@ -59,14 +62,6 @@ def scaled(factor: float, shift: float = 0.0):
     return lambda text, _: f"{factor * float(text) + shift:.15g}"
 
 
-def exchanged(path) -> None:
-    with (path / "observations.csv").open(newline="") as file:
-        names, *rows = csv.reader(file)
-    with (path / "observations.csv").open("w", newline="") as file:
-        header = [{"x": "y", "y": "x", "sx": "sy", "sy": "sx"}.get(n, n) for n in names]
-        csv.writer(file, lineterminator="\n").writerows([header, *rows])
-
-
 def put(value: str, *rows: int):
     return lambda text, i: value if i in rows else text
 
@@ -74,19 +69,12 @@ def put(value: str, *rows: int):
 OTHER_IMAGES = {
     "width and height exchanged": (
         lambda p: head(p, SIZE, "width: 2464, height: 3280"), "width and height (or x and y)"),
-    "x and y exchanged": (exchanged, "width and height (or x and y)"),
-    "half the size": (
-        lambda p: head(p, SIZE, "width: 1640, height: 1232"), "another camera, mode, or crop"),
     "a crop": (lambda p: head(p, SIZE, "width: 1920, height: 1080"), "another camera"),
     "points from the centre": (
         lambda p: change(p, "observations.csv", x=scaled(1, -1639.5), y=scaled(1, -1231.5)),
         "from the centre of the image"),
     "points in mm": (
         lambda p: change(p, "observations.csv", x=scaled(0.00112), y=scaled(0.00112)), "in mm"),
-    "points in parts of the width": (
-        lambda p: change(p, "observations.csv", x=scaled(1 / 3280), y=scaled(1 / 3280)), "in mm"),
-    "points in percent": (
-        lambda p: change(p, "observations.csv", x=scaled(200), y=scaled(200)), "lie outside"),
     "y upwards from below": (
         lambda p: change(p, "observations.csv", y=scaled(-1)), "lie outside"),
 }  # fmt: skip
@@ -106,71 +94,24 @@ def test_points_of_another_image_are_refused(recording, name):
         assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("every", [1, 3])
-def test_some_gross_errors_off_the_image_are_left_to_the_adjustment(recording, every):
-    """Also with a third of the targets, where one error pulls its whole epoch away."""
-    header, *lines = (recording / "observations.csv").read_text().splitlines()
-    (recording / "observations.csv").write_text("\n".join([header, *lines[::every]]) + "\n")
-    rows = tuple(row // every for row in (5, 500, 1500, 2500, 3500))
+def test_some_gross_errors_off_the_image_are_left_to_the_adjustment(recording):
+    """One of them pulls its whole epoch away."""
+    rows = (1, 166, 500, 833, 1166)
     change(recording, "observations.csv", x=put("-400", *rows), y=put("9000", *rows))
-    epochs = tc.open(recording).calibrate()
-    assert epochs.ok.all()
-
-
-NUMBERS = {
-    "observations.csv": [
-        ("x", "1e308"), ("y", "-1e308"), ("x", "1e7"), ("sx", "1e-300"), ("sy", "1e300"),
-        ("sx", "5e-324"), ("sy", "1e-9"), ("sx", "1e5"),
-    ],
-    "testfield.csv": [("sX", "1e-300"), ("sX", "2e7"), ("sZ", "5e-324"), ("X", "1e308"),
-                      ("diameter", "1e300"), ("sY", "1e300")],
-    "epochs.csv": [("frame_time", "1e300"), ("temperature", "1e300"), ("frame_time", "1.6e12"),
-                   ("temperature_time", "1.6e15"), ("frame_time", "1e11")],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("file", "column", "value"), [(f, c, v) for f, cells in NUMBERS.items() for c, v in cells]
-)
-def test_numbers_that_nothing_measures_are_refused(recording, file, column, value):
-    last = len((recording / file).read_text().splitlines()) - 2
-    change(recording, file, **{column: put(value, last)})
-    with pytest.raises((RecordingError, TestFieldError)) as caught:
-        read_recording(recording)
-    assert f"{file}, line {last + 2}, column {column}: " in str(caught.value)
-
-
-HEADS = [
-    ("interval: 10.0", "interval: 1.0e-300"), ("interval: 10.0", "interval: 1.0e+300"),
-    ("pixel_pitch: 0.00112", "pixel_pitch: 1.0e-300"),
-    ("principal_distance: 3.04", "principal_distance: 1.0e+300"),
-    ("principal_distance: 3.04", "principal_distance: 1.0e-300"),
-    ("resolution: 0.0625", "resolution: 1.0e-300"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("old", "new"), HEADS)
-def test_a_head_that_no_camera_has_is_refused(recording, old, new):
-    head(recording, old, new)
-    with pytest.raises(RecordingError, match=r"recording\.yaml, key .*(at |thousandths)"):
-        read_recording(recording)
-
-
-@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "µs"), (1e9, "ns")])
-def test_times_in_another_unit_are_named(recording, factor, unit):
-    change(recording, "epochs.csv", frame_time=scaled(factor), temperature_time=scaled(factor))
-    with pytest.raises(RecordingError, match=f"are they {unit}"):
-        read_recording(recording)
-
-
-def test_one_time_for_all_epochs_is_refused(recording):
-    change(recording, "epochs.csv", frame_time=lambda *_: "1600000000")
-    with pytest.raises(RecordingError, match="all epochs have the same time"):
-        read_recording(recording)
+    assert tc.open(recording).calibrate().ok.all()
 
 
 def fahrenheit(text: str, i: int) -> str:
     return text if i < 20 else f"{1.8 * float(text) + 32:.4f}"
+
+
+def exchange_in_the_middle(path) -> None:
+    """Points within both images show nothing; the principal point shows the exchange."""
+    file = path / "observations.csv"
+    header, *rows = file.read_text().splitlines()
+    kept = [r for r in rows if float(r.split(",")[2]) < 2460]
+    file.write_text("\n".join([header, *kept]) + "\n")
+    head(path, SIZE, "width: 2464, height: 3280")
 
 
 def repeat_epoch(path) -> None:
@@ -189,20 +130,18 @@ DOUBTS = {
         lambda p: head(p, "pixel_pitch: 0.00112", "pixel_pitch: 0.00224"), "2 times"),
     "the size of a larger mode": (
         lambda p: head(p, SIZE, "width: 6560, height: 4928"), "off the centre of 6560 × 4928"),
-    "a mirrored image": (
-        lambda p: change(p, "observations.csv", y=scaled(-1, 2463)), "can be calibrated"),
     "another field": (
         lambda p: change(p, "testfield.csv", X=lambda t, i: 37.0 * ((i * 7) % 41)),
         "can be calibrated"),
+    "width and height exchanged": (
+        exchange_in_the_middle,
+        "px off the centre of 2464 × 3280 px: width and height look exchanged"),
     "some epochs of one time": (
         lambda p: change(p, "epochs.csv", frame_time=put("1600000100.0", *range(10, 20))),
         "10 epochs have the time of another one, the first 11 and 12"),
     "times in minutes": (
         lambda p: change(p, "epochs.csv", frame_time=scaled(1 / 60),
                          temperature_time=scaled(1 / 60)), "every 0.167 s"),
-    "times in days": (
-        lambda p: change(p, "epochs.csv", frame_time=scaled(1 / 86400),
-                         temperature_time=scaled(1 / 86400)), "every 0.000116 s"),
     "a name that no store keeps": (
         lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store accepts it"),
     "an hour as the interval": (
@@ -215,9 +154,6 @@ DOUBTS = {
     "85.00 of a DS18B20": (
         lambda p: change(p, "epochs.csv", temperature=put("85.0", 12, 30, 31)),
         "3 readings given without a measurement, the first 85 °C at reading 13"),
-    "zeros of a lost sensor": (
-        lambda p: change(p, "epochs.csv", board_temperature=put("0.0", 12)),
-        "board_temperature: 1 reading given"),
     "a thermometer in another time zone": (
         lambda p: change(p, "epochs.csv", temperature_time=scaled(1, 3600)),
         "read 3600 s after their frames"),
@@ -251,19 +187,6 @@ def test_what_is_doubtful_is_told(recording, name):
         replayed = call("replay", recording)
         assert replayed.returncode == 0
         assert message in replayed.stderr
-
-
-def test_width_and_height_exchanged_in_the_middle_of_the_image(recording):
-    """Points within both images show nothing; the principal point shows the exchange."""
-    file = recording / "observations.csv"
-    header, *rows = file.read_text().splitlines()
-    kept = [r for r in rows if float(r.split(",")[2]) < 2460]
-    file.write_text("\n".join([header, *kept]) + "\n")
-    assert call("check", recording).stdout.startswith(f"{recording}: a valid recording")
-    head(recording, SIZE, "width: 2464, height: 3280")
-    checked, replayed = call("check", recording), call("replay", recording)
-    for text in (checked.stdout, replayed.stderr):
-        assert "px off the centre of 2464 × 3280 px: width and height look exchanged" in text
 
 
 def test_a_whole_recording_has_no_doubts(recording):
@@ -369,6 +292,5 @@ def test_two_series_of_which_one_is_doubtful(recording, simulated):
     change(recording.parent / "N", "observations.csv",
            x=lambda t, _: f"{float(t) + rng.normal(0, 0.05):.4f}")  # fmt: skip
     one, other = tc.open(recording), tc.open(recording.parent / "N")
-    for result in (tc.fit(one, other), tc.discover(other, verify=[one])):
-        (told,) = result.as_dict()["doubts"]
-        assert told.startswith(f"{recording}: temperature: 3 readings")
+    (told,) = tc.fit(one, other).as_dict()["doubts"]
+    assert told.startswith(f"{recording}: temperature: 3 readings")

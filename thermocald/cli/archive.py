@@ -195,7 +195,7 @@ def convert(
 
     Example: thermocald convert M1 --to parquet
     """
-    from thermocald.store.recording.parquet_table import csv_to_parquet, parquet_to_csv
+    from thermocald.store.recording.observation_file import csv_to_parquet, parquet_to_csv
     from thermocald.store.recording.reader import open_recording
 
     if to not in _NAMES:

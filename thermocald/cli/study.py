@@ -128,7 +128,7 @@ def export(
     """
     from thermocald.output import series_export
     from thermocald.result import csv_text
-    from thermocald.store.recording.parquet_table import write_parquet
+    from thermocald.store.recording.observation_file import write_parquet
 
     folder = source.is_dir()
     exterior = exterior or ("auto" if folder else "stored")

@@ -153,8 +153,7 @@ def import_(
     Example: thermocald testfield import --charuco 11x8 --square 30 --marker 22 --dictionary
     DICT_5X5_250 --out charuco.csv
     """
-    from thermocald.store.recording.board_file import read_board, read_rings
-    from thermocald.store.recording.testfield_file import write_testfield
+    from thermocald.store.recording.testfield_file import read_board, read_rings, write_testfield
 
     if (source is None) == (board is None):
         raise UsageError(

@@ -28,7 +28,7 @@ from thermocald.parallel import processes
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.store.recording.head import read_head
-from thermocald.store.recording.parquet_table import write_parquet
+from thermocald.store.recording.observation_file import write_parquet
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.series import EpochResult
 from thermocald.store.server.connection import ServerAddress, is_server
@@ -221,7 +221,7 @@ def calibrate_block(block: Block) -> Outcome:
     sds = np.array([r.sd for r in results])
     temperatures = {
         name: recording.columns.at_frame(name)[block.first : block.stop]
-        for name in recording.channels
+        for name in recording.head.channels
     }
     columns: dict[str, Any] = {
         "camera": [camera.name] * len(epochs),

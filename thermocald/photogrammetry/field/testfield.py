@@ -167,8 +167,8 @@ class Observations:
     def __len__(self) -> int:
         return len(self.targets)
 
-    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Observations:
-        """Return some of the observations, by mask or rows."""
+    def select(self, keep: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Observations:
+        """Return some of the observations, by mask, rows or slice."""
         return Observations(
             self.targets[keep],
             self.points[keep],

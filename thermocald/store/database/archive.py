@@ -78,18 +78,17 @@ def archive_series(
     [{epoch, seconds}]. Raises RecordingError, StoreError.
     """
     times = series_times(store, series)
-    known = {"start": series.start, "device": series.identity, "calibration": series.settings}
+    set_back = (-np.diff(times.corrections)).tolist()
+    known = {
+        "start": series.start, "device": series.identity, "calibration": series.settings,
+        "clock_set_back": [
+            {"epoch": number, "seconds": seconds}
+            for number, seconds in zip(times.numbers[1:].tolist(), set_back, strict=True)
+            if seconds
+        ],
+    }  # fmt: skip
     known = {key: value for key, value in known.items() if value}
     head = replace(series.head, extra={**series.head.extra, **known})
-    if set_back := np.flatnonzero(np.diff(times.corrections)).tolist():
-        steps = [
-            {
-                "epoch": int(times.numbers[i + 1]),
-                "seconds": float(times.corrections[i] - times.corrections[i + 1]),
-            }
-            for i in set_back
-        ]
-        head = replace(head, extra={**head.extra, "clock_set_back": steps})
     folder = FileFolder(frames or Path())
     with RecordingWriter(path, head, series.testfield) as writer:
         for stored in store.epochs(series):
@@ -107,9 +106,8 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
     channels: dict[str, dict[str, None]] = {}
     for reading in store.readings():
         channels.setdefault(reading.thermometer, {}).update(dict.fromkeys(reading.values))
-    written: dict[str, Path] = {}
+    written = {name: folder / f"thermometer-{name}.csv" for name in channels}
     for name, columns in channels.items():
-        written[name] = folder / f"thermometer-{name}.csv"
         rows: Iterator[Columns] = (
             {
                 "time": [f"{reading.utc:.6f}"],

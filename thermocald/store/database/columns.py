@@ -48,10 +48,6 @@ KEPT = {
 }
 """The tables that grow while a daemon runs: numbers and texts, in the order of the checksum."""
 ROW = {table: (*numbers, *texts, "checksum") for table, (numbers, texts) in KEPT.items()}
-_INSERT = {
-    table: f"INSERT INTO {table} ({', '.join(names)}) VALUES ({', '.join('?' * len(names))})"
-    for table, names in ROW.items()
-}
 _MAPPINGS = ("temperatures", "extra")
 CHUNKED = (*(n for n in EPOCH_NUMBERS if n not in ("revision", "measured")), "status", *_MAPPINGS)
 
@@ -105,7 +101,9 @@ def insert_row(connection: sqlite3.Connection, table: str, **given: Any) -> int:
     row = {"id": last_id(connection, table) + 1, **given}
     numbers, texts = ([row[name] for name in names] for names in KEPT[table])
     values = (*numbers, *texts, row_checksum(numbers, texts))
-    if connection.execute(_INSERT[table], values).rowcount != 1:
+    places = ", ".join("?" * len(values))
+    statement = f"INSERT INTO {table} ({', '.join(ROW[table])}) VALUES ({places})"
+    if connection.execute(statement, values).rowcount != 1:
         raise sqlite3.IntegrityError(f"a foreign trigger keeps rows out of {table}; drop it")
     return int(row["id"])
 
@@ -148,88 +146,6 @@ def read_epochs(
     return read_rows(connection, "epoch", condition, (series, first, last))
 
 
-def latest_columns(
-    connection: sqlite3.Connection,
-    series: int,
-    after: int,
-    until: int | None = None,
-    names: Sequence[str] | None = None,
-) -> dict[str, Array]:
-    """Return columns of the epochs with numbers above `after` up to `until`, latest revisions."""
-    latest = {row["number"]: row for row in read_epochs(connection, series, after + 1, until)}
-    return _columns(connection, list(latest.values()), names)
-
-
-def _columns(
-    connection: sqlite3.Connection, rows: list[dict[str, Any]], names: Sequence[str] | None
-) -> dict[str, Array]:
-    """Turn rows into columns, NaN for a row without the number; names: None for all."""
-    columns: dict[str, Array] = {}
-    for field in CHUNKED if names is None else dict.fromkeys(n.split(".")[0] for n in names):
-        column = [row[field] for row in rows]
-        if field == "status":
-            codes = dict(connection.execute("SELECT status, code FROM status_code"))
-            columns[field] = np.array([codes[status] for status in column], dtype=np.float64)
-        elif field in _MAPPINGS:
-            found = [json.loads(text) for text in column]
-            for name in dict.fromkeys(name for mapping in found for name in mapping):
-                columns[f"{field}.{name}"] = np.array(
-                    [mapping.get(name) for mapping in found], dtype=np.float64
-                )
-        else:
-            columns[field] = np.array(column, dtype=np.float64)  # None, SQL's NULL, becomes NaN
-    if names is None:
-        return columns
-    absent = np.full(len(rows), np.nan)
-    return {name: columns.get(name, absent) for name in names}
-
-
-def _name_statuses(
-    connection: sqlite3.Connection, columns: dict[str, Array]
-) -> dict[str, NDArray[Any]]:
-    """Replace the codes in the column `status` by their words."""
-    named: dict[str, NDArray[Any]] = dict(columns)
-    if "status" in columns:
-        codes = dict(connection.execute("SELECT code, status FROM status_code"))
-        words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
-        named["status"] = words[columns["status"].astype(np.int64)]
-    return named
-
-
-def read_columns(
-    connection: sqlite3.Connection, series: int, names: Sequence[str]
-) -> dict[str, NDArray[Any]]:
-    """Return columns (E,) by name, NaN for an epoch without the number.
-
-    They share one block of memory, which is freed with the last of them. If a chunk is damaged, the
-    rows are read instead. Raises StoreError if these are damaged too.
-    """
-    try:
-        columns = SeriesColumns(connection, series).read(names)
-    except _ChunkError as error:
-        log.warning("%s; its epochs are read one by one instead", error)
-        columns = latest_columns(connection, series, -1, names=names)
-    return _name_statuses(connection, columns)
-
-
-def read_page(
-    connection: sqlite3.Connection, series: int, names: Sequence[str], after: int, rows: int
-) -> dict[str, NDArray[Any]]:
-    """Return columns of at most `rows` epochs with numbers above `after`, from their rows."""
-    end = _number_after(connection, series, after, rows)
-    return _name_statuses(connection, latest_columns(connection, series, after, end, names))
-
-
-def _number_after(connection: sqlite3.Connection, series: int, after: int, rows: int) -> int | None:
-    """Return the number of the epoch `rows` after a number; None if there are fewer."""
-    found = connection.execute(
-        "SELECT number FROM epoch WHERE series_id = ? AND number > ? AND revision = 0 "
-        "ORDER BY number LIMIT 1 OFFSET ?",
-        (series, after, rows - 1),
-    ).fetchone()
-    return found[0] if found else None
-
-
 def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:
     """Yield a phrase for each damaged chunk."""
     for row in connection.execute(
@@ -241,30 +157,9 @@ def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:
             yield f"a chunk of column {row[2]} (its epochs are read one by one instead)"
 
 
-def insert_chunk(
-    connection: sqlite3.Connection,
-    series: int,
-    first_row: int,
-    last: int,
-    columns: dict[str, Array],
-) -> None:
-    """Write columns (n,) of the epochs from row `first_row` to number `last` as one chunk."""
-    written = last_id(connection, "epoch")
-    rows = [
-        (series, name, first_row, last, written, values.tobytes())
-        for name, values in columns.items()
-    ]
-    connection.executemany(
-        "INSERT INTO column_chunk (series_id, name, first_row, last_number, last_id, data, "
-        "checksum) VALUES (?, ?, ?, ?, ?, ?, ?)",
-        [(*row, _chunk_checksum(*row)) for row in rows],
-    )
-
-
-def _chunk_checksum(
-    series: int, name: str, first_row: int, last: int, last_id: int, data: bytes
-) -> int:
-    return row_checksum((series, first_row, last, last_id), (name,), data)
+def _chunk_checksum(series: int, name: str, *row: Any) -> int:
+    *numbers, data = row
+    return row_checksum((series, *numbers), (name,), data)
 
 
 def _require_chunk(kept: int, series: int, name: str, *row: Any) -> None:
@@ -280,7 +175,7 @@ def _overwrite(columns: dict[str, Array], numbers: Array, late: dict[str, Array]
 
 
 class SeriesColumns:
-    """The columns of a series; rows: number of epochs in chunks; last_number: that of their last.
+    """The columns of a series.
 
     A file may hold chunks of any length; CHUNK is only the length that this version writes.
     """
@@ -288,71 +183,143 @@ class SeriesColumns:
     def __init__(self, connection: sqlite3.Connection, series: int) -> None:
         self._connection = connection
         self._series = series
-        self._find_chunks()
 
-    def _find_chunks(self) -> None:
+    def read(self, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Return columns (E,) by name, NaN for an epoch without the number.
+
+        They share one block of memory, which is freed with the last of them. If a chunk is damaged,
+        the rows are read instead. Raises StoreError if these are damaged too.
+        """
+        try:
+            columns = self._join_chunks(names)
+        except _ChunkError as error:
+            log.warning("%s; its epochs are read one by one instead", error)
+            columns = self.latest(-1, names=names)
+        return self._name_statuses(columns)
+
+    def read_page(self, names: Sequence[str], after: int, rows: int) -> dict[str, NDArray[Any]]:
+        """Return columns of at most `rows` epochs with numbers above `after`, from their rows."""
+        return self._name_statuses(self.latest(after, self._number_after(after, rows), names))
+
+    def latest(
+        self, after: int, until: int | None = None, names: Sequence[str] | None = None
+    ) -> dict[str, Array]:
+        """Return columns of the epochs with numbers above `after` up to `until` from their rows.
+
+        These are those of the latest revisions; `status` is a code.
+        """
+        found = read_epochs(self._connection, self._series, after + 1, until)
+        return self._columns(list({row["number"]: row for row in found}.values()), names)
+
+    def _columns(
+        self, rows: list[dict[str, Any]], names: Sequence[str] | None = None
+    ) -> dict[str, Array]:
+        """Turn rows into columns, NaN for a row without the number; names: None for all."""
+        columns: dict[str, Array] = {}
+        for field in CHUNKED if names is None else dict.fromkeys(n.split(".")[0] for n in names):
+            column = [row[field] for row in rows]
+            if field in _MAPPINGS:
+                found = [json.loads(text) for text in column]
+                for name in dict.fromkeys(name for mapping in found for name in mapping):
+                    columns[f"{field}.{name}"] = np.array(
+                        [mapping.get(name) for mapping in found], dtype=np.float64
+                    )
+                continue
+            if field == "status":
+                codes = dict(self._connection.execute("SELECT status, code FROM status_code"))
+                column = [codes[status] for status in column]
+            columns[field] = np.array(column, dtype=np.float64)  # None, SQL's NULL, becomes NaN
+        if names is None:
+            return columns
+        absent = np.full(len(rows), np.nan)
+        return {name: columns.get(name, absent) for name in names}
+
+    def _name_statuses(self, columns: dict[str, Array]) -> dict[str, NDArray[Any]]:
+        """Replace the codes in the column `status` by their words."""
+        named: dict[str, NDArray[Any]] = dict(columns)
+        if "status" in columns:
+            codes = dict(self._connection.execute("SELECT code, status FROM status_code"))
+            words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
+            named["status"] = words[columns["status"].astype(np.int64)]
+        return named
+
+    def _number_after(self, after: int, rows: int) -> int | None:
+        """Return the number of the epoch `rows` after a number; None if there are fewer."""
+        found = self._connection.execute(
+            "SELECT number FROM epoch WHERE series_id = ? AND number > ? AND revision = 0 "
+            "ORDER BY number LIMIT 1 OFFSET ?",
+            (self._series, after, rows - 1),
+        ).fetchone()
+        return found[0] if found else None
+
+    def _find_chunks(self) -> tuple[int, int]:
+        """Find the chunks; return their number of rows, and that of their last epoch."""
         # (first row, bytes, number of the last epoch, last id of `epoch` when it was written)
         self._chunks: list[tuple[int, int, int, int]] = self._connection.execute(
             "SELECT first_row, length(data), last_number, last_id FROM column_chunk "
             "WHERE series_id = ? AND name = 'number' ORDER BY first_row",
             (self._series,),
         ).fetchall()
-        self.rows = 0
+        rows = 0
         for first, size, *_ in self._chunks:
-            if first != self.rows or size % 8:
+            if first != rows or size % 8:
                 raise _ChunkError(f"the column chunks of series {self._series} are broken")
-            self.rows += size // 8
-        self.last_number = self._chunks[-1][2] if self._chunks else -1
+            rows += size // 8
+        return rows, self._chunks[-1][2] if self._chunks else -1
 
-    def read(self, names: Sequence[str]) -> dict[str, Array]:
+    def _join_chunks(self, names: Sequence[str]) -> dict[str, Array]:
         """Return columns over all epochs, `status` as codes."""
-        tail = latest_columns(
-            self._connection, self._series, self.last_number, names=["number", *names]
-        )
+        rows, last = self._find_chunks()
+        tail = self.latest(last, names=["number", *names])
         # one allocation for all, which the system makes in huge pages: half the time
-        block = np.empty((len(names), self.rows + tail["number"].size))
+        block = np.empty((len(names), rows + tail["number"].size))
         columns = dict(zip(names, block, strict=True))
         for name, column in columns.items():
-            self._fill(name, column[: self.rows])
-            column[self.rows :] = tail[name]
+            self._fill(name, column[:rows])
+            column[rows:] = tail[name]
         if late := self._late_rows(0):
-            numbers = np.empty(self.rows)
+            numbers = np.empty(rows)
             self._fill("number", numbers)
-            _overwrite(columns, numbers, _columns(self._connection, late, ["number", *names]))
+            _overwrite(columns, numbers, self._columns(late, ["number", *names]))
         return columns
 
     def build(self) -> None:
         """Write chunks while there are enough rows, in the caller's transaction."""
-        while end := _number_after(self._connection, self._series, self.last_number, CHUNK):
-            columns = latest_columns(self._connection, self._series, self.last_number, end)
-            insert_chunk(self._connection, self._series, self.rows, end, columns)
-            self._find_chunks()
-            self._merge()
+        rows, last = self._find_chunks()
+        while end := self._number_after(last, CHUNK):
+            self.insert(rows, end, self.latest(last, end))
+            rows, last = self._find_chunks()
+            self._merge(last)
 
-    def _merge(self) -> None:
+    def insert(self, first_row: int, last: int, columns: dict[str, Array]) -> None:
+        """Write columns (n,) of the epochs from row `first_row` to number `last` as one chunk."""
+        written = last_id(self._connection, "epoch")
+        rows = [
+            (self._series, name, first_row, last, written, values.tobytes())
+            for name, values in columns.items()
+        ]
+        self._connection.executemany(
+            "INSERT INTO column_chunk (series_id, name, first_row, last_number, last_id, data, "
+            "checksum) VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [(*row, _chunk_checksum(*row)) for row in rows],
+        )
+
+    def _merge(self, last: int) -> None:
         """Merge the last MERGED small chunks, with later calibrations of their epochs."""
         chunks = self._chunks[-MERGED:]
         if len(chunks) < MERGED or any(size != 8 * CHUNK for _, size, *_ in chunks):
             return
-        start = chunks[0][0]
-        columns: dict[str, Array] = {}
-        for name, first, *row, data, kept in self._connection.execute(
-            "SELECT name, first_row, last_number, last_id, data, checksum FROM column_chunk "
-            "WHERE series_id = ? AND first_row >= ?",
-            (self._series, start),
-        ):
-            _require_chunk(kept, self._series, name, first, *row, data)
-            column = columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
-            column[first - start :][:CHUNK] = np.frombuffer(data)
-        if late := self._late_rows(len(self._chunks) - MERGED):
-            renewed = _columns(self._connection, late, None)
-            for name in renewed:
-                columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
-            _overwrite(columns, columns["number"].copy(), renewed)
-        self._connection.execute(
-            "DELETE FROM column_chunk WHERE series_id = ? AND first_row >= ?", (self._series, start)
+        late = self._columns(self._late_rows(len(self._chunks) - MERGED))
+        start, which = chunks[0][0], "column_chunk WHERE series_id = ? AND first_row >= ?"
+        found = self._connection.execute(
+            f"SELECT DISTINCT name FROM {which}", (self._series, start)
         )
-        insert_chunk(self._connection, self._series, start, self.last_number, columns)
+        columns = {name: np.empty(MERGED * CHUNK) for name in {*(n for (n,) in found), *late}}
+        for name, column in columns.items():
+            self._fill(name, column, start)
+        _overwrite(columns, columns["number"].copy(), late)
+        self._connection.execute(f"DELETE FROM {which}", (self._series, start))
+        self.insert(start, last, columns)
         self._find_chunks()
 
     def _late_rows(self, start: int) -> list[dict[str, Any]]:
@@ -369,20 +336,21 @@ class SeriesColumns:
             before = last
         return rows
 
-    def _fill(self, name: str, column: Array) -> None:
-        """Copy a column's chunks into `column` (rows,), NaN for chunks without it."""
+    def _fill(self, name: str, column: Array, start: int = 0) -> None:
+        """Copy a column's chunks from a row on into `column`, NaN for chunks without it."""
         target = column.data.cast("B")  # copies faster than NumPy assigns
         sizes = {first: size for first, size, *_ in self._chunks}
         done = 0
         for first, *row, data, kept in self._connection.execute(
             "SELECT first_row, last_number, last_id, data, checksum FROM column_chunk "
-            "WHERE series_id = ? AND name = ? ORDER BY first_row",
-            (self._series, name),
+            "WHERE series_id = ? AND name = ? AND first_row >= ? ORDER BY first_row",
+            (self._series, name, start),
         ):
             if sizes.get(first) != len(data):
                 raise _ChunkError(f"a chunk of column {name} is broken")
             _require_chunk(kept, self._series, name, first, *row, data)
-            column[done:first] = np.nan
-            target[8 * first : 8 * first + len(data)] = data
-            done = first + len(data) // 8
+            at = first - start
+            column[done:at] = np.nan
+            target[8 * at : 8 * at + len(data)] = data
+            done = at + len(data) // 8
         column[done:] = np.nan

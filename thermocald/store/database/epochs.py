@@ -18,8 +18,7 @@ import logging
 import math
 import sqlite3
 import struct
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -36,7 +35,6 @@ from thermocald.store.database.columns import (
     checked_chunks,
     examined_rows,
     insert_row,
-    read_epochs,
     require_checksum,
     row_checksum,
 )
@@ -59,7 +57,7 @@ POINT_QUANTUM_PX = 1e-5
 
 _HEADER = struct.Struct("<BBIH")  # layout, flags, number of observations, bytes of the names
 _LAYOUT = 1
-_COVARIANCES, _LONG_ROWS, _FLOAT_POINTS = 1, 2, 4
+_COVARIANCES, _FLOAT_POINTS = 1, 4
 _UPPER = np.triu_indices(16)
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
 _PART_BYTES = 1100  # seven to a page
@@ -89,29 +87,23 @@ def pack_observations(seen: Observations) -> bytes:
     flags = 0
     if seen.covariances is not None:
         flags |= _COVARIANCES
-    if len(seen) and int(seen.targets.max()) > 0xFFFF:
-        flags |= _LONG_ROWS
     if not bool(np.all(np.abs(quanta) < 2**31)):
         flags |= _FLOAT_POINTS  # beyond ±21474 px, or not finite: as float64
     names = "\n".join(seen.quality).encode()
     parts = [
         _HEADER.pack(_LAYOUT, flags, len(seen), len(names)) + names,
-        seen.targets.astype("<u4" if flags & _LONG_ROWS else "<u2").tobytes(),
-        seen.points.astype("<f8").tobytes()
-        if flags & _FLOAT_POINTS
-        else quanta.astype("<i4").tobytes(),
-        seen.sigmas.astype("<f4").tobytes(),
+        seen.targets.astype("<u2").tobytes(),
+        (seen.points.astype("<f8") if flags & _FLOAT_POINTS else quanta.astype("<i4")).tobytes(),
     ]
-    if seen.covariances is not None:
-        parts.append(seen.covariances.astype("<f4").tobytes())
-    parts += [values.astype("<f4").tobytes() for values in seen.quality.values()]
-    return b"".join(parts)
+    covariances = [] if seen.covariances is None else [seen.covariances]
+    singles = (seen.sigmas, *covariances, *seen.quality.values())
+    return b"".join([*parts, *(values.astype("<f4").tobytes() for values in singles)])
 
 
 def unpack_observations(data: bytes) -> Observations:
     """Invert `pack_observations`. Raises StoreError for other bytes."""
     flags, n, start = _read_header(data)
-    rows = _unpack(flags, [(0, n, start, data)])
+    seen = _unpack(flags, [(0, n, start, data)]).seen
     try:
         names = data[_HEADER.size : start].decode()
         end = start + n * sum(_sizes(flags))
@@ -121,7 +113,7 @@ def unpack_observations(data: bytes) -> Observations:
         }
     except ValueError as cause:
         raise StoreError(f"observations in the store are broken: {cause}") from cause
-    return Observations(rows.targets, rows.points, rows.sigmas, rows.covariances, quality)
+    return replace(seen, quality=quality)
 
 
 def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
@@ -151,7 +143,7 @@ def _sizes(flags: int) -> list[int]:
 
     The quality follows, column by column.
     """
-    sizes = [4 if flags & _LONG_ROWS else 2, 16 if flags & _FLOAT_POINTS else 8, 8]
+    sizes = [2, 16 if flags & _FLOAT_POINTS else 8, 8]
     return [*sizes, 4] if flags & _COVARIANCES else sizes
 
 
@@ -171,20 +163,23 @@ def _unpack(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> Observatio
         # division by 1e5 gives the double nearest to the decimal; a product with 1e-5 would not
         points /= round(1 / POINT_QUANTUM_PX)
     numbers, counts = (np.array([e[k] for e in epochs], dtype=np.int64) for k in (0, 1))
-    return ObservationRows(
-        np.repeat(numbers, counts),
-        np.frombuffer(whole[0], "<u4" if flags & _LONG_ROWS else "<u2").astype(np.int64),
+    seen = Observations(
+        np.frombuffer(whole[0], "<u2").astype(np.int64),
         points.reshape(-1, 2),
         np.frombuffer(whole[2], "<f4").astype(np.float64).reshape(-1, 2),
         np.frombuffer(whole[3], "<f4").astype(np.float64) if flags & _COVARIANCES else None,
     )
+    return ObservationRows(np.repeat(numbers, counts), seen)
 
 
 def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> None:
     """Insert one epoch with its details, in the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
-    parts = _detail_parts(epoch.number, result.covariance, seen)
+    covariance = [] if result.covariance is None else [(0, pack_covariance(result.covariance))]
+    packed = b"" if seen is None else pack_observations(seen)
+    cuts = range(0, len(packed), _PART_BYTES)
+    parts = [*covariance, *((1 + i, packed[c : c + _PART_BYTES]) for i, c in enumerate(cuts))]
     row: dict[str, Any] = {
         "series_id": series,
         "number": epoch.number,
@@ -214,36 +209,6 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", details).rowcount
     if parts and kept != len(parts):
         raise sqlite3.IntegrityError("a foreign trigger keeps rows out of detail; drop it")
-
-
-def _detail_parts(
-    number: int, covariance: Array | None, seen: Observations | None
-) -> list[tuple[int, bytes]]:
-    """Return covariance and observations as numbered parts of the table `detail`."""
-    parts = [] if covariance is None else [(0, pack_covariance(covariance))]
-    if seen is not None:
-        data = pack_observations(seen)
-        cuts = range(0, len(data), _PART_BYTES)
-        if len(cuts) >= _PARTS:
-            raise StoreError(f"epoch {number}: {len(seen)} observations are too many to store")
-        parts += [(1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
-    return parts
-
-
-def select_epochs(
-    connection: sqlite3.Connection,
-    series: int,
-    first: int = 0,
-    last: int | None = None,
-    *,
-    details: bool = True,
-) -> Iterator[StoredEpoch]:
-    """Yield epochs `first` to `last` (numbers), each in its latest revision.
-
-    details: False leaves out observations and covariances. Raises StoreError for damage.
-    """
-    rows = read_epochs(connection, series, first, last)
-    return latest_epochs(rows, partial(read_details, connection) if details else None)
 
 
 def latest_epochs(

@@ -25,19 +25,20 @@ import struct
 import tempfile
 import time
 import uuid
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from thermocald.errors import (
+    OutputError,
     StoreBusyError,
     StoreError,
     StoreFullError,
     StoreVersionError,
     ThermocaldError,
 )
-from thermocald.files import cannot_write, is_ordinary, output_place
+from thermocald.files import cannot_write, is_ordinary, new_file
 from thermocald.store import schema
 from thermocald.store.database.columns import DamageError
 
@@ -243,8 +244,7 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
         )
     with in_words(path, "the store cannot be opened", reading=True):
         connection = _open(path, mode)
-    try:
-        with in_words(path, "the store cannot be opened", reading=True):
+        try:
             version = _version(connection, path)
             if version == 0 and mode == "read":
                 raise StoreError(f"{path}: is empty; nothing was stored yet")
@@ -268,9 +268,9 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
             else:
                 connection.execute(f"PRAGMA mmap_size = {_MMAP_BYTES}")
             connection.execute("PRAGMA foreign_keys = ON")
-    except BaseException:
-        connection.close()
-        raise
+        except BaseException:
+            connection.close()
+            raise
     return connection
 
 
@@ -356,7 +356,7 @@ def _backup_version(connection: sqlite3.Connection, path: Path, version: int) ->
         return
     try:
         copy_database(connection, copy)
-    except (OSError, sqlite3.Error) as error:
+    except (OutputError, sqlite3.Error) as error:
         raise StoreError(
             f"{path}: is of version {version} and must be backed up before its upgrade, but "
             f"{copy} cannot be written ({error}); nothing was changed"
@@ -368,29 +368,17 @@ def _backup_version(connection: sqlite3.Connection, path: Path, version: int) ->
 def copy_database(source: sqlite3.Connection, target: Path) -> None:
     """Copy a database (online backup) to a file that appears as a whole or not at all.
 
-    A writer is not blocked. Raises OSError or sqlite3.Error.
+    A writer is not blocked. Raises OutputError or sqlite3.Error.
     """
-    target, straight = output_place(target)
-    if straight:
-        raise OSError(errno.EINVAL, "is not a regular file")
-    partial = target.with_name(f".{target.name}.partial")
-    try:
-        partial.unlink(missing_ok=True)
+    with new_file(target) as partial:
+        if partial == target:
+            raise OSError(errno.EINVAL, "is not a regular file")
         partial.touch()  # raises with the reason, which SQLite would not give
         with closing(sqlite3.connect(partial)) as copy:
             source.backup(copy)
             copy.execute("PRAGMA journal_mode = DELETE")
-        descriptor = os.open(partial, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        os.replace(partial, target)
-    except BaseException:
-        for name in (partial, partial.with_name(f"{partial.name}-journal")):
-            with suppress(OSError):
-                name.unlink(missing_ok=True)
-        raise
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
 
 
 def open_copy(
@@ -410,10 +398,9 @@ def open_copy(
             copy = Path(folder) / "copy.db"
             _copy_files(path, wal, copy)
             with closing(_connect(copy, "rw")) as connection:
-                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
                 if change is not None:
                     change(connection)
-                connection.execute("PRAGMA journal_mode = DELETE")
+                connection.execute("PRAGMA journal_mode = DELETE")  # moves the -wal into the file
             opened = _connect(copy, "ro&immutable=1")
             # SQLite opens the file only now, before the folder is removed
             opened.execute("SELECT 1 FROM sqlite_master").fetchone()

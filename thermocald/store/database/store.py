@@ -12,13 +12,13 @@ import logging
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from thermocald.errors import StoreError, StoreFullError
-from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
 from thermocald.numbers import counted
 from thermocald.store.database import columns, epochs
@@ -122,12 +122,12 @@ class Store(SeriesReader):
     def last_epoch(self, series: StoredSeries) -> int | None:
         """Return the number of the last epoch, after which to resume; None without epochs."""
         found = self._value("SELECT max(number) FROM epoch WHERE series_id = ?", series.id)
-        if found is not None and not isinstance(found, int):
-            raise columns.DamageError(
-                f"{self.path}: the store is damaged: an epoch of {series.head.series} has the "
-                f"number {found!r}; restore a backup"
-            )
-        return found
+        if found is None or isinstance(found, int):
+            return found
+        raise StoreError(
+            f"{self.path}: the store is damaged: an epoch of {series.head.series} has the number "
+            f"{found!r}; restore a backup"
+        )
 
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool
@@ -140,23 +140,16 @@ class Store(SeriesReader):
         whole = not first and last is None
         missing, size, first = 0, _EPOCHS_AT_ONCE, first or 1
         while size == _EPOCHS_AT_ONCE:
-            page: list[StoredEpoch] = []
-            failed: StoreError | None = None
-            try:
-                with self._reads("epochs") as connection:
-                    found = epochs.select_epochs(
-                        connection, series.id, first, last, details=details
-                    )
-                    page.extend(islice(found, _EPOCHS_AT_ONCE))
-                    del found
-            except StoreError as error:
-                failed = error
+            with self._reads("epochs") as connection:
+                rows = columns.read_epochs(connection, series.id, first, last)
+                detail = partial(epochs.read_details, connection) if details else None
+                found = epochs.latest_epochs(rows, detail)
+                page = list(islice(found, _EPOCHS_AT_ONCE))
+                del found, rows
             for stored in page:
                 missing += max(0, stored.epoch.number - first)
                 first = stored.epoch.number + 1
                 yield stored
-            if failed is not None:
-                raise failed
             size = len(page)
         if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - first)):
             log.warning(
@@ -182,7 +175,7 @@ class Store(SeriesReader):
     ) -> dict[str, NDArray[Any]]:
         source = {name: _chunk_name(name, series) for name in names}
         with self._reads("columns") as connection:
-            found = columns.read_columns(connection, series.id, [*dict.fromkeys(source.values())])
+            found = columns.SeriesColumns(connection, series.id).read(sorted({*source.values()}))
         return {name: found[source[name]] for name in names}
 
     def column_pages(
@@ -198,7 +191,7 @@ class Store(SeriesReader):
         after, size = -1, rows
         while size == rows:
             with self._reads("columns") as connection:
-                found = columns.read_page(connection, series.id, wanted, after, rows)
+                found = columns.SeriesColumns(connection, series.id).read_page(wanted, after, rows)
             yield {name: found[source[name]] for name in names}
             size = len(found["number"])
             after = int(found["number"][-1]) if size else after
@@ -286,10 +279,7 @@ class Store(SeriesReader):
         Raises StoreError, or OutputError if the target cannot be written.
         """
         with in_words(self.path, f"the copy {target} cannot be made"):
-            try:
-                copy_database(self._db, target)
-            except OSError as error:
-                raise cannot_write(target, error) from error
+            copy_database(self._db, target)
 
     @contextmanager
     def _reads(self, what: str) -> Iterator[sqlite3.Connection]:
@@ -391,8 +381,8 @@ class Store(SeriesReader):
     ) -> None:
         """Store a later calibration of an epoch; observations: None if unchanged; extra: added."""
         with self._transaction(f"the calibration of epoch {number} was not stored"):
-            found = epochs.select_epochs(self._db, series.id, number, number, details=False)
-            if (then := next(found, None)) is None:
+            rows = columns.read_epochs(self._db, series.id, number, number)
+            if (then := next(epochs.latest_epochs(rows, None), None)) is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
             stored = StoredEpoch(
                 replace(then.epoch, observations=observations),

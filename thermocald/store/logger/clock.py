@@ -26,7 +26,7 @@ AMBIGUOUS = ("refuse", "order", "earlier", "later")
 """How to treat the repeated hour: refuse it, use the order of the rows, or take one."""
 
 _OFFSET = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?", re.IGNORECASE)
-_ERROR = re.compile(r"([+-]?)(?:(\d+):)?(\d+):(\d+(?:\.\d+)?)|([+-]?)(\d+(?:\.\d+)?)s?")
+_ERROR = re.compile(r"([+-]?)(?:(?:(\d+):)?(\d+):)?(\d+(?:\.\d+)?)s?")
 _LARGEST_OFFSET_H = 14
 
 
@@ -50,10 +50,7 @@ def time_zone(text: str) -> tzinfo:
 
 def stated_zones(text: str) -> dict[str, tzinfo]:
     """Return the zones that a column's head names, such as GMT+01:00, UTC or EST and EDT."""
-    return {
-        name: time_zone(name) if name[-1].isdigit() else _zone(name.upper())
-        for name in _STATED_ZONE.findall(text)
-    }
+    return {name: _zone(name.upper()) for name in _STATED_ZONE.findall(text)}
 
 
 def clock_error(text: str) -> float:
@@ -67,10 +64,8 @@ def clock_error(text: str) -> float:
             f"clock error {text!r}: give +HH:MM:SS if the clock was ahead, -HH:MM:SS if it was "
             "behind, or seconds"
         )
-    sign, hours, minutes, seconds, sign_s, only = found.groups()
-    if only is not None:
-        return -float(only) if sign_s == "-" else float(only)
-    total = int(hours or 0) * 3600 + int(minutes) * 60 + float(seconds)
+    sign, hours, minutes, seconds = found.groups()
+    total = int(hours or 0) * 3600 + int(minutes or 0) * 60 + float(seconds)
     return -total if sign == "-" else total
 
 
@@ -119,38 +114,30 @@ class DeviceClock:
                     )
                 twice.append(i)
         if twice:
-            self._resolve_repeated(seconds, moments, twice, where)
+            repeated = [moments[i] for i in twice]
+            seconds[twice] = self._choose(repeated, seconds[twice], where(twice[0]))
         return seconds - self.ahead
 
-    def _resolve_repeated(
-        self,
-        seconds: Array,
-        moments: Sequence[datetime],
-        twice: list[int],
-        where: Callable[[int], str],
-    ) -> None:
-        """Choose one of the two times of each moment that exists twice, in place."""
-        first = twice[0]
-        moment = moments[first]
-        again = f"{where(first)}: {moment:%Y-%m-%d %H:%M:%S} exists twice in {self.zone}"
+    def _choose(self, moments: Sequence[datetime], earlier: Array, where: str) -> Array:
+        """Return the times (n,) s that moments mean which exist twice; earlier: the first ones."""
+        again = f"{where}: {moments[0]:%Y-%m-%d %H:%M:%S} exists twice in {self.zone}"
         if self.ambiguous == "refuse":
             raise DataError(
                 f"{again} (clocks were put back): give --ambiguous order if the rows are in the "
                 "order of time, else --ambiguous earlier or later"
             )
         if self.ambiguous == "earlier":
-            return
-        later = np.array([moments[i].replace(tzinfo=self.zone, fold=1).timestamp() for i in twice])
+            return earlier
+        later = np.array([m.replace(tzinfo=self.zone, fold=1).timestamp() for m in moments])
         if self.ambiguous == "later":
-            seconds[twice] = later
-            return
-        back = [k for k in range(1, len(twice)) if seconds[twice[k]] < seconds[twice[k - 1]]]
+            return later
+        back = np.flatnonzero(np.diff(earlier) < 0) + 1
         if len(back) != 1:
             raise DataError(
                 f"{again}, and the order of the rows does not show which is meant (time runs back "
                 f"{len(back)} times, not once): give --ambiguous earlier or later"
             )
-        seconds[twice[back[0] :]] = later[back[0] :]
+        return np.concatenate([earlier[: back[0]], later[back[0] :]])
 
 
 def device_clock(
@@ -282,8 +269,7 @@ def _month_to_number(text: str) -> str:
 
 def _date(found: re.Match[str], order: str | None) -> date:
     if found["compact"]:
-        text = found["compact"]
-        return date(int(text[:4]), int(text[4:6]), int(text[6:]))
+        return date.fromisoformat(found["compact"])
     a, b, c = (int(found[part]) for part in "abc")
     if len(found["a"]) == 4:
         return date(a, b, c)
@@ -311,8 +297,6 @@ def _time(found: re.Match[str]) -> time:
 
 
 def _zone(text: str) -> tzinfo:
-    if not text[-1].isdigit():
-        return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT
-    sign = -1 if "-" in text else 1
-    digits = re.sub(r"\D", "", text)
-    return timezone(sign * timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0)))
+    if text[-1].isdigit():
+        return time_zone(text)
+    return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.store.logger.clock import DeviceClock
-    from thermocald.store.logger.columns import LogOptions
+    from thermocald.store.logger.dialect import LogOptions
 
 
 SOURCES = ("exif", "name", "file")
@@ -178,14 +178,14 @@ def find_copies(paths: Sequence[Path]) -> dict[int, int]:
 
     Files that cannot be read are ignored.
     """
-    of_size: dict[int, list[int]] = {}
     first: dict[bytes, int] = {}
     copies = {}
+    sizes = [path.stat().st_size if path.is_file() else -1 for path in paths]
+    alike = Counter(sizes)
     for i, path in enumerate(paths):
-        with suppress(OSError):
-            of_size.setdefault(path.stat().st_size, []).append(i)
-    for i in sorted(i for alike in of_size.values() if len(alike) > 1 for i in alike):
-        with suppress(OSError), paths[i].open("rb") as file:
+        if alike[sizes[i]] == 1:
+            continue
+        with suppress(OSError), path.open("rb") as file:
             key = hashlib.file_digest(file, "sha256").digest()
             if (known := first.setdefault(key, i)) != i:
                 copies[i] = known
@@ -404,7 +404,6 @@ def _camera_of(
     file: a camera file, used instead of EXIF; pitch, distance mm: used instead of EXIF's; dry_run:
     an unknown pixel pitch is noted, not an error.
     """
-    notes: list[str] = []
     if file is not None:
         known = read_camera(file, pitch)
         if (known.sensor.width, known.sensor.height) != (photograph.width, photograph.height):
@@ -412,8 +411,8 @@ def _camera_of(
                 f"{file}: is of {known.sensor.width} × {known.sensor.height} px, the photographs "
                 f"have {photograph.width} × {photograph.height}"
             )
-        notes += doubt_lines(pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch))
-        return known, notes
+        return known, doubt_lines(pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch))
+    notes: list[str] = []
     if distance is None and photograph.focal_length is not None:
         distance = photograph.focal_length
         notes.append(f"camera: principal distance {distance:g} mm from EXIF (--principal-distance)")

@@ -24,21 +24,19 @@ from thermocald.store.logger.clock import (
     stated_zones,
     whole_seconds,
 )
-from thermocald.store.logger.columns import (
-    OTHER_NAME,
-    LogOptions,
-    find_date_order,
-    find_temperature_columns,
-    find_time_columns,
-    quoted,
-    require_columns,
-)
 from thermocald.store.logger.dialect import (
+    OTHER_NAME,
     OUR_TIMES,
     TIME_NAME,
     UNIT_BEHIND,
     LoggerFile,
+    LogOptions,
+    find_date_order,
+    find_temperature_columns,
+    find_time_columns,
     open_log,
+    quoted,
+    require_columns,
     stated_unit,
     to_celsius,
     without_unit,
@@ -84,7 +82,6 @@ def read_log(
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
     table = _Table(file, time_names, names, order)
-    table.read()
     times = table.times(clock)
     if len(times) < 2:
         raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
@@ -176,12 +173,15 @@ def _sort_by_time(times: Array, channels: dict[str, Array]) -> tuple[Array, dict
 
 
 class _Table:
-    """The rows of a log as arrays of numbers, compact enough for a year of them."""
+    """The rows of a log as arrays of numbers, compact enough for a year of them.
+
+    Rows without a time (a footer) and words that are no reading are counted.
+    """
 
     def __init__(
         self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], order: str | None
     ) -> None:
-        self.file, self.names, self._order = file, names, order
+        self.file, self._order = file, order
         self._time_names = times
         self._places = [file.names.index(name) for name in times]
         self._seconds, self._lines = array("d"), array("q")
@@ -191,11 +191,7 @@ class _Table:
         self._untimed: list[tuple[int, str]] = []
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
         self.labels: list[str] = []
-
-    def read(self) -> None:
-        """Read all rows; count those without a time (a footer) and words that are no reading."""
-        file = self.file
-        columns = [(name, file.names.index(name)) for name in self.names]
+        columns = [(name, file.names.index(name)) for name in names]
         label = file.names.index(_LABEL) if _LABEL in file.names else None
         bare = set(self._time_names) <= set(OUR_TIMES)
         head = 0

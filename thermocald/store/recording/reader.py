@@ -15,14 +15,14 @@ from thermocald.errors import RecordingError
 from thermocald.names import FileFolder
 from thermocald.numbers import counted
 from thermocald.photogrammetry.series.normals import runs
-from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
-from thermocald.store.recording.observation_file import LONG_FROM_BYTES, ObservationFile
+from thermocald.store.recording.head import CameraSpec, Head, read_head
+from thermocald.store.recording.observation_file import ObservationFile
 from thermocald.store.recording.sense import pairing_doubts, reading_doubts, time_doubts, time_fault
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield, require_millimetres
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
@@ -124,10 +124,6 @@ class Recording:
     def camera(self) -> CameraSpec:
         return self.head.camera
 
-    @property
-    def channels(self) -> Mapping[str, Channel]:
-        return self.head.channels
-
     def extra_columns(self) -> dict[str, tuple[str, ...]]:
         """Return the unknown columns of epochs.csv, as text."""
         return self.columns.extra
@@ -135,20 +131,14 @@ class Recording:
     @cached_property
     def epochs(self) -> list[Epoch]:
         """All epochs with their observations, which are read at the first access."""
-        if not self.has_observations:
-            return [self._epoch(i, None) for i in range(len(self))]
-        rows = self._observation_file.load()
-        return [self._epoch(i, rows.of_epoch(i)) for i in range(len(self))]
+        return list(self.iter_epochs())
 
     def iter_epochs(self, window: slice = slice(None)) -> Iterator[Epoch]:
         """Yield the epochs, or some of them (from 0).
 
-        A long recording (`is_long`) is read in constant memory; the rows of its observations must
-        be in the order of the epochs.
+        A long file of observations is read in constant memory; its rows must be in the order of the
+        epochs.
         """
-        if "epochs" in self.__dict__ or (self.has_observations and not self.is_long):
-            yield from self.epochs[window]
-            return
         rows = range(len(self))[window]
         part = slice(rows.start, rows.stop)
         seen = self._observation_file.stream(part) if self.has_observations else repeat(None)
@@ -185,8 +175,6 @@ class Recording:
         """Return the observations of one epoch (from 0); None for a recording without any."""
         if not self.has_observations:
             return None
-        if "epochs" in self.__dict__ or not self.is_long:
-            return self.epochs[row].observations
         return next(self._observation_file.stream(slice(row, row + 1)))
 
     def doubts(self) -> list[str]:
@@ -207,7 +195,7 @@ class Recording:
                 f"{counted(len(repeated), 'frame')} listed in several epochs, the first "
                 f"{repeated[0]}"
             )
-        if self.has_observations and not self.is_long:
+        if self.has_observations and not self._observation_file.is_long:
             first: dict[bytes, int] = {}
             twice, last = [], 0
             for epoch in self.epochs:
@@ -229,22 +217,11 @@ class Recording:
         rows = [i for i, frame in enumerate(self.columns.frames) if frame and ok[i]]
         return [(i, self.path / self.columns.frames[i]) for i in rows[:1] + rows[1:][-1:]]
 
-    @property
-    def is_long(self) -> bool:
-        """Whether the observations are read in parts, as they are too many for memory."""
-        path = self._observation_path  # a file that is gone is reported when it is read
-        return self.has_observations and path.exists() and path.stat().st_size >= LONG_FROM_BYTES
-
-    @property
-    def _observation_path(self) -> Path:
-        parquet = self.path / "observations.parquet"
-        return parquet if parquet.exists() else self.path / "observations.csv"
-
     @cached_property
     def _observation_file(self) -> ObservationFile:
-        return ObservationFile(
-            self._observation_path, self.testfield, self.columns.numbers, self.camera.sensor
-        )
+        parquet = self.path / "observations.parquet"
+        path = parquet if parquet.exists() else self.path / "observations.csv"
+        return ObservationFile(path, self.testfield, self.columns.numbers, self.camera.sensor)
 
 
 def open_recording(path: Path) -> Recording:
@@ -284,9 +261,9 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     extra = [n for n in table.columns if n and n not in {*required, "temperature_time", "frame"}]
     timed = [n for n in ("temperature_time",) if n in table.columns]
     found = table.read(["epoch"], ["frame_time"], [*timed, *channels], ["frame", *extra])
-    if not found:
-        raise RecordingError(f"{table.path}: holds no epochs")
     numbers, frame_time = found["epoch"], found["frame_time"]
+    if not len(numbers):
+        raise RecordingError(f"{table.path}: holds no epochs")
     table.check(
         "epoch",
         np.diff(numbers, prepend=-1) <= 0,
@@ -344,13 +321,13 @@ def _read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     """Read a `readings.csv`. Raises RecordingError naming line and column."""
     table = Table(path, ["time", *channels])
     columns = table.read(numbers=["time"], optional=channels)
-    times = columns.pop("time", np.empty(0))
+    times = columns.pop("time")
     table.check("time", np.diff(times, prepend=-np.inf) <= 0, "times must increase")
     if fault := time_fault(times):
         table.fail(fault[0], "time", fault[1])
     for name, values in columns.items():
         _check_celsius(table, name, values)
-    return TemperatureLog(times, {name: columns.get(name, np.empty(0)) for name in channels})
+    return TemperatureLog(times, columns)
 
 
 def interpolate_readings(
@@ -365,11 +342,8 @@ def interpolate_readings(
     frames = np.asarray(frame_times, dtype=float)
     times, values = np.asarray(reading_times, dtype=float), np.asarray(readings, dtype=float)
     good = np.isfinite(times) & np.isfinite(values)
-    if not good.all():
-        times, values = times[good], values[good]
-    if (np.diff(times) <= 0).any():
-        times, unique = np.unique(times, return_index=True)
-        values = values[unique]
+    times, unique = np.unique(times[good], return_index=True)
+    values = values[good][unique]
     if len(times) < 2:
         # one reading gives the temperature at its own time only
         only = float(values[0]) if len(values) else np.nan

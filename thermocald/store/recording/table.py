@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 _MAX_EXACT_INTEGER = 2**53
 _LONGEST_HEADER = 200_000
+_MOST_COLUMNS = 1000
+_ROWS = 8192  # of a chunk
 _LEFT_EMPTY = "; leave the field empty if there is none"
 
 
@@ -38,8 +41,7 @@ class Table:
     columns: the names in the header, in their order.
     """
 
-    seeks = False
-    _head, _most_columns = ", line 1", 1000
+    _head = ", line 1"
 
     def __init__(
         self,
@@ -52,9 +54,9 @@ class Table:
         self._text = text
         self._error = error
         self.columns = self._header()
-        if (count := len(self.columns)) > self._most_columns:
+        if (count := len(self.columns)) > _MOST_COLUMNS:
             raise error(
-                f"{path}{self._head}: has {count} columns; at most {self._most_columns} are read"
+                f"{path}{self._head}: has {count} columns; at most {_MOST_COLUMNS} are read"
             )
         for name in self.columns:
             if name and self.columns.count(name) > 1:
@@ -64,14 +66,11 @@ class Table:
                 raise error(self._missing(name))
 
     def chunks(
-        self,
-        rows: int = 8192,
-        columns: Sequence[str] | None = None,
-        epochs: tuple[int, int] | None = None,
+        self, columns: Sequence[str] | None = None, epochs: tuple[int, int] | None = None
     ) -> Iterator[Chunk]:
-        """Yield the rows below the header, at most `rows` at a time; empty lines are skipped.
+        """Yield the rows below the header, at most _ROWS at a time; empty lines are skipped.
 
-        columns, epochs (first, last): what is needed; a table that `seeks` leaves out the rest.
+        columns, epochs (first, last): what is needed; a Parquet file leaves out the rest.
         """
         del columns, epochs
         first = 0
@@ -81,7 +80,7 @@ class Table:
             content = map(tuple, filter(None, reader))
             try:
                 next(content, None)
-                while block := list(islice(content, rows)):
+                while block := list(islice(content, _ROWS)):
                     yield Chunk(self, first, block)
                     first += len(block)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
@@ -95,20 +94,20 @@ class Table:
         texts: Sequence[str] = (),
     ) -> dict[str, Any]:
         """Return whole columns by name; optional: numbers that may be empty, which become NaN."""
-        parts: dict[str, list[Any]] = {}
+        parts: dict[str, list[Any]] = {n: [] for n in (*integers, *numbers, *optional, *texts)}
         for chunk in self.chunks():
             for name in integers:
-                parts.setdefault(name, []).append(chunk.integers(name))
+                parts[name].append(chunk.integers(name))
             for name in (*numbers, *optional):
-                found = chunk.numbers(name, empty_is_nan=name in optional)
-                parts.setdefault(name, []).append(found)
+                parts[name].append(chunk.numbers(name, empty_is_nan=name in optional))
             # chunk by chunk: the garbage collector would traverse a list of a year's texts
             for name in texts:
-                parts.setdefault(name, []).append(chunk.text(name))
+                parts[name].append(chunk.text(name))
         return {
-            name: tuple(chain.from_iterable(found)) if name in texts else np.concatenate(found)
+            name: tuple(chain.from_iterable(found)) if name in texts
+            else np.concatenate(found or [np.empty(0)])
             for name, found in parts.items()
-        }
+        }  # fmt: skip
 
     def numeric(self, names: Sequence[str]) -> list[str]:
         """Return the columns that begin with numbers or are empty; they are read until it shows."""
@@ -133,18 +132,19 @@ class Table:
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise the error for one row (counted from 0 below the header) and column."""
-        where = f"{self.path}, line {self._line(row)}"
-        if column is not None:
-            where += f", column {column}"
-        raise self._error(f"{where}: {message}")
+        of = "" if column is None else f", column {column}"
+        raise self._error(f"{self._where(row)}{of}: {message}")
+
+    def _where(self, row: int) -> str:
+        return f"{self.path}, line {self._line(row)}"
 
     def _open(self) -> TextIO:
         if self._text is not None:
             return io.StringIO(self._text, newline="")
+        # reading a link to a device might never end
+        if os.path.exists(self.path) and not os.path.isfile(self.path):
+            raise self._error(f"{self.path}: is not a file")
         try:
-            # reading a link to a device might never end
-            if self.path.exists() and not self.path.is_file():
-                raise self._error(f"{self.path}: is not a file")
             return self.path.open(newline="", encoding="utf-8-sig")
         except (OSError, ValueError) as cause:  # ValueError: a NUL character in the path
             why = getattr(cause, "strerror", cause)

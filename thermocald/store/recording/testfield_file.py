@@ -1,14 +1,18 @@
-"""`testfield.csv` (CONVENTIONS §3): read, check and write it."""
+"""`testfield.csv` (CONVENTIONS §3), and the boards of other programs.
+
+These are Kalibr, OpenCV, calib.io, and lists of ring-coded targets.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import TestFieldError
-from thermocald.files import write_text
-from thermocald.photogrammetry.field.testfield import KINDS, TestField
+from thermocald.errors import TestFieldError, UsageError
+from thermocald.files import QuantityReader, read_yaml, write_text
+from thermocald.photogrammetry.field.testfield import KINDS, Distance, TestField
 from thermocald.result import csv_text
 from thermocald.store.recording.table import Table
 
@@ -28,6 +32,30 @@ _REQUIRED = ("target", *_NUMBERS)
 _SMALLEST_FIELD_MM = 25.0
 # A lens cannot focus so close that a field of a few principal distances fills the image.
 _SMALLEST_FIELD_IN_PRINCIPAL_DISTANCES = 5.0
+
+_MOST_LINES = 20_000
+_MOST_ROWS = 1000
+_LARGEST_BYTES = 5_000_000
+_KINDS = ("aprilgrid", "april_grid", "checkerboard", "chessboard", "checker", "charuco",
+          "charucoboard")  # fmt: skip
+_SYNONYMS = {
+    "columns": ("squaresx", "numsquaresx", "cols", "columns", "boardcols", "numcols", "ncols",
+                "width", "boardwidth", "targetcols", "tagcols"),
+    "rows": ("squaresy", "numsquaresy", "rows", "boardrows", "numrows", "nrows", "height",
+             "boardheight", "targetrows", "tagrows"),
+    "square": ("squarelength", "squaresize", "squareside", "square", "checkersize", "checkerwidth",
+               "cellsize"),
+    "marker": ("markerlength", "markersize", "markerside", "marker"),
+    "dictionary": ("dictionary", "dict", "arucodict", "arucodictionary", "dictname",
+                   "dictionaryname"),
+}  # fmt: skip
+"""Keys for each quantity, in lower case, without underscores and unit."""
+_CALIB_IO = re.compile(
+    r"calib\.io_(checker|charuco)_[^_]+_(\d{1,3})x(\d{1,3})_(\d*\.?\d+)"
+    r"(?:_(\d*\.?\d+))?(?:_(DICT_\w+?))?(?:\.\w+)?",
+    re.IGNORECASE,
+)
+"""Names of calib.io's files: kind, page, rows x columns of squares, square, marker mm."""
 
 
 def read_testfield(path: Path) -> TestField:
@@ -55,7 +83,7 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
     found = table.read(
         (), [n for n in _NUMBERS if n != "diameter"], ["diameter"], ["target", *given]
     )
-    names = [text.strip() for text in found.get("target", ())]
+    names = [text.strip() for text in found["target"]]
     first: dict[str, int] = {}
     for row, name in enumerate(names):
         if not name:
@@ -64,8 +92,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             table.fail(row, "target", f"{name[:40]!r} must be printable")
         if first.setdefault(name, row) != row:
             table.fail(row, "target", f"target {name!r} is duplicated")
-    columns = {name: found.get(name, np.empty(0)) for name in _NUMBERS}
-    for column, numbers in columns.items():
+    for column in _NUMBERS:
+        numbers = found[column]
         table.check(column, abs(numbers) > _LARGEST_MM, f"must be within {_LARGEST_MM:g} mm")
         if column == "diameter":
             table.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
@@ -88,9 +116,9 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
         raise TestFieldError(f"{table.path}: holds no targets")
     return TestField.build(
         names,
-        np.array([columns["X"], columns["Y"], columns["Z"]]).T,
-        np.array([columns["sX"], columns["sY"], columns["sZ"]]).T,
-        columns["diameter"].tolist(),
+        np.array([found[name] for name in "XYZ"]).T,
+        np.array([found[name] for name in ("sX", "sY", "sZ")]).T,
+        found["diameter"].tolist(),
         kinds,
         [code.strip() for code in found.get("code", empty)],
     )
@@ -131,3 +159,159 @@ def testfield_csv(field: TestField) -> str:
 def write_testfield(path: Path, field: TestField) -> None:
     """Write `testfield.csv`; an existing file is replaced as a whole or not at all."""
     write_text(path, testfield_csv(field))
+
+
+def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
+    """Read the board in a YAML or JSON file; return it with a description for the user.
+
+    Kalibr: target_type aprilgrid or checkerboard, lengths in metres. Others: type charuco or
+    chessboard with OpenCV's names for the parameters; lengths below 1 are in metres, others in mm.
+    A file of calib.io's generator describes its board by its name (`calib.io_charuco_420x297_8x11_
+    34_25_DICT_5X5.pdf`: 8 rows of 11 squares of 34 mm). Raises TestFieldError naming file and key.
+    """
+    from thermocald.photogrammetry.targets import boards  # OpenCV is slow to import
+
+    named = _CALIB_IO.fullmatch(path.name)
+    # keys are compared in a plain form: `Square_Length_mm` → `squarelength`
+    plain = _keys_in_name(path, named) if named else {
+        re.sub(r"[^a-z0-9]", "", k.lower().removesuffix("_mm")): v
+        for k, v in read_yaml(path, TestFieldError).items()
+    }  # fmt: skip
+    whose = "calib.io's" if named else "a"
+    board = _BoardReader(path, plain)
+    kind = str(plain.get("targettype", plain.get("type", ""))).lower()
+    if not kind and any(k in plain for k in _SYNONYMS["dictionary"]):
+        kind = "charuco"
+    if kind not in _KINDS:
+        wrong = f"{kind!r} is unknown" if kind else "is missing"
+        raise TestFieldError(
+            f"{path}, key target_type: {wrong}; give aprilgrid, checkerboard, charuco or chessboard"
+        )
+    columns, rows = board.count("columns"), board.count("rows")
+    if kind.startswith("april"):
+        size = 1e3 * board.number("tagsize", "m", above=0.0, high=1e6)
+        spacing = board.number("tagspacing", "1", above=0.0, high=1e6)
+        start = next((key for key in ("startid", "lowid") if plain.get(key) is not None), None)
+        first = 0 if start is None else int(board.number(start, "1", low=0, high=_MOST_ROWS))
+        field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
+        return field, (
+            f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, "
+            f"{spacing * size:g} mm apart"
+        )
+    if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in plain:
+        wide = 1e3 * board.number("colspacingmeters", "m", above=0.0, high=1e6)
+        high = 1e3 * board.number("rowspacingmeters", "m", above=0.0, high=1e6)
+        field = boards.chessboard(columns, rows, wide, high, sigma=sigma)
+        return field, f"Kalibr's checkerboard of {columns} × {rows} corners, {wide:g} × {high:g} mm"
+    square = board.length("square")
+    if "charuco" not in kind:
+        if {"squaresx", "numsquaresx"} & set(plain):  # one more than corners
+            columns, rows = columns - 1, rows - 1
+        field = boards.chessboard(columns, rows, square, sigma=sigma)
+        return field, f"{whose} chessboard of {columns} × {rows} inner corners, {square:g} mm"
+    marker = board.length("marker")
+    key = board.find_key("dictionary")
+    if plain.get(key) is None:
+        raise board.fail(key, f"is missing; the file has {', '.join(plain)[:200]}")
+    name = _dictionary(path, plain[key])
+    legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
+    field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
+    return field, (
+        f"{whose} ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
+        f"{marker:g} mm of {name}"
+    )
+
+
+class _BoardReader(QuantityReader):
+    """A reader of a board's keys by their meaning in `_SYNONYMS`."""
+
+    error = TestFieldError
+
+    def find_key(self, meaning: str) -> str:
+        """Return the synonym for a meaning that the file has; the first if it has none."""
+        names = _SYNONYMS[meaning]
+        return next((name for name in names if self.mapping.get(name) is not None), names[0])
+
+    def count(self, meaning: str) -> int:
+        return self.whole(self.find_key(meaning), "1", high=_MOST_ROWS)
+
+    def length(self, meaning: str) -> float:
+        """Read a length in mm; below 1 it is in metres, as in ROS and OpenCV's samples."""
+        length = self.number(self.find_key(meaning), "mm", above=0.0, high=1e6)
+        return 1e3 * length if length < 1 else length
+
+
+def _keys_in_name(path: Path, named: re.Match[str]) -> dict[str, Any]:
+    """Return the keys of the board that a file's name describes."""
+    keys = {"type": named[1].lower(), "squaresx": int(named[3]), "squaresy": int(named[2]),
+            "square": float(named[4])}  # fmt: skip
+    if keys["type"] == "checker":
+        return keys
+    if named[5] is None or named[6] is None:
+        raise TestFieldError(
+            f"{path}: the name does not describe the markers; give --charuco "
+            f"{named[3]}x{named[2]} --square {named[4]} with --marker and --dictionary"
+        )
+    # the smaller dictionaries of a marker size are the first markers of the largest
+    name = named[6].upper()
+    name = name if name.count("_") > 1 else f"{name}_1000"
+    return {**keys, "marker": float(named[5]), "dictionary": name}
+
+
+def _dictionary(path: Path, value: Any) -> str:
+    """Return OpenCV's name of a dictionary, given its name with or without DICT_, or number."""
+    import cv2
+
+    if isinstance(value, int):
+        names = [n for n in dir(cv2.aruco) if n.startswith("DICT_")]
+        known = [n for n in names if getattr(cv2.aruco, n) == value]
+        if known:
+            return sorted(known)[0]
+    name = str(value).strip()
+    name = name if name.startswith("DICT_") else f"DICT_{name}"
+    if not isinstance(getattr(cv2.aruco, name, None), int):
+        raise TestFieldError(f"{path}: {str(value)[:40]!r} is not one of OpenCV's dictionaries")
+    return name
+
+
+def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = None) -> TestField:
+    """Read ring-coded targets from a list of Metashape or AICON: label, X, Y, Z in mm.
+
+    A label is the target's number, alone or after a word (`target 12`). Other lines are skipped.
+    Raises TestFieldError naming file and line.
+    """
+    from thermocald.photogrammetry.targets import boards
+
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise TestFieldError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as cause:
+        raise TestFieldError(f"{path}: cannot be read: {cause}") from cause
+    numbers: list[int] = []
+    points: list[list[float]] = []
+    for line, text in enumerate(lines[:_MOST_LINES], 1):
+        found = re.match(r"\s*(?:[A-Za-z_]+[\s_]*)?(\d{1,4})[\s,;]+(.*)", text)
+        if found is None or text.lstrip().startswith("#"):
+            continue
+        fields = [f for f in re.split(r"[\s,;]+", found[2]) if f]
+        try:
+            point = [float(f) for f in fields[:3]]
+        except ValueError:
+            raise TestFieldError(f"{path}, line {line}: {found[2][:40]!r} is not X, Y, Z") from None
+        if len(point) < 3 or not np.isfinite(point).all():
+            raise TestFieldError(f"{path}, line {line}: X, Y, Z (mm) are needed after the label")
+        numbers.append(int(found[1]))
+        points.append(point)
+    if not numbers:
+        raise TestFieldError(f"{path}: holds no line `label, X, Y, Z`")
+    sigmas = None if sigma is None else np.full((len(points), 3), sigma)
+    return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigmas=sigmas)
+
+
+def read_distances(path: Path) -> list[Distance]:
+    """Read measured distances from a CSV with a, b, length, sigma mm. Raises UsageError."""
+    names = ("a", "b", "length", "sigma")
+    found = Table(path, names, UsageError).read(numbers=names[2:], texts=names[:2])
+    rows = zip(*(found[name] for name in names), strict=True)
+    return [Distance(a.strip(), b.strip(), float(mm), float(sd)) for a, b, mm, sd in rows]

@@ -6,6 +6,7 @@ import csv
 import math
 import os
 import shutil
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Self
 
 from thermocald.errors import RecordingError
@@ -17,6 +18,7 @@ from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
     from typing import Any, TextIO
 
@@ -43,8 +45,8 @@ class RecordingWriter:
         self._head = head
         self._field = testfield
         self._partial = path.absolute().with_name(f".{path.absolute().name}.partial")
-        self._epochs: TextIO | None = None
-        self._observations: TextIO | None = None
+        self._files: dict[str, TextIO] = {}
+        self._columns: list[str] = []  # of observations
         self._last: Epoch | None = None
         self._last_reading = -math.inf
 
@@ -52,20 +54,16 @@ class RecordingWriter:
         require_channels(self._head.channels, str(self.path), RecordingError)
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise RecordingError(f"{self.path}: exists already; choose another name or remove it")
-        try:
+        with self._in_words():
             shutil.rmtree(self._partial, ignore_errors=True)
             self._partial.mkdir(parents=True)
-            head = dump_yaml(head_document(self._head))
-            (self._partial / "recording.yaml").write_text(head, encoding="utf-8")
-            (self._partial / "testfield.csv").write_text(
-                testfield_csv(self._field), encoding="utf-8"
-            )
-            self._epochs = self._new("epochs.csv")
+            for name, text in (
+                ("recording.yaml", dump_yaml(head_document(self._head))),
+                ("testfield.csv", testfield_csv(self._field)),
+            ):
+                (self._partial / name).write_text(text, encoding="utf-8")
             names = ["epoch", "frame_time", "temperature_time", *self._head.channels, "frame"]
-            csv.writer(self._epochs, lineterminator="\n").writerow(names)
-        except OSError as cause:
-            self._abandon()
-            raise self._failed(cause) from cause
+            self._epochs = self._new("epochs.csv", names)
         return self
 
     def append(
@@ -75,45 +73,34 @@ class RecordingWriter:
 
         Without `image`, the frame that the epoch names is copied.
         """
-        if self._epochs is None:
-            raise RecordingError(f"{self.path}: the writer is not open")
         self._refuse_backwards(epoch)
-        try:
+        with self._in_words():
             frame = self._keep_frame(epoch, image)
-            row: list[object] = [epoch.number, f"{epoch.frame_time:.6f}"]
-            row.append(_number(epoch.temperature_time, ".6f"))
-            row += [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
-            csv.writer(self._epochs, lineterminator="\n").writerow([*row, frame])
+            times = f"{epoch.frame_time:.6f}", _number(epoch.temperature_time, ".6f")
+            read = [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
+            self._epochs.writerow([epoch.number, *times, *read, frame])
             if epoch.observations is not None:
                 self._write_observations(epoch.number, epoch.observations)
-        except OSError as cause:
-            raise self._failed(cause) from cause
         self._last = epoch
         if math.isfinite(epoch.temperature_time):
             self._last_reading = epoch.temperature_time
 
     def keep_readings(self, readings: TemperatureLog) -> None:
         """Write every reading of a log, not only those of the epochs."""
-        try:
-            with self._new(READINGS) as file:
-                file.writelines(csv_text([{"time": readings.times, **readings.channels}]))
-        except OSError as cause:
-            raise self._failed(cause) from cause
+        with self._in_words():
+            (text,) = csv_text([{"time": readings.times, **readings.channels}])
+            (self._partial / READINGS).write_text(text, encoding="utf-8")
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._abandon()
             return
-        try:
-            for file in (self._epochs, self._observations):
-                if file is not None:
-                    file.flush()
-                    os.fsync(file.fileno())
-                    file.close()
+        with self._in_words():
+            for file in self._files.values():
+                file.flush()
+                os.fsync(file.fileno())
+                file.close()
             self._partial.rename(self.path)
-        except OSError as cause:
-            self._abandon()
-            raise self._failed(cause) from cause
 
     def _refuse_backwards(self, epoch: Epoch) -> None:
         """Raise RecordingError for an epoch that `open_recording` would refuse."""
@@ -127,23 +114,32 @@ class RecordingWriter:
         if epoch.temperature_time < self._last_reading:
             raise RecordingError(f"{where}: the time of its temperature runs backwards")
 
-    def _new(self, name: str) -> TextIO:
-        return (self._partial / name).open("w", encoding="utf-8", newline="")
+    def _new(self, name: str, columns: list[str]) -> Any:
+        """Return the CSV writer of a new table."""
+        self._files[name] = (self._partial / name).open("w", encoding="utf-8", newline="")
+        rows = csv.writer(self._files[name], lineterminator="\n")
+        rows.writerow(columns)
+        return rows
 
     def _abandon(self) -> None:
-        for file in (self._epochs, self._observations):
-            if file is not None:
-                try:
-                    file.close()
-                except OSError:  # a full disk fails the flush too; the file is removed below
-                    file.close()
+        for file in self._files.values():
+            try:
+                file.close()
+            except OSError:  # a full disk fails the flush too; the file is removed below
+                file.close()
         shutil.rmtree(self._partial, ignore_errors=True)
 
-    def _failed(self, cause: OSError) -> RecordingError:
-        failed = cannot_write(self.path, cause)
-        error = RecordingError(f"{failed}; the part written so far was removed")
-        error.exit_status = failed.exit_status
-        return error
+    @contextmanager
+    def _in_words(self) -> Iterator[None]:
+        """After an OSError, remove what was written and raise a RecordingError that says why."""
+        try:
+            yield
+        except OSError as cause:
+            self._abandon()
+            failed = cannot_write(self.path, cause)
+            error = RecordingError(f"{failed}; the part written so far was removed")
+            error.exit_status = failed.exit_status
+            raise error from cause
 
     def _keep_frame(self, epoch: Epoch, image: bytes | NDArray[Any] | None) -> str:
         if image is None and epoch.frame is None:
@@ -174,12 +170,9 @@ class RecordingWriter:
             columns["sxy"] = seen.covariances
         if len(seen):
             columns |= seen.quality
-        if self._observations is None:
-            self._observations = self._new("observations.csv")
+        if not self._columns:
             self._columns = list(columns)
-            csv.writer(self._observations, lineterminator="\n").writerow(
-                ["epoch", "target", *columns]
-            )
+            self._observations = self._new("observations.csv", ["epoch", "target", *columns])
         if added := [name for name in columns if name not in self._columns]:
             self._add_columns(added)
         names = [self._field.names[i] for i in seen.targets.tolist()]
@@ -189,22 +182,18 @@ class RecordingWriter:
             else [_ABSENT.get(name, "")] * len(seen)
             for name in self._columns
         ]
-        rows = csv.writer(self._observations, lineterminator="\n")
-        rows.writerows(zip([number] * len(seen), names, *cells, strict=True))
+        self._observations.writerows(zip([number] * len(seen), names, *cells, strict=True))
 
     def _add_columns(self, names: list[str]) -> None:
         """Add columns to the rows of observations written so far."""
-        assert self._observations is not None
-        self._observations.close()
+        self._files["observations.csv"].close()
         before = self._partial / "observations.before"
         (self._partial / "observations.csv").rename(before)
-        self._observations = self._new("observations.csv")
-        rows = csv.writer(self._observations, lineterminator="\n")
         absent = [_ABSENT.get(name, "") for name in names]
         with before.open(encoding="utf-8", newline="") as file:
             written = csv.reader(file)
-            rows.writerow([*next(written), *names])
-            rows.writerows([*row, *absent] for row in written)
+            self._observations = self._new("observations.csv", [*next(written), *names])
+            self._observations.writerows([*row, *absent] for row in written)
         before.unlink()
         self._columns += names
 

@@ -21,7 +21,7 @@ from thermocald.store.recording.head import parse_head
 from thermocald.store.server.connection import Connected
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
@@ -174,13 +174,13 @@ class FleetReader(Connected):
         for _, found in groupby(series, key=lambda one: (one.station, one.camera)):
             every = list(found)
             newest = every[-1]
-            low = _extreme(min, (one.low for one in every))
-            high = _extreme(max, (one.high for one in every))
+            low = min((one.low for one in every if one.low is not None), default=math.nan)
+            high = max((one.high for one in every if one.high is not None), default=math.nan)
             camera = FleetCamera(
                 newest.station, newest.camera, newest.name, heads[newest.key],
                 json.loads(newest.identity), newest.last,
                 sum(one.epochs for one in every), sum(one.results for one in every),
-                _extreme(max, (one.last_ok for one in every)),
+                max((one.last_ok for one in every if one.last_ok is not None), default=math.nan),
                 (low, high) if math.isfinite(low) else None,
             )  # fmt: skip
             owned.append((camera, every))
@@ -194,34 +194,29 @@ class FleetReader(Connected):
         A series is copied if one of its newest epochs has two times: those of two stores.
         """
         rows = self._query(
-            "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures, e.number, "
-            "e.revision "
+            "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures, "
+            "CASE WHEN e.place <= %s THEN EXISTS (SELECT FROM epoch o WHERE o.series = s.key "
+            "AND o.number = e.number AND o.revision = e.revision "
+            "AND o.frame_time <> e.frame_time) ELSE false END "
             "FROM unnest(%s::uuid[], %s::float8[]) s(key, last) "
             "CROSS JOIN LATERAL (SELECT min(first) AS t FROM (SELECT first, "
             "sum(epochs) OVER (ORDER BY slot DESC) - epochs AS later FROM summary "
             "WHERE series = s.key AND slot <= thermocald_slot(s.last) ORDER BY slot DESC LIMIT %s) "
-            "counted WHERE later < %s) since CROSS JOIN LATERAL (SELECT * FROM epoch "
+            "counted WHERE later < %s) since CROSS JOIN LATERAL (SELECT *, "
+            "row_number() OVER (ORDER BY frame_time DESC) AS place FROM epoch "
             "WHERE series = s.key AND frame_time BETWEEN since.t AND s.last "
             "ORDER BY frame_time DESC LIMIT %s) e "
             "ORDER BY s.key, e.frame_time DESC, e.revision DESC",
-            ([*current], [r.last_time for r in current.values()], RECENT, RECENT, RECENT),
+            (_COMPARED, [*current], [r.last_time for r in current.values()], *[RECENT] * 3),
         )
-        newest: list[tuple[Any, int, int, float]] = []
-        for key, frame_time, received, status, temperatures, number, revision in rows:
-            recent = current[key].recent
-            if len(recent) < _COMPARED:
-                newest.append((key, number, revision, frame_time))
-            if not recent or recent[-1].frame_time != frame_time:  # an older revision follows
+        for key, frame_time, received, status, temperatures, copied in rows:
+            camera = current[key]
+            camera.copied |= copied
+            # an older revision follows
+            if not camera.recent or camera.recent[-1].frame_time != frame_time:
                 values = parse_numbers(temperatures)
-                recent.append(RecentEpoch(frame_time, number_or_nan(received), status, values))
-        columns = [list(column) for column in zip(*newest, strict=True)] or [[]] * 4
-        for (key,) in self._query(
-            "SELECT DISTINCT s.key FROM unnest(%s::uuid[], %s::int8[], %s::int4[], %s::float8[]) "
-            "s(key, number, revision, at) WHERE EXISTS (SELECT FROM epoch o WHERE o.series = s.key "
-            "AND o.number = s.number AND o.revision = s.revision AND o.frame_time <> s.at)",
-            tuple(columns),
-        ):
-            current[key].copied = True
+                read = RecentEpoch(frame_time, number_or_nan(received), status, values)
+                camera.recent.append(read)
 
     def _read_samples(
         self,
@@ -273,8 +268,3 @@ class FleetReader(Connected):
                 [i, *s] for i, one in enumerate(every) for _, s in sorted(samples[one.key].items())
             ]
             camera.samples = np.array(rows, dtype=float).reshape(-1, 9)
-
-
-def _extreme(of: Callable[[list[float]], float], values: Iterable[float | None]) -> float:
-    known = [v for v in values if v is not None and not math.isnan(v)]
-    return of(known) if known else math.nan

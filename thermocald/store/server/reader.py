@@ -19,7 +19,6 @@ from uuid import UUID, uuid5
 import numpy as np
 
 from thermocald import __version__
-from thermocald.errors import StoreVersionError
 from thermocald.store.database.epochs import (
     latest_epochs,
     series_row,
@@ -221,18 +220,13 @@ class ServerWriter(Connected):
         self.station = station
         self.store = UUID(store)
         self._sent: set[UUID] = set()
-        self._days: set[int] = set()
         # {table: {column: type}} on the server, read once as every batch needs it
         self._tables: dict[str, dict[str, str]] = {}
-        try:
-            for table, column, kind in self._query(
-                "SELECT table_name, column_name, udt_name FROM information_schema.columns "
-                "WHERE table_schema = 'public' ORDER BY ordinal_position"
-            ):
-                self._tables.setdefault(table, {})[column] = kind
-        except BaseException:
-            self.close()
-            raise
+        for table, column, kind in self._query(
+            "SELECT table_name, column_name, udt_name FROM information_schema.columns "
+            "WHERE table_schema = 'public' ORDER BY ordinal_position"
+        ):
+            self._tables.setdefault(table, {})[column] = kind
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
@@ -246,13 +240,9 @@ class ServerWriter(Connected):
         keys = {id_: series_key(self.station, self.store, one) for id_, one in series.items()}
         ready = [self._row(table, row, keys) for row in rows]
         needed = {row["series_id"] for row in rows if row.get("series_id") is not None}
-        days: set[int] = set()
-        if table == "epoch":
-            times = (row["frame_time"] for row in rows)
-            # a clock that was not set gives a time without a month's table
-            days = {
-                int(t // _DAY_S) for t in times if _PLAUSIBLE[0] <= t <= _PLAUSIBLE[1]
-            } - self._days
+        times = (row["frame_time"] for row in rows if table == "epoch")
+        # a clock that was not set gives a time without a month's table
+        days = {t // _DAY_S for t in times if _PLAUSIBLE[0] <= t <= _PLAUSIBLE[1]}
         with self._transaction(f"{len(rows)} {table}s were not sent") as connection:
             for id_ in sorted(needed):
                 if keys[id_] not in self._sent:
@@ -265,7 +255,6 @@ class ServerWriter(Connected):
             self._insert(connection, table, ready)
         # only what was committed counts as done
         self._sent.update(keys[id_] for id_ in needed)
-        self._days |= days
 
     def write_frame(self, series: StoredSeries, frame: KeptFrame, data: bytes) -> None:
         """Insert the file of one epoch's frame; the server checks its SHA-256."""
@@ -296,11 +285,6 @@ class ServerWriter(Connected):
         for name, value in row.items():
             if name in _LOCAL[table]:
                 continue
-            if name not in columns:
-                raise StoreVersionError(
-                    f"{self.address}: the store's {table}s have a column {name!r} that the server "
-                    "lacks; run `thermocald server init` with this program's version"
-                )
             if name == "clock_trusted":
                 value = bool(value)
             # PostgreSQL's text cannot hold NUL, which a broken device may send in a note

@@ -51,6 +51,12 @@ class ListKeeper:
         time.sleep(self.pause_s)
         self.kept.append((acquired.number, acquired.calibrated is not None))
 
+    def observe(self, calibrated, in_order):
+        return calibrated
+
+    def lose(self, why) -> None:
+        pass
+
     def amend(self, calibrated) -> None:
         self.amended.append(calibrated.epoch.number)
 
@@ -66,7 +72,7 @@ def pipeline():
     keeper, calibrator = ListKeeper(), SlowCalibrator()
     clock = SystemClock()
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), clock)
-    made = Pipeline("cam", calibrator, none, (), keeper, clock, patience_s=0.0)
+    made = Pipeline("cam", calibrator, none, (), keeper, clock)
     made.start()
     yield made, keeper, calibrator
     calibrator.gate.set()

@@ -151,7 +151,7 @@ def work():
         a @ a
 thread = threading.Thread(target=work)
 thread.start()
-schedule, late = Schedule(SystemClock(), 0.05), []
+schedule, late = Schedule(SystemClock(), 0.05, time.monotonic()), []
 for _ in range(400):
     tick = schedule.wait()
     late.append(time.monotonic() - schedule.due(tick))

@@ -152,12 +152,9 @@ def test_an_epoch_that_is_not_handed_over_is_lost(how):
             raise RuntimeError("a mistake of ours")
         gate.wait(20.0)
 
-    keeper = SimpleNamespace(keep=keep, amend=None, backlog=lambda below: None)
+    keeper = SimpleNamespace(keep=keep, backlog=lambda below: None, lose=told.append)
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), SystemClock())
-    pipeline = Pipeline(
-        "cam", None, none, (), keeper, SystemClock(), patience_s=0.0,
-        on_lost=told.append,
-    )  # fmt: skip
+    pipeline = Pipeline("cam", None, none, (), keeper, SystemClock())
     pipeline.start()
     count = 2 if how == "the keeper breaks" else 10 if how.startswith("too") else 3
     for _ in range(count):

@@ -19,6 +19,7 @@ import logging
 import math
 import threading
 from collections import deque
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -43,13 +44,15 @@ _LATEST_START = 0.1  # of a period; a tick that would begin later is skipped
 _REMEMBERED = 1000
 
 
+@dataclass(eq=False)
 class Schedule:
     """The ticks of one device; one thread waits for them, others may read the statistics."""
 
-    def __init__(self, clock: Clock, period_s: float, begin: float | None = None) -> None:
-        self.clock = clock
-        self.period_s = period_s
-        self.begin = clock.monotonic() if begin is None else begin
+    clock: Clock
+    period_s: float
+    begin: float
+
+    def __post_init__(self) -> None:
         self._next = 0
         self._ticks = 0
         self._skipped = 0
@@ -98,40 +101,32 @@ _SEARCH_PAUSE_S = 10.0
 _OFTEN, _OFTEN_S = 10, 3600.0  # outages within a time, from which they are not reported one by one
 
 
+@dataclass(eq=False)
 class Link:
     """One device and its state; one thread uses it, others may read its attributes.
 
-    called: kind and name. For the status: state; why: the last fault; out_since: monotonic s;
-    since: UTC s, when the device went away or ended, else NaN; faults: number of failed calls.
-    on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
-    back (`device_back`), fails permanently (`device_failed`), or its recording ends
-    (`device_finished`). free_running: retries at once, as a recording played fast.
+    For the status: state; why: the last fault; out_since: monotonic s; since: UTC s, when the
+    device went away or ended, else NaN; faults: number of failed calls. on_event: receives UTC s, a
+    kind and a sentence when the device goes away (`device_out`), comes back (`device_back`), fails
+    permanently (`device_failed`), or its recording ends (`device_finished`). free_running: retries
+    at once, as a recording played fast.
     """
 
-    def __init__(
-        self,
-        kind: Kind,
-        name: str,
-        device: Device,
-        clock: Clock,
-        *,
-        period_s: float = 1.0,
-        on_event: OnEvent = lambda *_: None,
-        free_running: bool = False,
-    ) -> None:
-        self.name = name
-        self.called = f"{kind} {name}"
-        self.device = device
+    kind: Kind
+    name: str
+    device: Device
+    clock: Clock
+    period_s: float = 1.0
+    on_event: OnEvent = lambda *_: None
+    free_running: bool = False
+
+    def __post_init__(self) -> None:
+        self.called = f"{self.kind} {self.name}"
         self.state: LinkState = "closed"
         self.why = ""
         self.out_since = 0.0
         self.since = math.nan
         self.faults = 0
-        self._clock = clock
-        self._period_s = period_s
-        self._on_event = on_event
-        self._free_running = free_running
-        self._searched = DeviceNotFound if kind == "output" else (DeviceNotFound, DeviceDenied)
         self._pause_s = 0.0
         self._retry_at = 0.0
         self._outages: deque[float] = deque(maxlen=_OFTEN)
@@ -145,7 +140,7 @@ class Link:
 
     def do(self, action: Callable[[], object]) -> bool:
         """Call `action` with the device open; return whether it succeeded."""
-        waits = not self._free_running and self._clock.monotonic() < self._retry_at
+        waits = not self.free_running and self.clock.monotonic() < self._retry_at
         if self.ended or (self.state == "out" and waits):
             return False
         try:
@@ -153,12 +148,14 @@ class Link:
                 self.device.open()
             action()
         except TransientDeviceError as error:
-            self._out(str(error), max(self._period_s, _LONGEST_PAUSE_S))
-        except self._searched as error:
-            self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
+            self._out(str(error), max(self.period_s, _LONGEST_PAUSE_S))
         except PermanentDeviceError as error:
+            denied = isinstance(error, DeviceDenied) and self.kind != "output"
+            if denied or isinstance(error, DeviceNotFound):
+                self._out(str(error), max(self.period_s, _SEARCH_PAUSE_S))
+                return False
             self._ask("close", self.device.close, None)
-            self.since = self._clock.utc()
+            self.since = self.clock.utc()
             self.why = without_secrets(str(error))
             # the end of a recording is not a failure
             finished = isinstance(error, DeviceFinished)
@@ -169,7 +166,7 @@ class Link:
             # an error in a driver, even its sys.exit(), must not stop the daemon
             if self.state != "out" and not self._restless:
                 log.exception("%s: its driver failed", self.called)
-            self._out(f"{type(error).__name__}: {error}", max(self._period_s, _LONGEST_PAUSE_S))
+            self._out(f"{type(error).__name__}: {error}", max(self.period_s, _LONGEST_PAUSE_S))
         else:
             self._back()
             return True
@@ -198,7 +195,7 @@ class Link:
             return default
 
     def _back(self) -> None:
-        away_s = self._clock.monotonic() - self.out_since
+        away_s = self.clock.monotonic() - self.out_since
         if self.state == "out" and (not self._restless or away_s > _OFTEN_S):
             self._report(logging.INFO, "device_back", f"{self.called} is back after {away_s:.0f} s")
         self.state = "open"
@@ -213,8 +210,8 @@ class Link:
         self.why = why
         if self.state != "out":
             self.state = "out"
-            self.out_since = self._clock.monotonic()
-            self.since = self._clock.utc()
+            self.out_since = self.clock.monotonic()
+            self.since = self.clock.utc()
             self._outages.append(self.out_since)
             was_restless, count = self._restless, len(self._outages)
             self._restless = count == _OFTEN and self.out_since - self._outages[0] < _OFTEN_S
@@ -223,13 +220,13 @@ class Link:
                 text = f"{self.called} is out: {why}{often if self._restless else ''}"
                 self._report(logging.WARNING, "device_out", text)
         # the first retry is at the next tick, since most faults concern a single frame
-        now = self._clock.monotonic()
+        now = self.clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
         self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), longest_s)
 
     def _report(self, level: int, kind: str, text: str) -> None:
         log.log(level, "%s", text, extra={"device": self.name, "event": kind})
-        self._on_event(self._clock.utc(), kind, text)
+        self.on_event(self.clock.utc(), kind, text)
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
@@ -245,6 +242,7 @@ class Link:
         }
 
 
+@dataclass(eq=False)
 class DeviceLoop:
     """Calls `action` at every tick, with the device open.
 
@@ -253,28 +251,21 @@ class DeviceLoop:
     while it returns true, the device is closed and not used.
     """
 
-    def __init__(
-        self,
-        link: Link,
-        action: Callable[[], None],
-        clock: Clock,
-        period_s: float,
-        begin: float,
-        *,
-        free_running: bool = False,
-        idle: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self.link = link
-        self.schedule = Schedule(clock, period_s, begin)
+    link: Link
+    action: Callable[[], object]
+    clock: Clock
+    period_s: float
+    begin: float
+    free_running: bool = False
+    idle: Callable[[], bool] = lambda: False
+
+    def __post_init__(self) -> None:
+        self.schedule = Schedule(self.clock, self.period_s, self.begin)
         self.lost = 0
-        self._action = action
-        self._free_running = free_running
-        self._idle = idle
-        self._clock = clock
         self._stop = threading.Event()
         self._busy_since: float | None = None
         # a hung driver cannot be stopped, and must not keep the process alive
-        self._thread = threading.Thread(target=self._run, name=link.called, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=self.link.called, daemon=True)
 
     def start(self) -> None:
         """Start at the next tick."""
@@ -292,18 +283,18 @@ class DeviceLoop:
     def busy_s(self) -> float:
         """Return how long the current call has taken, s; 0 between calls."""
         since = self._busy_since
-        return 0.0 if since is None else self._clock.monotonic() - since
+        return 0.0 if since is None else self.clock.monotonic() - since
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set() and not self.link.ended:
-                if not self._free_running and self.schedule.wait(self._stop) is None:
+                if not self.free_running and self.schedule.wait(self._stop) is None:
                     break
-                self._busy_since = self._clock.monotonic()
-                if self._idle():
+                self._busy_since = self.clock.monotonic()
+                if self.idle():
                     if self.link.state == "open":  # a device that is away stays "out"
                         self.link.close()
-                elif not self.link.do(self._action):
+                elif not self.link.do(self.action):
                     self.lost += 1
                 self._busy_since = None
         finally:

@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Any
 from thermocald import __version__
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
-from thermocald.daemon.camera_line import Runtime
 from thermocald.daemon.control import ControlSocket
 from thermocald.daemon.live_state import LiveState, status_warnings
+from thermocald.daemon.series_run import Runtime
 from thermocald.daemon.session import Sessions
 from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.acquisition.device_loop import DeviceLoop, OutputLoop
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.daemon.camera_line import CameraLine, Runtime
+from thermocald.daemon.camera_line import CameraLine
 from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError
 from thermocald.hal import load_driver, open_device
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from thermocald.config import Config, OutputConfig
+    from thermocald.daemon.series_run import Runtime
 
 
 _RETENTION_EVERY_S = 600.0
@@ -50,7 +51,7 @@ class Station:
         self.cameras = [
             CameraLine(
                 plan, runtime, self.thermometers, self.frames, self.outputs, begin,
-                preview=config.dashboard.enabled,
+                config.dashboard.enabled,
             )
             for plan in plan_cameras(config, clock)
         ]  # fmt: skip

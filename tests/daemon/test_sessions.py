@@ -256,7 +256,7 @@ def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, 
         config, asked, "creep,slip", None, said.append, 40.0, 2.0, 0.8
     )
     assert max(s.hold_c for s in session.programme if s.hold_c) <= 40.0
-    watch._store = daemon.store
+    watch.store = daemon.store
     watch._compare = lambda: Separation("creep", "slip", 55.0, 14.0, True)
     enough, look = 6, watch.look
     watch.look = lambda taken: look(taken + 40) if taken >= enough else False

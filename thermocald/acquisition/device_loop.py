@@ -19,8 +19,10 @@ import logging
 import math
 import threading
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from thermocald.addresses import without_secrets
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     OnEvent = Callable[[float, str, str], None]
 
 _QUEUE = 400  # results that may wait for an output: an hour at one every 10 s
+_RETRY_S = 0.5  # while an output is away
 _LATEST_START = 0.1  # of a period; a tick that would begin later is skipped
 _REMEMBERED = 1000
 
@@ -310,10 +313,9 @@ class OutputLoop:
         self.emitted = 0
         self.lost = 0
         self._output = output
-        self._queue: deque[Mapping[str, Any]] = deque()
-        self._changed = threading.Condition()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=f"output {name}", daemon=True)
+        self._queue: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=self.link.called, daemon=True)
 
     def start(self) -> None:
         """Start the thread; the output is opened in it."""
@@ -321,39 +323,27 @@ class OutputLoop:
 
     def put(self, result: Mapping[str, Any]) -> None:
         """Queue a result; returns at once."""
-        with self._changed:
-            if len(self._queue) >= _QUEUE:
-                self._queue.popleft()
+        if self._queue.qsize() >= _QUEUE:
+            with suppress(Empty):
+                self._queue.get_nowait()
                 self.lost += 1
-            self._queue.append(result)
-            self._changed.notify_all()
+        self._queue.put(result)
 
     def stop(self, grace_s: float) -> bool:
         """Emit the waiting results within the grace and close; False if that took too long."""
-        with self._changed:
-            self._stopping = True
-            self._changed.notify_all()
+        self._stopping.set()
+        self._queue.put(None)
         self._thread.join(grace_s)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         self.link.do(lambda: None)
-        while True:
-            with self._changed:
-                while not self._queue and not self._stopping:
-                    self._changed.wait(1.0)
-                if not self._queue:
+        while (result := self._queue.get()) is not None:
+            while not self.link.do(partial(self._output.emit, result)):
+                # it is kept until the output is back
+                if self.link.ended or self._stopping.wait(_RETRY_S):
+                    self.lost += 1
                     break
-                result = self._queue[0]
-            if self.link.do(partial(self._output.emit, result)):
-                self.emitted += 1
-            elif self._stopping or self.link.ended:
-                self.lost += 1
             else:
-                with self._changed:
-                    self._changed.wait(0.5)  # the result is kept until the output is back
-                continue
-            with self._changed:
-                if self._queue and self._queue[0] is result:
-                    self._queue.popleft()
+                self.emitted += 1
         self.link.close()

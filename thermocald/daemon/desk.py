@@ -10,7 +10,7 @@ import shutil
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -233,13 +233,15 @@ def listening_daemon(config: Config) -> Path | None:
     return None if ask(folder, "session status") is None else folder
 
 
+@dataclass(eq=False)
 class Progress:
-    """Prints a session's progress; total: its epochs; done: those of an earlier run."""
+    """Prints a session's progress; total: its epochs; shown: the last one printed or stored."""
 
-    def __init__(self, total: int, say: Callable[[str], None], done: int = 0) -> None:
-        self._total = total
-        self._say = say
-        self._shown = done
+    total: int
+    say: Callable[[str], None]
+    shown: int = 0
+
+    def __post_init__(self) -> None:
         self._printed_at = float("-inf")
         self._paused = False
 
@@ -249,15 +251,15 @@ class Progress:
         last: the last epoch's row, as outputs receive it; paused: why the session is paused, or "".
         """
         if paused and not self._paused:
-            self._say(f"paused: {paused}")
+            self.say(f"paused: {paused}")
         if self._paused and not paused:
-            self._say("the camera is back")
+            self.say("the camera is back")
         self._paused = bool(paused)
-        if not last or last["epoch"] <= self._shown:
+        if not last or last["epoch"] <= self.shown:
             return
-        self._shown = last["epoch"]
+        self.shown = last["epoch"]
         temperature = last.get("temperature")
-        line = f"epoch {last['epoch']} of {self._total}: "
+        line = f"epoch {last['epoch']} of {self.total}: "
         line += "" if temperature is None else f"{temperature:.2f} °C, "
         if last["status"] == "ok":
             line += f"c {with_sd(last['c'], last['sd_c'], 'mm')}, sigma0 {last['sigma0']:.2f}"
@@ -270,9 +272,9 @@ class Progress:
             room = shutil.get_terminal_size().columns - 1
             sys.stderr.write(f"\r\x1b[K{line[:room]}")
             sys.stderr.flush()
-        elif now - self._printed_at >= _LINE_EVERY_S or self._shown == self._total:
+        elif now - self._printed_at >= _LINE_EVERY_S or self.shown == self.total:
             self._printed_at = now
-            self._say(line)
+            self.say(line)
 
 
 def plan_separation(
@@ -332,16 +334,17 @@ def _describe(found: list[Experiment], names: tuple[str, str]) -> str:
     return "\n".join(lines)
 
 
+@dataclass(eq=False)
 class Watch:
     """Compares two effects by the epochs so far, in a thread, until they are separated."""
 
-    def __init__(
-        self, store: Path, session: Session, names: tuple[str, str],
-        evidence: SeriesInput | None, say: Callable[[str], None],
-    ) -> None:  # fmt: skip
-        self._store, self._session, self._names = store, session, names
-        self._evidence = evidence
-        self._say = say
+    store: Path
+    session: Session
+    names: tuple[str, str]
+    evidence: SeriesInput | None
+    say: Callable[[str], None]
+
+    def __post_init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, "separation")
         self._pending: Future[Separation] | None = None
         self._seen = 0
@@ -360,7 +363,7 @@ class Watch:
                 sentence = self.found.sentence
             except ThermocaldError as error:
                 sentence = str(error)
-            self._say(f"after {self._seen} epochs: {sentence}")
+            self.say(f"after {self._seen} epochs: {sentence}")
             self._pending = None
         if self._pending is None and taken >= max(_FEWEST, self._seen + _EVERY) and not self.ended:
             self._seen = taken
@@ -372,7 +375,7 @@ class Watch:
         self._pool.shutdown(wait=True, cancel_futures=True)
         if not self.ended:
             reached = self.found.sentence if self.found else "too few epochs"
-            self._say(f"not separated: {reached}")
+            self.say(f"not separated: {reached}")
 
     def _compare(self) -> Separation:
         from thermocald.discovery.experiment import compare_effects
@@ -380,9 +383,9 @@ class Watch:
         from thermocald.thermal.reduce import reduce_together
         from thermocald.thermal.source import epochs_input
 
-        with open_source(self._store) as store:
-            found = store.find_series(self._session.camera, self._session.series)
+        with open_source(self.store) as store:
+            found = store.find_series(self.session.camera, self.session.series)
             epochs = [s.epoch for s in store.epochs(found)]
-            now = epochs_input(found.head, found.testfield, epochs, self._session.series)
-        before = [] if self._evidence is None else [replace(self._evidence, camera=now.camera)]
-        return compare_effects(reduce_together([*before, now]), *self._names)
+            now = epochs_input(found.head, found.testfield, epochs, self.session.series)
+        before = [] if self.evidence is None else [replace(self.evidence, camera=now.camera)]
+        return compare_effects(reduce_together([*before, now]), *self.names)

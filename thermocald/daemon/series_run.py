@@ -333,9 +333,7 @@ class SeriesRun:
         epoch = calibrated.epoch
         result = EpochResult.from_adjustment(calibrated.adjustment)
         try:
-            self._guard.amend(
-                self._series, epoch.number, result, epoch.observations, calibrated.extra
-            )
+            self._guard.amend(self._series, calibrated, result)
         except StoreError as error:
             # that the store is away was logged once
             level = logging.DEBUG if self._guard.away else logging.WARNING

@@ -16,7 +16,7 @@ EPOCHS = EPOCHS_OF_A_BLOCK + 40
 
 def scene(count):
     """Return a calibrator and epochs of noisy image points."""
-    field = corner_field("plain", per_side=4, pitch_mm=150.0)
+    field = corner_field("plain", per_side=3, pitch_mm=200.0)
     model, rng = demonstration_model(field), np.random.default_rng(3)
     image = project(
         model.sensor, model.interior.as_array(), model.exterior.as_array(), field.points

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.test_page_attacks import Page
-from thermocald.errors import StoreError, ThermocaldError
+from thermocald.errors import ThermocaldError
 from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
@@ -103,22 +103,6 @@ class Chaos:
         said = f"{wrong} epochs are not right, and nothing says so: {victim} {self.count}"
         assert not wrong or named, said
 
-    def write_beside(self, rng, other: Path) -> None:
-        """Try to write by the store's name, a link or a hard link, and to read by a hard link."""
-        store = self.daemon.store
-        kind = ["name", "link", "hard link"][int(rng.integers(3))]
-        if kind == "link":
-            other.symlink_to(store)
-        elif kind == "hard link":
-            os.link(store, other)
-            with pytest.raises(StoreError, match="under another of its names"):
-                Store.open(other)
-        for name in {store, other} if kind != "name" else {store}:
-            with pytest.raises(StoreError, match="another thermocald process writes to it"):
-                Store.open(name, "append")
-        other.unlink(missing_ok=True)
-        self.note(f"second writers by {kind}")
-
     def note(self, what: str, happened: bool = True) -> None:
         self.count[what] = self.count.get(what, 0) + happened
 
@@ -155,8 +139,6 @@ def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path
                 attackers.append(page.slow("/api/series.csv?camera=rpi&series=watch"))
                 attackers.append(socket.create_connection(("127.0.0.1", page.port)))
             chaos.note("page attacks")
-        if rng.random() < 0.4:
-            chaos.write_beside(rng, tmp_path / "beside.db")
         if rng.random() < 0.3:
             files = sorted(p for p in chaos.folder.glob("thermocald.db*") if p.is_file())
             chosen = files if rng.random() < 0.5 else [files[int(rng.integers(len(files)))]]

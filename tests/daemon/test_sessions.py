@@ -195,26 +195,6 @@ def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon):
     assert series_of(daemon.store) == {}
 
 
-@pytest.mark.slow
-def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, live):
-    """Which steps the relay receives; the tests of drivers cover the relay itself."""
-    pytest.importorskip("gpiozero")
-    sections = devices(period_s=0.3, name="phone-1")
-    relay = {"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 60,
-             "programme": [{"seconds": 5, "hold_c": None}]}  # fmt: skip
-    sections["outputs"] = [relay]
-    daemon.configure(**sections)
-    daemon.start(GPIOZERO_PIN_FACTORY="mock")
-    daemon.until(lambda: daemon.ask("session status") is not None)
-    with pytest.raises(UsageError, match="hold_c"):
-        daemon.ask("session start", session={
-            **SESSION, "programme": [{"seconds": 10.0, "hold_c": 80.0}]})  # fmt: skip
-    steps = [{"seconds": 600.0, "hold_c": 45.0}]
-    daemon.ask("session start", session={**SESSION, "epochs": 4, "programme": steps})
-    daemon.until(lambda: daemon.session()["state"] == "done")
-    assert daemon.stop() == 0
-
-
 def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemon, devices):
     """Each session began with a new output, which had forgotten the limit."""
     pytest.importorskip("gpiozero")
@@ -226,6 +206,9 @@ def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemo
     daemon.start(GPIOZERO_PIN_FACTORY="mock")
     folder = daemon.store.with_name(daemon.store.name + ".live")
     daemon.until(lambda: ask(folder, "session status") is not None)
+    hot = [{"seconds": 10.0, "hold_c": 80.0}]
+    with pytest.raises(UsageError, match="hold_c"):
+        ask(folder, "session start", session={**SESSION, "programme": hot})
     started = ask(folder, "session start", session={**SESSION, "programme": steps, "epochs": 200})
     assert started["session"]["state"] == "checking"
     daemon.until(lambda: daemon.status()["outputs"]["lamp"]["device"] == "failed")

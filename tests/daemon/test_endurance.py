@@ -115,30 +115,6 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
         assert (np.diff(times) > 0).all()
 
 
-def test_half_a_day_on_a_disk_of_25_mb_loses_no_result(daemon, replayed, tmp_path, small_disk):
-    """Its observations and covariances alone would fill the disk."""
-    disk, epochs = small_disk(25), 4320
-    path = make_recording(tmp_path / "day", 300, per_side=7, interval=10.0)
-    daemon.store = disk / "thermocald.db"
-    sections = replayed(path, period_s=10.0)
-    sections["store"] = {"path": str(daemon.store), "durable": False}
-    sections["outputs"] = []
-    document = json.dumps({**sections, "frames": {"keep": "none"}})
-    run = fast_run(document, epochs)
-    done = subprocess.run(
-        [sys.executable, "-c", run],
-        cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert "observations no longer" in done.stderr
-    with Store.open(daemon.store) as store:
-        assert store.examine().damaged == ()
-        series = store.find_series()
-        columns = store.series_columns(series, ["epoch", "c", "sd_c", "status"])
-        assert columns["epoch"].astype(int).tolist() == list(range(1, epochs + 1))
-        assert np.isfinite(columns["c"]).all()
-        assert np.isfinite(columns["sd_c"]).all()
-
-
 def test_the_rhythm_holds_while_the_interpreter_is_busy():
     """p99 ≤ 5 ms; on a busy machine, no more than it delays a bare sleep."""
     before = sys.getswitchinterval()

@@ -28,12 +28,9 @@ def fill(folder: Path) -> None:
 
 
 @pytest.fixture
-def disk(request, daemon, measured):
-    """A small disk with the store of a configured daemon: in memory, or like a card."""
-    if getattr(request, "param", "memory") == "memory":
-        folder = request.getfixturevalue("small_disk")(40)
-    else:
-        _, folder = request.getfixturevalue("loop_disk")(40, "-m", "0")
+def disk(daemon, measured, small_disk):
+    """A small disk with the store of a configured daemon."""
+    folder = small_disk(40)
     daemon.store = folder / "thermocald.db"
     daemon.configure(**measured)
     return folder
@@ -53,7 +50,6 @@ def epochs_wait(daemon) -> bool:
     )
 
 
-@pytest.mark.parametrize("disk", mostly_slow(["memory", "card"], "memory"), indirect=True)
 def test_it_is_said_and_waited_for(daemon, disk):
     daemon.start()
     daemon.more(2)

@@ -36,7 +36,7 @@ from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.fleet.forward import Forwarder
-from thermocald.fleet.page import fleet_document
+from thermocald.fleet.overview import fleet_document
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings

@@ -34,7 +34,7 @@ def ear(tmp_path):
     folder = tmp_path / ("deep" * 30)  # longer than the limit of a socket address
     control = ControlSocket(folder, answer)
     control.ensure_open()
-    control.asked, control.folder = asked, folder
+    control.asked = asked
     yield control
     control.close()
     assert not (folder / "control.sock").exists()

@@ -23,7 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import (
@@ -37,7 +37,7 @@ from thermocald.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from thermocald.hal import Clock, Device, Kind, Output
+    from thermocald.hal import Clock, Kind, Output
 
     OnEvent = Callable[[float, str, str], None]
 
@@ -94,7 +94,6 @@ class Schedule:
 
 
 log = logging.getLogger(__name__)
-_T = TypeVar("_T")
 
 LinkState = Literal["closed", "open", "out", "failed", "finished"]
 
@@ -117,7 +116,7 @@ class Link:
 
     kind: Kind
     name: str
-    device: Device
+    device: Any
     clock: Clock
     period_s: float = 1.0
     on_event: OnEvent = lambda *_: None
@@ -157,7 +156,7 @@ class Link:
             if denied or isinstance(error, DeviceNotFound):
                 self._out(str(error), max(self.period_s, _SEARCH_PAUSE_S))
                 return False
-            self._ask("close", self.device.close, None)
+            self._ask("close", self.device.close)
             self.since = self.clock.utc()
             self.why = without_secrets(str(error))
             # the end of a recording is not a failure
@@ -177,17 +176,19 @@ class Link:
 
     def close(self) -> None:
         """Release the device."""
-        self._ask("close", self.device.close, None)
+        self._ask("close", self.device.close)
         if not self.ended:
             self.state = "closed"
 
     def identity(self) -> dict[str, str]:
         """Return the device's identity; empty if it cannot be read."""
-        return self._ask(
-            "identity", lambda: {str(k): str(v) for k, v in self.device.identity().items()}, {}
+        return dict(
+            self._ask(
+                "identity", lambda: {str(k): str(v) for k, v in self.device.identity().items()}, {}
+            )
         )
 
-    def _ask(self, method: str, call: Callable[[], _T], default: _T) -> _T:
+    def _ask(self, method: str, call: Callable[[], Any], default: Any = None) -> Any:
         """Call a method of the driver that should not fail; log once that it did."""
         try:
             return call()
@@ -207,7 +208,7 @@ class Link:
         self._pause_s = 0.0
 
     def _out(self, why: str, longest_s: float) -> None:
-        self._ask("close", self.device.close, None)
+        self._ask("close", self.device.close)
         why = without_secrets(why)  # a library may quote an address
         self.faults += 1
         self.why = why
@@ -233,14 +234,11 @@ class Link:
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
-        warnings: list[str] = []
         return {
             "device": "hung" if busy_s > hang_after_s else self.state,
             "why": self.why,
             "since": self.since,
-            "warnings": self._ask(
-                "warnings", lambda: [str(text) for text in self.device.warnings()], warnings
-            ),
+            "warnings": self._ask("warnings", lambda: list(map(str, self.device.warnings())), []),
             "faults": self.faults,
         }
 
@@ -312,7 +310,6 @@ class OutputLoop:
         self.link = Link("output", name, output, clock, on_event=on_event)
         self.emitted = 0
         self.lost = 0
-        self._output = output
         self._queue: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=self.link.called, daemon=True)
@@ -339,7 +336,7 @@ class OutputLoop:
     def _run(self) -> None:
         self.link.do(lambda: None)
         while (result := self._queue.get()) is not None:
-            while not self.link.do(partial(self._output.emit, result)):
+            while not self.link.do(partial(self.link.device.emit, result)):
                 # it is kept until the output is back
                 if self.link.ended or self._stopping.wait(_RETRY_S):
                     self.lost += 1

@@ -240,12 +240,9 @@ def enforce_retention(config: Config) -> list[str]:
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.machine import machine_clock_trusted
 
-    guard = StoreGuard(config.store.path)
-    try:
+    with contextlib.closing(StoreGuard(config.store.path)) as guard:
         now = time.time() if machine_clock_trusted() else None
         sentences = FrameFolder(config.frames).enforce(now)
         for sentence in sentences:
             guard.event(time.time(), "frames_deleted", sentence)
-    finally:
-        guard.close()
     return sentences

@@ -19,6 +19,7 @@ from thermocald.errors import ImageError, StoreError
 from thermocald.names import UNEVENTFUL
 from thermocald.photogrammetry.camera.camera_model import IOP, PARAMETER_NAMES, PRINCIPAL
 from thermocald.photogrammetry.camera.conversions import opencv_terms
+from thermocald.result import with_sds
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, StoredSeries
 
 if TYPE_CHECKING:
@@ -328,8 +329,7 @@ class SeriesRun:
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
         """Store a deferred calibration; delete a frame that was stored only for it."""
-        if self._series is None:
-            return
+        assert self._series is not None
         epoch = calibrated.epoch
         result = EpochResult.from_adjustment(calibrated.adjustment)
         try:
@@ -409,25 +409,20 @@ def result_row(
 
     temperature: °C, the reference thermometer's at `temperature_time`; missing numbers are NaN.
     """
-    reference = next(iter(epoch.temperatures.values()), math.nan)
-    row: dict[str, Any] = {
+    kept = result or EpochResult(NOT_CALIBRATED)
+    return {
         "device": plan.name,
         "series": plan.series,
         "epoch": epoch.number,
         "frame_time": epoch.frame_time,
         "temperature_time": epoch.temperature_time,
         **epoch.temperatures,
-        "temperature": reference,
-    }
-    kept = result or EpochResult(NOT_CALIBRATED)
-    row.update(zip(PARAMETER_NAMES, kept.values.tolist(), strict=True))
-    row.update(zip((f"sd_{n}" for n in PARAMETER_NAMES), kept.sd.tolist(), strict=True))
-    row.update(
-        sigma0=kept.sigma0,
-        n_observations=kept.n_observations,
-        n_rejected=len(kept.rejected),
-        status=kept.status,
-        reason=kept.reason,
+        "temperature": next(iter(epoch.temperatures.values()), math.nan),
+        **with_sds(PARAMETER_NAMES, kept.values, kept.sd),
+        "sigma0": kept.sigma0,
+        "n_observations": kept.n_observations,
+        "n_rejected": len(kept.rejected),
+        "status": kept.status,
+        "reason": kept.reason,
         **extra,
-    )
-    return row
+    }

@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import ValidationError
 
+from thermocald.acquisition.pipeline import check_frame
+from thermocald.config import in_words, parse_config
+from thermocald.daemon.control import DaemonBusy, ask
+from thermocald.daemon.live_state import find_state
+from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.session import Session
+from thermocald.daemon.systemd import set_up_logging
 from thermocald.errors import (
     ConfigurationError,
     DataError,
@@ -23,14 +31,17 @@ from thermocald.errors import (
     ThermocaldError,
     UsageError,
 )
+from thermocald.files import read_yaml
+from thermocald.hal import SystemClock, load_driver, open_device
 from thermocald.numbers import with_sd
+from thermocald.store.database.store import Store
+from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from concurrent.futures import Future
 
     from thermocald.config import Config
-    from thermocald.daemon.session import Session
     from thermocald.daemon.station import Station
     from thermocald.discovery.experiment import Experiment, Separation
     from thermocald.thermal.series import SeriesInput
@@ -51,7 +62,6 @@ def take_on_the_desk(
     watch: ends the session when its effects are separated. Raises DataError if epochs are missing.
     """
     from thermocald.daemon.service import Service
-    from thermocald.daemon.systemd import set_up_logging
 
     done, epochs = _stored(config, session), session.epochs
     read = _prepare(config, session, done)
@@ -89,9 +99,6 @@ def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
 
 def _prepare(config: Config, session: Session, done: int) -> Config:
     """Return the configuration with the session's camera and series and its thermometers."""
-    from thermocald.config import parse_config
-    from thermocald.hal import load_driver
-
     document = config.model_dump(mode="python", by_alias=True)
     chosen = next(c for c in document["cameras"] if c["name"] == session.camera)
     chosen["series"] = session.series
@@ -109,8 +116,6 @@ def _prepare(config: Config, session: Session, done: int) -> Config:
 
 
 def _stored(config: Config, session: Session) -> int:
-    from thermocald.store.database.store import Store
-
     if not config.store.path.exists():
         return 0
     with Store.open(config.store.path) as store:
@@ -120,10 +125,6 @@ def _stored(config: Config, session: Session) -> int:
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
-    from thermocald.acquisition.pipeline import check_frame
-    from thermocald.daemon.plan import plan_cameras
-    from thermocald.hal import SystemClock, open_device
-
     clock = SystemClock()
     for one in config.thermometers:
         with open_device("thermometer", one.driver, one.options, clock) as thermometer:
@@ -145,8 +146,6 @@ def take_in_the_daemon(
     watch: Watch | None = None,
 ) -> None:  # fmt: skip
     """Let a running daemon take the session, and report its progress if `wait`."""
-    from thermocald.daemon.control import DaemonBusy, ask
-
     answer = ask(folder, "session start", session=session.model_dump(mode="json"))
     if answer is None:
         raise DataError("the daemon was just stopped; repeat the command")
@@ -205,12 +204,6 @@ def session_of(
     programme: Path | None, check: bool,
 ) -> Session:  # fmt: skip
     """Return the requested session; raises UsageError or ConfigurationError."""
-    from pydantic import ValidationError
-
-    from thermocald.config import in_words
-    from thermocald.daemon.session import Session
-    from thermocald.files import read_yaml
-
     request: dict[str, Any] = {"camera": only_camera(config, camera), "series": series}
     request |= {"start": condition, "epochs": epochs, "check": check}
     if programme is not None:
@@ -226,9 +219,6 @@ def session_of(
 
 def listening_daemon(config: Config) -> Path | None:
     """Return the live folder of the daemon that writes this store; None if none listens."""
-    from thermocald.daemon.control import ask
-    from thermocald.daemon.live_state import find_state
-
     folder = find_state(config.store.path)
     return None if ask(folder, "session status") is None else folder
 
@@ -294,7 +284,6 @@ def plan_separation(
         rank_experiments,
         read_alternatives,
     )
-    from thermocald.hal import load_driver
 
     if session.programme:
         raise UsageError("--until-separated plans the programme; omit --programme")
@@ -379,7 +368,6 @@ class Watch:
 
     def _compare(self) -> Separation:
         from thermocald.discovery.experiment import compare_effects
-        from thermocald.store.sources import open_source
         from thermocald.thermal.reduce import reduce_together
         from thermocald.thermal.source import epochs_input
 

@@ -5,18 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, calibrated_epochs
+from thermocald.acquisition import calibrator as module
+from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
 
-EPOCHS = EPOCHS_OF_A_BLOCK + 40
+BLOCK = 12
+
+
+@pytest.fixture(autouse=True)
+def _short_blocks(monkeypatch):
+    monkeypatch.setattr(module, "EPOCHS_OF_A_BLOCK", BLOCK)
 
 
 def scene(count):
     """Return a calibrator and epochs of noisy image points."""
-    field = corner_field("plain", per_side=3, pitch_mm=200.0)
+    field = corner_field("plain", per_side=4, pitch_mm=150.0)
     model, rng = demonstration_model(field), np.random.default_rng(3)
     image = project(
         model.sensor, model.interior.as_array(), model.exterior.as_array(), field.points
@@ -44,8 +50,8 @@ def test_a_repeated_frame_is_no_new_observation():
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_block_knows_the_frame_before_it(jobs):
     """A daemon calibrates without blocks, and says of a replayed series what a replay says."""
-    calibrator, epochs = scene(EPOCHS_OF_A_BLOCK + 2)
-    first = EPOCHS_OF_A_BLOCK
+    calibrator, epochs = scene(BLOCK + 2)
+    first = BLOCK
     epochs[first] = replace(epochs[first - 1], number=first)
     done = list(calibrated_epochs(calibrator(), epochs, jobs))[first - 1 :]
     assert [d.adjustment.status for d in done] == ["ok", "repeated_frame", "ok"]
@@ -62,9 +68,9 @@ def test_an_epoch_that_is_calibrated_late_is_not_the_last_one():
 
 
 def test_processes_do_not_matter():
-    calibrator, epochs = scene(EPOCHS)
+    calibrator, epochs = scene(3 * BLOCK + 4)
     one, two = (list(calibrated_epochs(calibrator(), epochs, jobs)) for jobs in (1, 2))
-    assert [done.epoch.number for done in two] == list(range(EPOCHS))
+    assert [done.epoch.number for done in two] == list(range(3 * BLOCK + 4))
     for a, b in zip(one, two, strict=True):
         assert a.adjustment.ok
         np.testing.assert_array_equal(b.adjustment.values, a.adjustment.values)

@@ -50,7 +50,7 @@ def load(stop: threading.Event) -> None:
 
 def scheduled(ticks: int, work_s: float) -> tuple[list[float], float, int]:
     """Return (lateness s, drift s, skipped ticks) of the daemon's schedule."""
-    schedule = Schedule(SystemClock(), PERIOD_S)
+    schedule = Schedule(SystemClock(), PERIOD_S, time.monotonic())
     late, last = [], None
     for _ in range(ticks):
         last = schedule.wait()
@@ -95,7 +95,7 @@ def rhythm(ticks: int) -> None:
 
 def virtual_day() -> None:
     clock = VirtualClock()
-    schedule = Schedule(clock, 10.0)
+    schedule = Schedule(clock, 10.0, clock.monotonic())
     rng = np.random.default_rng(1)
     late = []
     for _ in range(8640):
@@ -112,8 +112,11 @@ def virtual_day() -> None:
 def epoch_cost(epochs: int) -> None:
     """Measure the steps from an 8 MP frame to the store, on one thread."""
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.daemon.epoch_keeper import EpochKeeper
+    from thermocald.acquisition.steady_clock import SteadyClock
+    from thermocald.acquisition.thermometers import Thermometers
+    from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import mock_config, plan_cameras, running_series
+    from thermocald.daemon.series_run import Runtime, SeriesRun
     from thermocald.daemon.store_guard import StoreGuard
 
     clock = VirtualClock()
@@ -122,7 +125,9 @@ def epoch_cost(epochs: int) -> None:
         plan = replace(plan_cameras(config, clock)[0], series="bench")
         thermometer = open_device("thermometer", "mock", {"seed": 2}, clock)
         guard = StoreGuard(Path(folder) / "t.db", durable=True)
-        keeper = EpochKeeper(plan, guard, FrameFolder(config.frames), lambda *_: None)
+        runtime = Runtime(guard, SteadyClock(clock), LiveState(Path(folder)))
+        thermometers, frames = Thermometers(config, clock), FrameFolder(config.frames)
+        run = SeriesRun(plan, runtime, thermometers, frames, [], dict)
         assert plan.sensor is not None
         assert plan.testfield is not None
         observer = OnlineObserver(plan.sensor, plan.testfield, lambda *_: None)
@@ -155,7 +160,7 @@ def epoch_cost(epochs: int) -> None:
                 e = time.thread_time()
                 item = AcquiredEpoch(k + 1, frame, True, calibrated.epoch)
                 item.calibrated = calibrated
-                keeper.keep(item)
+                run.keep(item)
                 d = time.thread_time()
                 skew.append(epoch.temperature_time - epoch.frame_time)
                 if k:  # the whole first frame is searched

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,11 +33,11 @@ from psutil import Process
 
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
 from tests.fleet.conftest import new_cluster
-from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
+from tests.fleet.dask_cluster import DaskCluster
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.fleet.forward import Forwarder
-from thermocald.fleet.page import fleet_document
+from thermocald.fleet.overview import fleet_document
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -53,6 +54,21 @@ STUDIED = 8760  # epochs of the studied year: one per hour
 FRAMES = 20  # per recording that the workers measure again
 YEAR_S = 365 * 86400.0
 NAMES = ["epoch", "frame_time", "c", "x0", "y0", "sd_c", "sigma0", "temperature"]
+
+
+def write_frame_archive(folder: Path, recordings: int, frames: int) -> None:
+    """Write recordings M00, M01 … of the same rendered 8 MP frames, which are stored once."""
+    simulation = preset_simulation("rpi-v2.1-heating", 1, "M00")
+    programme = replace(simulation.programme, epochs=frames)
+    first = folder / "M00"
+    replace(simulation, programme=programme).write(first, with_frames=True)
+    for i in range(1, recordings):
+        other = folder / f"M{i:02d}"
+        shutil.copytree(first, other, copy_function=os.link)
+        head = other / "recording.yaml"
+        text = head.read_text().replace("M00", other.name)
+        head.unlink()
+        head.write_text(text)
 
 
 def timed(call):

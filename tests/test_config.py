@@ -128,6 +128,12 @@ BAD = [
     (document(dashboard={"port": 70000}), "dashboard.port: is 70000"),
     (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
     (document(cameras="none"), "cameras: is 'none'"),
+    (camera(thermal_model="m", testfield="f"), "either `testfield` or `thermal_model`"),
+    (camera(thermal_model="m", thermometers=[]), "`thermal_model` needs `thermometers`"),
+    (camera(thermal_model="m.yaml"), "cameras[0].thermal_model: there is no file"),
+    (camera(mount_sd_deg=0.01), "`mount_sd_deg` needs a `thermal_model`"),
+    (camera(thermal_model="m", control_reference="r"), "`control_reference` needs `control_point"),
+    (document(frames={"corrected": True}), "corrected needs a camera with a thermal_model"),
     (document(cameras=[{"name": "a", "driver": "m"}] * 2), "cameras: the name 'a' is duplicated"),
     (document(cameras=[{"name": "status", "driver": "m"}]), "choose another name"),
 ]

@@ -19,7 +19,7 @@ from tests.store.small import write_recording
 from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline
 from thermocald.acquisition.thermometers import Thermometers, require_columns
 from thermocald.config import parse_config
-from thermocald.daemon.epoch_keeper import result_row
+from thermocald.daemon.series_run import result_row
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice
 from thermocald.hal import Frame, Reading, VirtualClock, open_device
@@ -168,7 +168,7 @@ def test_the_reference_keeps_its_place_when_it_is_not_read():
     thermometers = Thermometers(parse_config(document, Path("config.yaml")), clock)
     thermometers.add("air", Reading({"temperature": 12.0}, 0.0, clock.utc()))
     kept: list[AcquiredEpoch] = []
-    keeper = SimpleNamespace(keep=kept.append, amend=None, backlog=lambda below: None)
+    keeper = SimpleNamespace(keep=kept.append, backlog=lambda below: None)
     names = ["housing", "air"]
     pipeline = Pipeline("cam", None, thermometers, names, keeper, clock, patience_s=0.0)
     pipeline.start()

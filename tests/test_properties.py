@@ -1,5 +1,6 @@
-"""Random configurations, recordings and logger files: refused with one line, or
-right, or reported as doubtful. Few examples here, thousands in the slow suite.
+"""Random configurations and logger files: refused with one line, or right.
+
+Few examples here, thousands in the slow suite.
 """
 
 from __future__ import annotations
@@ -8,8 +9,6 @@ import contextlib
 import copy
 import math
 import re
-import shutil
-import time
 from datetime import UTC, datetime, timedelta, timezone
 from functools import reduce
 from operator import getitem
@@ -20,7 +19,6 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-import thermocald as tc
 from thermocald.config import Config, load_config, parse_config
 from thermocald.errors import ConfigurationError, ThermocaldError
 from thermocald.files import dump_yaml
@@ -38,9 +36,6 @@ AMOUNTS = pytest.mark.parametrize(
         pytest.param({**FEW, "max_examples": 2000}, id="many", marks=pytest.mark.slow),
     ],
 )
-
-
-_RECORDINGS_S = 200.0  # at most
 
 
 def one_line(error: ThermocaldError) -> None:
@@ -144,119 +139,6 @@ def test_any_key_in_a_configuration(amount, tmp_path):
         one_line(caught.value)
 
     check()
-
-
-# --- recordings --------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    """A recording of 12 epochs, its tables, and its calibration."""
-    path = tmp_path_factory.mktemp("recorded") / "M"
-    tc.simulate("rpi-v2.1-heating", seed=5, out=path)
-    tables = {}
-    for name in ("epochs.csv", "observations.csv", "testfield.csv"):
-        header, *rows = [line.split(",") for line in (path / name).read_text().splitlines()]
-        if name != "testfield.csv":
-            rows = [row for row in rows if int(row[0]) <= 12]
-        tables[name] = (header, rows)
-        write(path / name, header, rows)
-    return path, tables, tc.open(path).calibrate()
-
-
-def write(path: Path, header: list[str], rows: list[list[str]]) -> None:
-    path.write_text("".join(",".join(row) + "\n" for row in [header, *rows]))
-
-
-def times(factor: float, shift: float = 0.0):
-    return lambda text: f"{float(text) * factor + shift:.15g}" if text else text
-
-
-MEANINGS = st.one_of(
-    st.sampled_from([1e3, 1e-3, 1e6, 1e9, 0.5, 2.0, -1.0, 1 / 60, 25.4, 0.00112, 1e-300]).map(
-        times
-    ),
-    st.sampled_from([1.8, 1.0]).map(lambda f: times(f, 32.0 if f > 1 else 273.15)),
-    st.sampled_from(["85.0", "0", "-1", "1e308", "1e-300", "-127.0", "", "nan", "1e5", "4e9"]).map(
-        lambda value: lambda _: value
-    ),
-)
-COLUMNS = [
-    ("observations.csv", "x"), ("observations.csv", "y"), ("observations.csv", "sx"),
-    ("observations.csv", "sy"), ("epochs.csv", "frame_time"), ("epochs.csv", "temperature_time"),
-    ("epochs.csv", "temperature"), ("testfield.csv", "X"), ("testfield.csv", "Z"),
-    ("testfield.csv", "sY"),
-]  # fmt: skip
-SPANS = st.tuples(st.floats(0, 1), st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]))
-HEADS = st.one_of(
-    st.none(),
-    st.tuples(
-        st.sampled_from(["width", "height", "pixel_pitch", "principal_distance", "interval"]),
-        st.sampled_from([0.5, 2.0, 10.0, 0.1, 1e300, 1e-300, -1.0]),
-    ),
-)
-
-
-@pytest.mark.slow
-def test_any_other_meaning_of_a_recording(recorded, tmp_path):
-    """A column in another unit or with other values, in all rows or some: the calibration agrees
-    with the original, or the recording is refused, or a doubt is reported.
-    """
-    source, tables, right = recorded
-    folder = tmp_path / "M"
-    tried: list[int] = []
-
-    end = time.monotonic() + _RECORDINGS_S
-
-    # each costs a series
-    @settings(**{**FEW, "max_examples": 343})
-    @given(st.sampled_from(COLUMNS), MEANINGS, SPANS, HEADS)
-    def check(place, meaning, span, head):
-        if time.monotonic() > end:
-            return
-        tried.append(1)
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(source, folder)
-        name, column = place
-        header, rows = tables[name]
-        k = header.index(column)
-        first = round(span[0] * len(rows))
-        stop = first + max(1, round(span[1] * len(rows)))
-        changed = [
-            [*row[:k], meaning(row[k]), *row[k + 1 :]] if first <= i < stop else row
-            for i, row in enumerate(rows)
-        ]
-        write(folder / name, header, changed)
-        if head is not None:
-            text = (folder / "recording.yaml").read_text()
-            found = re.search(rf"{head[0]}: ([\d.]+)", text)
-            value = float(found[1]) * head[1]
-            stated = (
-                str(int(value)) if head[0] in ("width", "height") and abs(value) < 1e9 else value
-            )
-            (folder / "recording.yaml").write_text(
-                text.replace(found[0], f"{head[0]}: {stated}", 1)
-            )
-        try:
-            series = tc.open(folder)
-            epochs = series.calibrate()
-        except ThermocaldError as error:
-            one_line(error)
-            return
-        if not epochs.ok.all() or series.doubts(epochs):
-            return
-        if np.nanmedian(epochs.sigma0) > 5.0 * np.nanmedian(right.sigma0):
-            return  # printed as: the image points' scatter over the stated one
-        pitch = series.head.camera.sensor.pixel_pitch / 0.00112
-        values, sds = np.median(epochs.values, axis=0), np.median(epochs.sd, axis=0)
-        assert 0.8 < values[0] / 3.04 < 1.25
-        for i in range(3):
-            true = float(np.median(right.values[:, i])) * pitch
-            allowed = 8.0 * max(sds[i], np.median(right.sd[:, i]) * pitch) + 0.1 * abs(pitch - 1.0)
-            assert abs(values[i] - true) < max(allowed, 0.01)
-
-    check()
-    assert len(tried) > 8  # else nothing was shown
 
 
 # --- logger files ------------------------------------------------------------------------

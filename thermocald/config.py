@@ -63,12 +63,10 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _suggest(cls, data: Any) -> Any:
-        if isinstance(data, dict) and cls.model_config["extra"] == "forbid":
-            for key in data:
-                if key not in cls.model_fields:
-                    raise _of_key(str(key), f"unknown{nearest(str(key), list(cls.model_fields))}")
         for key, value in data.items() if isinstance(data, dict) else ():
             known = cls.model_fields.get(key)
+            if known is None and cls.model_config["extra"] == "forbid":
+                raise _of_key(str(key), f"unknown{nearest(str(key), list(cls.model_fields))}")
             if isinstance(value, bool) and known and _is_number(known.annotation):
                 message = f"is {value}, as YAML reads yes, no, on, off; a number is needed"
                 raise _of_key(key, message)

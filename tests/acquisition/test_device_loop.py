@@ -14,7 +14,7 @@ from thermocald.hal import VirtualClock, open_device
 
 def test_a_day_of_ticks_has_no_drift():
     clock = VirtualClock(monotonic=1234.567)
-    schedule = Schedule(clock, 10.0)
+    schedule = Schedule(clock, 10.0, clock.monotonic())
     rng_s = [0.013 * (k % 500) for k in range(8640)]  # work of up to 6.5 s
     starts = []
     for work_s in rng_s:
@@ -29,7 +29,7 @@ def test_a_day_of_ticks_has_no_drift():
 
 def test_a_late_tick_is_skipped_and_counted_and_the_rhythm_stays():
     clock = VirtualClock()
-    schedule = Schedule(clock, 10.0)
+    schedule = Schedule(clock, 10.0, clock.monotonic())
     indices, skipped = [], []
     for work_s in (1.0, 27.0, 1.0, 10.5, 1.0, 11.5):
         indices.append(schedule.wait())

@@ -29,6 +29,17 @@ def frame(encoded: bytes | None = None) -> Frame:
     return Frame(image, 0.0, 0.0, encoded=encoded)
 
 
+def test_the_frames_that_are_wanted_are_kept(folder_of):
+    def wanted(eventful=False, **options):
+        folder = folder_of(**options)
+        return [number for number in range(1, 11) if folder.wanted(number, eventful)]
+
+    every = list(range(1, 11))
+    assert wanted(keep="all") == wanted(keep="events", eventful=True) == every
+    assert wanted(keep="events") == wanted(keep="none", eventful=True) == []
+    assert wanted(keep="every_n", every_n=5) == [5, 10]
+
+
 def test_a_jpeg_stays_as_it_came_and_grey_values_lose_nothing(folder_of):
     folder = folder_of()
     jpeg = folder.keep("cam", "M1", 1234, frame(b"\xff\xd8 as it came \xff\xd9"))

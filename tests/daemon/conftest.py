@@ -308,26 +308,6 @@ def small_disk(tmp_path: Path):
         tool("umount", "-l", folder)
 
 
-@pytest.fixture
-def loop_disk(tmp_path: Path):
-    """MB, options of mkfs and mount → (image, folder) of an ext4 disk in a file, like a card."""
-    image, folder = tmp_path / "disk.img", tmp_path / "card"
-
-    def mount(size_mb: int, *mkfs: str, options: str = "loop") -> tuple[Path, Path]:
-        if os.geteuid() or not all(map(shutil.which, ("mkfs.ext4", "mount"))):
-            pytest.skip("needs root, mount and mkfs.ext4")
-        folder.mkdir()
-        image.write_bytes(bytes(size_mb * 1_000_000))
-        made = tool("mkfs.ext4", "-q", *mkfs, image).returncode
-        if made or tool("mount", "-o", options, image, folder).returncode:
-            pytest.skip("no file system can be mounted from a file here")
-        return image, folder
-
-    yield mount
-    while folder.is_mount():
-        subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
 class Supervisor:
     """The notification socket, in place of systemd's."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import random
 import shutil
 import socket
 import stat
@@ -33,7 +34,7 @@ def ear(tmp_path):
     folder = tmp_path / ("deep" * 30)  # longer than the limit of a socket address
     control = ControlSocket(folder, answer)
     control.ensure_open()
-    control.asked, control.folder = asked, folder
+    control.asked = asked
     yield control
     control.close()
     assert not (folder / "control.sock").exists()
@@ -142,19 +143,13 @@ def test_what_is_not_understood_is_refused_and_does_nothing(ear, data):
     assert ask(ear.folder, "session status") is not None
 
 
-def test_a_line_that_never_ends_is_cut(ear):
+def test_endless_lines_and_random_bytes_never_end_it(ear):
     answer = say(ear, b'{"format": "' + b"x" * 70000)
     assert "longer than 65536" in answer["error"]
-
-
-def test_random_bytes_never_end_it(ear):
-    import numpy as np
-
-    rng = np.random.default_rng(4)
-    for _ in range(200):
-        data = rng.bytes(int(rng.integers(1, 300))).replace(b"\n", b"") + b"\n"
+    rng = random.Random(4)
+    for _ in range(50):
+        data = rng.randbytes(rng.randrange(1, 300)).replace(b"\n", b"") + b"\n"
         assert say(ear, data)["ok"] is False
-    assert threading.active_count() >= 2
     assert ear.asked == []
 
 

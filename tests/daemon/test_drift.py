@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from thermocald.daemon.camera_line import START_EPOCHS, drift_columns
+from thermocald.daemon.series_run import START_EPOCHS, drift_columns
 
 
 def rows(c, sd=1e-4, status="ok"):

@@ -125,34 +125,6 @@ def test_posed_epochs_are_those_of_the_rendered_camera_and_kept_frames_stand_the
     assert {f"{n}.png" for n in numbers} <= {e.epoch.frame.name for e in epochs if e.epoch.frame}
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"testfield": "{model}"}, "either `testfield` or `thermal_model`"),
-     ({"thermometers": []}, "needs `thermometers`"),
-     ({"control_points": "none.csv"}, "there is no file"),
-     ({"thermal_model": None, "mount_sd_deg": 0.01}, "needs a `thermal_model`"),
-     ({"control_reference": "{model}"}, "needs `control_points`")],
-)  # fmt: skip
-def test_what_does_not_go_together_is_said(daemon, devices, thermal_model, options, words):
-    options = {k: v.format(model=thermal_model) if isinstance(v, str) else v
-               for k, v in options.items()}  # fmt: skip
-    document = at_work(devices, thermal_model)
-    document["cameras"][0] |= options
-    daemon.configure(**document)
-    refused(daemon, words)
-
-
-def refused(daemon, words: str) -> None:
-    done = call("check", daemon.config)
-    assert done.returncode == 2
-    assert words in " ".join(done.stderr.split())
-
-
-def test_corrected_frames_need_a_thermal_model(daemon, devices):
-    daemon.configure(**devices() | {"frames": {"corrected": True}})
-    refused(daemon, "frames.corrected needs a camera with a thermal_model")
-
-
 RIVER = Path(__file__).resolve().parents[2] / "examples" / "river"
 
 

@@ -13,7 +13,9 @@ import yaml
 
 from tests.commands import call
 from thermocald.daemon.control import ask
+from thermocald.daemon.desk import Watch, take_in_the_daemon
 from thermocald.daemon.session import Session
+from thermocald.discovery.experiment import Separation
 from thermocald.errors import DataError, UsageError
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
@@ -195,26 +197,6 @@ def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon):
     assert series_of(daemon.store) == {}
 
 
-@pytest.mark.slow
-def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, live):
-    """Which steps the relay receives; the tests of drivers cover the relay itself."""
-    pytest.importorskip("gpiozero")
-    sections = devices(period_s=0.3, name="phone-1")
-    relay = {"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 60,
-             "programme": [{"seconds": 5, "hold_c": None}]}  # fmt: skip
-    sections["outputs"] = [relay]
-    daemon.configure(**sections)
-    daemon.start(GPIOZERO_PIN_FACTORY="mock")
-    daemon.until(lambda: daemon.ask("session status") is not None)
-    with pytest.raises(UsageError, match="hold_c"):
-        daemon.ask("session start", session={
-            **SESSION, "programme": [{"seconds": 10.0, "hold_c": 80.0}]})  # fmt: skip
-    steps = [{"seconds": 600.0, "hold_c": 45.0}]
-    daemon.ask("session start", session={**SESSION, "epochs": 4, "programme": steps})
-    daemon.until(lambda: daemon.session()["state"] == "done")
-    assert daemon.stop() == 0
-
-
 def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemon, devices):
     """Each session began with a new output, which had forgotten the limit."""
     pytest.importorskip("gpiozero")
@@ -226,6 +208,9 @@ def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemo
     daemon.start(GPIOZERO_PIN_FACTORY="mock")
     folder = daemon.store.with_name(daemon.store.name + ".live")
     daemon.until(lambda: ask(folder, "session status") is not None)
+    hot = [{"seconds": 10.0, "hold_c": 80.0}]
+    with pytest.raises(UsageError, match="hold_c"):
+        ask(folder, "session start", session={**SESSION, "programme": hot})
     started = ask(folder, "session start", session={**SESSION, "programme": steps, "epochs": 200})
     assert started["session"]["state"] == "checking"
     daemon.until(lambda: daemon.status()["outputs"]["lamp"]["device"] == "failed")
@@ -238,49 +223,37 @@ def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemo
 
 
 @pytest.mark.slow
-def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, live):
-    """The command plans and watches, the daemon takes the epochs; see also `test_closed_loop`."""
-    pytest.importorskip("gpiozero")
-    from thermocald.config import parse_config
-    from thermocald.daemon.desk import plan_separation, take_in_the_daemon
-    from thermocald.discovery.experiment import Separation
-
-    sections = devices(period_s=0.3, name="phone-1")
-    sections["outputs"] = [{"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 60,
-                            "programme": [{"seconds": 5, "hold_c": None}]}]  # fmt: skip
-    daemon.configure(**sections)
-    config = parse_config(yaml.safe_load(daemon.config.read_text()), daemon.config)
-    asked = Session.model_validate({**SESSION, "epochs": 4000, "check": False})
+def test_a_session_in_the_daemon_ends_when_the_effects_are_separated(live, daemon):
+    """The command watches, the daemon takes the epochs; see also `test_session_separate`."""
+    live()
+    session = Session.model_validate({**SESSION, "epochs": 4000, "check": False})
     said: list[str] = []
-    _, session, watch = plan_separation(
-        config, asked, "creep,slip", None, said.append, 40.0, 2.0, 0.8
-    )
-    assert max(s.hold_c for s in session.programme if s.hold_c) <= 40.0
-    watch._store = daemon.store
+    watch = Watch(daemon.store, session, ("creep", "slip"), None, said.append)
     watch._compare = lambda: Separation("creep", "slip", 55.0, 14.0, True)
     enough, look = 6, watch.look
     watch.look = lambda taken: look(taken + 40) if taken >= enough else False
-    daemon.start(GPIOZERO_PIN_FACTORY="mock")
-    daemon.until(lambda: daemon.ask("session status") is not None)
-
     take_in_the_daemon(daemon.live, session, True, said.append, watch)
     watch.close()
-
     daemon.until(lambda: daemon.session()["state"] == "stopped")
     assert enough <= daemon.session()["taken"] < 100
     assert watch.ended
     assert daemon.stop() == 0
 
 
-@pytest.mark.slow
-def test_reload_leaves_a_session_alone(live, daemon):
-    live()
+def reload(daemon, **changes) -> None:
+    """Change the camera's section of the configuration while a session runs."""
     daemon.ask("session start", session={**SESSION, "epochs": 12, "check": False})
     daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
     document = yaml.safe_load(daemon.config.read_text())
-    document["logging"] = {"level": "debug"}
+    document["cameras"][0] |= changes
     daemon.config.write_text(yaml.safe_dump(document))
     daemon.signal(signal.SIGHUP)
+
+
+@pytest.mark.slow
+def test_reload_leaves_a_session_alone(live, daemon):
+    live()
+    reload(daemon, seed=2)
     daemon.until(lambda: daemon.session().get("state") == "done")
     assert "the configuration was read again" in daemon.log()
     assert daemon.stop() == 0
@@ -290,12 +263,7 @@ def test_reload_leaves_a_session_alone(live, daemon):
 def test_a_session_whose_camera_is_gone_has_the_epochs_that_it_took(live, daemon):
     """It was "0 of 40 epochs, stopped"."""
     live()
-    daemon.ask("session start", session={**SESSION, "epochs": 40, "check": False})
-    daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
-    document = yaml.safe_load(daemon.config.read_text())
-    document["cameras"][0]["name"] = "phone-2"
-    daemon.config.write_text(yaml.safe_dump(document))
-    daemon.signal(signal.SIGHUP)
+    reload(daemon, name="phone-2")
     daemon.until(lambda: daemon.session().get("state") == "stopped")
     session = daemon.session()
     assert "there are: phone-2" in session["why"]

@@ -87,17 +87,10 @@ def test_everything_is_installed_where_it_belongs(tmp_path):
     script = ["sh", str(UNITS / "install.sh")]
     subprocess.run(script, env=environment, check=True, capture_output=True)
     files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    units = {p.name for p in UNITS.iterdir() if p.suffix in (".service", ".timer")}
+    assert len(units) == 10
     assert files == {
-        "etc/systemd/system/thermocald.service",
-        "etc/systemd/system/thermocald@.service",
-        "etc/systemd/system/thermocald-archive.service",
-        "etc/systemd/system/thermocald-archive.timer",
-        "etc/systemd/system/thermocald-backup.service",
-        "etc/systemd/system/thermocald-backup.timer",
-        "etc/systemd/system/thermocald-dashboard.service",
-        "etc/systemd/system/thermocald-dashboard@.service",
-        "etc/systemd/system/thermocald-forward.service",
-        "etc/systemd/system/thermocald-forward@.service",
+        *(f"etc/systemd/system/{name}" for name in units),
         "etc/thermocald/config.yaml",
         "etc/udev/rules.d/60-thermocald.rules",
         "usr/lib/sysusers.d/thermocald.conf",

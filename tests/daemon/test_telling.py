@@ -1,24 +1,16 @@
-"""Reports to the outside: the journal's fields, `thermocald status` and `top` in a terminal."""
+"""Reports to the outside: the journal's fields, and `thermocald status`."""
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-import pty
-import re
-import select
-import signal
 import socket
-import subprocess
-import sys
 import time
 from functools import partial
 
 import pytest
 
 from tests.commands import call
-from tests.daemon.conftest import ENVIRONMENT
 from thermocald.daemon.systemd import JournalHandler
 
 
@@ -130,63 +122,12 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
     assert found["device_out"]["THERMOCALD_THREAD"] == "camera one"
 
 
-def in_a_terminal(daemon, seconds: float, *options: str, key: bytes = b"") -> tuple[str, int]:
-    """Return what a command draws in a terminal of 80 columns until a key, or Ctrl-C, ends it."""
-    terminal, inner = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "thermocald", *options], cwd=daemon.folder,
-        env={**ENVIRONMENT, "COLUMNS": "80", "LINES": "40", "TERM": "xterm"},
-        stdin=inner, stdout=inner, stderr=inner,
-    )  # fmt: skip
-    os.close(inner)
-    seen, end, interrupted = b"", time.monotonic() + 90, False
-    until = end
-    while process.poll() is None and time.monotonic() < end:
-        if select.select([terminal], [], [], 0.1)[0]:
-            try:
-                seen += os.read(terminal, 65536)
-            except OSError:
-                break
-        if until == end and "σ₀".encode() in seen:
-            until = time.monotonic() + seconds
-        if not interrupted and time.monotonic() > until:
-            interrupted = True
-            if key:
-                os.write(terminal, key)
-            else:
-                process.send_signal(signal.SIGINT)
-    try:
-        status = process.wait(30)  # the terminal closes before the process ends
-    except subprocess.TimeoutExpired:
-        process.kill()
-        status = process.wait()
-    os.close(terminal)
-    return seen.decode(errors="replace"), status
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("key", [b"q", b""], ids=["q", "Ctrl-C"])
-def test_top_is_always_up_to_date(daemon, devices, key):
-    daemon.run(**devices())
-    daemon.more(3)
-    seen, status = in_a_terminal(daemon, 5.0, "top", "--store", str(daemon.store),
-                                 "--interval", "0.3", key=key)  # fmt: skip
-    assert daemon.stop() == 0
-    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", seen)
-    epochs = [int(n) for n in re.findall(r"one/watch: (?:open|hung|out), epoch (\d+)", plain)]
-    assert epochs == sorted(epochs)
-    assert epochs[-1] > epochs[0]
-    assert "housing" in plain
-    assert status == 0
-    assert "Traceback" not in plain
-
-
 def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, measured):
     status = partial(call, "status", "--store", daemon.store)
     gone = status()
     assert (gone.returncode, gone.stderr.count("\n")) == (1, 1)
     daemon.run(**measured)
-    daemon.more(3)
+    daemon.until(lambda: daemon.status() and daemon.status()["cameras"]["rpi"]["last"])
     told = status("--json", "-")
     document = json.loads(told.stdout)
     assert document["pid"] == daemon.process.pid

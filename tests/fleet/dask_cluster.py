@@ -1,20 +1,16 @@
-"""A real Dask scheduler with worker processes on loopback, and an archive of frames for them."""
+"""A real Dask scheduler with worker processes on loopback."""
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
-
-from thermocald.physics.presets import preset_simulation
 
 # docs/how-to/fleet.md: idle processes cost less
 SETTINGS = """\
@@ -72,18 +68,3 @@ class DaskCluster:
         traceback: TracebackType | None,
     ) -> None:
         self._stack.close()
-
-
-def write_frame_archive(folder: Path, recordings: int, frames: int) -> None:
-    """Write recordings M00, M01 … of the same rendered 8 MP frames, which are stored once."""
-    simulation = preset_simulation("rpi-v2.1-heating", 1, "M00")
-    programme = replace(simulation.programme, epochs=frames)
-    first = folder / "M00"
-    replace(simulation, programme=programme).write(first, with_frames=True)
-    for i in range(1, recordings):
-        other = folder / f"M{i:02d}"
-        shutil.copytree(first, other, copy_function=os.link)
-        head = other / "recording.yaml"
-        text = head.read_text().replace("M00", other.name)
-        head.unlink()
-        head.write_text(text)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 
-import thermocald as tc
 from tests.commands import answer, succeed
 from thermocald.fleet.forward import Forwarder
 from thermocald.physics.presets import preset_simulation
@@ -44,30 +42,6 @@ def test_a_server_gives_what_the_file_gives(places):
     assert len(set(sources)) == 2
     assert "secret" not in str(sources)
     assert here == there
-
-
-@pytest.mark.slow
-def test_discover_and_correct_read_a_server_too(places, tmp_path):
-    file, server = places
-    # discovery depends only on these
-    here, there = (tc.open(place).observed() for place in places)
-    assert "secret" not in there.name
-    assert np.array_equal(here.frame_times, there.frame_times)
-    assert np.array_equal(here.grid.points, there.grid.points, equal_nan=True)
-    assert np.array_equal(here.grid.weights, there.grid.weights)
-    assert here.readings.keys() == there.readings.keys()
-    run("fit", file, "-o", tmp_path / "m.yaml")
-    with Store.open(file) as store:
-        times = store.series_columns(store.find_series(), ["frame_time"])["frame_time"]
-    points = tmp_path / "points.csv"
-    points.write_text("time,x,y\n" + "".join(f"{t!r},1000,{100 + i}\n" for i, t in
-                                              enumerate(times[5:40].tolist())))  # fmt: skip
-    logs = (tmp_path / "M1" / "epochs.csv", file, server)
-    corrected = [run("correct", points, "--model", tmp_path / "m.yaml", "--log", log)
-                 for log in logs]  # fmt: skip
-    assert corrected[1] == corrected[2]
-    first, second = (np.genfromtxt(c.splitlines(), delimiter=",")[1:, 1:3] for c in corrected[:2])
-    assert np.allclose(first, second, atol=2e-3)
 
 
 def test_several_series_at_an_address_are_said(server, tmp_path):

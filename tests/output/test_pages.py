@@ -28,7 +28,7 @@ from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.discovery.result import discover_series
-from thermocald.fleet.page import render_fleet
+from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
 from thermocald.output.study.report import cut_clip, render_study, save_figures

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
+_USUAL = AdjustmentSettings()
 _WRONG_START = 5.0  # times the last sigma0; more: the camera has been knocked
 
 
@@ -112,6 +113,7 @@ class EpochCalibrator:
             self.seen = fingerprint, epoch.number
 
 
+@dataclass(eq=False)
 class Calibrator(EpochCalibrator):
     """Measures and adjusts the epochs of one camera, one after the other.
 
@@ -119,36 +121,24 @@ class Calibrator(EpochCalibrator):
     parameters held fixed; sigma_floor_px: added in quadrature to the sigmas of image points.
     """
 
-    def __init__(
-        self,
-        sensor: Sensor,
-        testfield: TestField,
-        settings: AdjustmentSettings | None = None,
-        *,
-        nominal_c: float | None = None,
-        interior: InteriorOrientation | None = None,
-        sigma_floor_px: float = 0.0,
-    ) -> None:
-        self.sensor = sensor
-        self.testfield = testfield
-        self.settings = settings or AdjustmentSettings()
-        self._nominal_c = nominal_c
-        self._interior = interior
-        self._floor = sigma_floor_px
-        self._tracker = Tracker(testfield, CameraSpec("", sensor, nominal_c, interior))
+    sensor: Sensor
+    testfield: TestField
+    settings: AdjustmentSettings = _USUAL
+    nominal_c: float | None = None
+    interior: InteriorOrientation | None = None
+    sigma_floor_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        camera = CameraSpec("", self.sensor, self.nominal_c, self.interior)
+        self._tracker = Tracker(self.testfield, camera)
         self.reset()
 
     @classmethod
-    def of_recording(cls, recording: Any, settings: AdjustmentSettings | None = None) -> Self:
+    def of_recording(cls, recording: Any, settings: AdjustmentSettings = _USUAL) -> Self:
         """Return the calibrator of a recording (store.recording.reader)."""
         camera: CameraSpec = recording.head.camera
-        return cls(
-            camera.sensor,
-            recording.testfield,
-            settings,
-            nominal_c=camera.principal_distance,
-            interior=camera.interior,
-        )
+        given = camera.principal_distance, camera.interior
+        return cls(camera.sensor, recording.testfield, settings, *given)
 
     def reset(self) -> None:
         """Forget the last epoch, and where the camera was."""
@@ -204,9 +194,9 @@ class Calibrator(EpochCalibrator):
 
     def weighed(self, observations: Observations) -> Observations:
         """Return the observations with the sigmas used in the adjustment."""
-        if self._floor == 0:
+        if self.sigma_floor_px == 0:
             return observations
-        return replace(observations, sigmas=np.hypot(observations.sigmas, self._floor))
+        return replace(observations, sigmas=np.hypot(observations.sigmas, self.sigma_floor_px))
 
     def adjust(self, observations: Observations) -> Adjustment:
         """Adjust one epoch's observations, from the last epoch's orientation if it fits."""
@@ -219,9 +209,9 @@ class Calibrator(EpochCalibrator):
             if result.status not in lost and not result.sigma0 > _WRONG_START * self._usual:
                 return self._keep(result)
         seen = self.sensor, self.testfield, observations
-        if not self.settings.free and self._interior is not None:
-            return self._keep(pose_only(*seen, self._interior, self.settings))
-        return self._keep(cold_start(*seen, self.settings, self._nominal_c, self._interior))
+        if not self.settings.free and self.interior is not None:
+            return self._keep(pose_only(*seen, self.interior, self.settings))
+        return self._keep(cold_start(*seen, self.settings, self.nominal_c, self.interior))
 
     def _keep(self, result: Adjustment) -> Adjustment:
         if result.ok:

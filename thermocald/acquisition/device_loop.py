@@ -19,8 +19,11 @@ import logging
 import math
 import threading
 from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any, Literal
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import (
@@ -34,22 +37,25 @@ from thermocald.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from thermocald.hal import Clock, Device, Kind, Output
+    from thermocald.hal import Clock, Kind, Output
 
     OnEvent = Callable[[float, str, str], None]
 
 _QUEUE = 400  # results that may wait for an output: an hour at one every 10 s
+_RETRY_S = 0.5  # while an output is away
 _LATEST_START = 0.1  # of a period; a tick that would begin later is skipped
 _REMEMBERED = 1000
 
 
+@dataclass(eq=False)
 class Schedule:
     """The ticks of one device; one thread waits for them, others may read the statistics."""
 
-    def __init__(self, clock: Clock, period_s: float, begin: float | None = None) -> None:
-        self.clock = clock
-        self.period_s = period_s
-        self.begin = clock.monotonic() if begin is None else begin
+    clock: Clock
+    period_s: float
+    begin: float
+
+    def __post_init__(self) -> None:
         self._next = 0
         self._ticks = 0
         self._skipped = 0
@@ -88,7 +94,6 @@ class Schedule:
 
 
 log = logging.getLogger(__name__)
-_T = TypeVar("_T")
 
 LinkState = Literal["closed", "open", "out", "failed", "finished"]
 
@@ -98,40 +103,32 @@ _SEARCH_PAUSE_S = 10.0
 _OFTEN, _OFTEN_S = 10, 3600.0  # outages within a time, from which they are not reported one by one
 
 
+@dataclass(eq=False)
 class Link:
     """One device and its state; one thread uses it, others may read its attributes.
 
-    called: kind and name. For the status: state; why: the last fault; out_since: monotonic s;
-    since: UTC s, when the device went away or ended, else NaN; faults: number of failed calls.
-    on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
-    back (`device_back`), fails permanently (`device_failed`), or its recording ends
-    (`device_finished`). free_running: retries at once, as a recording played fast.
+    For the status: state; why: the last fault; out_since: monotonic s; since: UTC s, when the
+    device went away or ended, else NaN; faults: number of failed calls. on_event: receives UTC s, a
+    kind and a sentence when the device goes away (`device_out`), comes back (`device_back`), fails
+    permanently (`device_failed`), or its recording ends (`device_finished`). free_running: retries
+    at once, as a recording played fast.
     """
 
-    def __init__(
-        self,
-        kind: Kind,
-        name: str,
-        device: Device,
-        clock: Clock,
-        *,
-        period_s: float = 1.0,
-        on_event: OnEvent = lambda *_: None,
-        free_running: bool = False,
-    ) -> None:
-        self.name = name
-        self.called = f"{kind} {name}"
-        self.device = device
+    kind: Kind
+    name: str
+    device: Any
+    clock: Clock
+    period_s: float = 1.0
+    on_event: OnEvent = lambda *_: None
+    free_running: bool = False
+
+    def __post_init__(self) -> None:
+        self.called = f"{self.kind} {self.name}"
         self.state: LinkState = "closed"
         self.why = ""
         self.out_since = 0.0
         self.since = math.nan
         self.faults = 0
-        self._clock = clock
-        self._period_s = period_s
-        self._on_event = on_event
-        self._free_running = free_running
-        self._searched = DeviceNotFound if kind == "output" else (DeviceNotFound, DeviceDenied)
         self._pause_s = 0.0
         self._retry_at = 0.0
         self._outages: deque[float] = deque(maxlen=_OFTEN)
@@ -145,7 +142,7 @@ class Link:
 
     def do(self, action: Callable[[], object]) -> bool:
         """Call `action` with the device open; return whether it succeeded."""
-        waits = not self._free_running and self._clock.monotonic() < self._retry_at
+        waits = not self.free_running and self.clock.monotonic() < self._retry_at
         if self.ended or (self.state == "out" and waits):
             return False
         try:
@@ -153,12 +150,14 @@ class Link:
                 self.device.open()
             action()
         except TransientDeviceError as error:
-            self._out(str(error), max(self._period_s, _LONGEST_PAUSE_S))
-        except self._searched as error:
-            self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
+            self._out(str(error), max(self.period_s, _LONGEST_PAUSE_S))
         except PermanentDeviceError as error:
-            self._ask("close", self.device.close, None)
-            self.since = self._clock.utc()
+            denied = isinstance(error, DeviceDenied) and self.kind != "output"
+            if denied or isinstance(error, DeviceNotFound):
+                self._out(str(error), max(self.period_s, _SEARCH_PAUSE_S))
+                return False
+            self._ask("close", self.device.close)
+            self.since = self.clock.utc()
             self.why = without_secrets(str(error))
             # the end of a recording is not a failure
             finished = isinstance(error, DeviceFinished)
@@ -169,7 +168,7 @@ class Link:
             # an error in a driver, even its sys.exit(), must not stop the daemon
             if self.state != "out" and not self._restless:
                 log.exception("%s: its driver failed", self.called)
-            self._out(f"{type(error).__name__}: {error}", max(self._period_s, _LONGEST_PAUSE_S))
+            self._out(f"{type(error).__name__}: {error}", max(self.period_s, _LONGEST_PAUSE_S))
         else:
             self._back()
             return True
@@ -177,17 +176,19 @@ class Link:
 
     def close(self) -> None:
         """Release the device."""
-        self._ask("close", self.device.close, None)
+        self._ask("close", self.device.close)
         if not self.ended:
             self.state = "closed"
 
     def identity(self) -> dict[str, str]:
         """Return the device's identity; empty if it cannot be read."""
-        return self._ask(
-            "identity", lambda: {str(k): str(v) for k, v in self.device.identity().items()}, {}
+        return dict(
+            self._ask(
+                "identity", lambda: {str(k): str(v) for k, v in self.device.identity().items()}, {}
+            )
         )
 
-    def _ask(self, method: str, call: Callable[[], _T], default: _T) -> _T:
+    def _ask(self, method: str, call: Callable[[], Any], default: Any = None) -> Any:
         """Call a method of the driver that should not fail; log once that it did."""
         try:
             return call()
@@ -198,7 +199,7 @@ class Link:
             return default
 
     def _back(self) -> None:
-        away_s = self._clock.monotonic() - self.out_since
+        away_s = self.clock.monotonic() - self.out_since
         if self.state == "out" and (not self._restless or away_s > _OFTEN_S):
             self._report(logging.INFO, "device_back", f"{self.called} is back after {away_s:.0f} s")
         self.state = "open"
@@ -207,14 +208,14 @@ class Link:
         self._pause_s = 0.0
 
     def _out(self, why: str, longest_s: float) -> None:
-        self._ask("close", self.device.close, None)
+        self._ask("close", self.device.close)
         why = without_secrets(why)  # a library may quote an address
         self.faults += 1
         self.why = why
         if self.state != "out":
             self.state = "out"
-            self.out_since = self._clock.monotonic()
-            self.since = self._clock.utc()
+            self.out_since = self.clock.monotonic()
+            self.since = self.clock.utc()
             self._outages.append(self.out_since)
             was_restless, count = self._restless, len(self._outages)
             self._restless = count == _OFTEN and self.out_since - self._outages[0] < _OFTEN_S
@@ -223,28 +224,26 @@ class Link:
                 text = f"{self.called} is out: {why}{often if self._restless else ''}"
                 self._report(logging.WARNING, "device_out", text)
         # the first retry is at the next tick, since most faults concern a single frame
-        now = self._clock.monotonic()
+        now = self.clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
         self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), longest_s)
 
     def _report(self, level: int, kind: str, text: str) -> None:
         log.log(level, "%s", text, extra={"device": self.name, "event": kind})
-        self._on_event(self._clock.utc(), kind, text)
+        self.on_event(self.clock.utc(), kind, text)
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
-        warnings: list[str] = []
         return {
             "device": "hung" if busy_s > hang_after_s else self.state,
             "why": self.why,
             "since": self.since,
-            "warnings": self._ask(
-                "warnings", lambda: [str(text) for text in self.device.warnings()], warnings
-            ),
+            "warnings": self._ask("warnings", lambda: list(map(str, self.device.warnings())), []),
             "faults": self.faults,
         }
 
 
+@dataclass(eq=False)
 class DeviceLoop:
     """Calls `action` at every tick, with the device open.
 
@@ -253,28 +252,21 @@ class DeviceLoop:
     while it returns true, the device is closed and not used.
     """
 
-    def __init__(
-        self,
-        link: Link,
-        action: Callable[[], None],
-        clock: Clock,
-        period_s: float,
-        begin: float,
-        *,
-        free_running: bool = False,
-        idle: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self.link = link
-        self.schedule = Schedule(clock, period_s, begin)
+    link: Link
+    action: Callable[[], object]
+    clock: Clock
+    period_s: float
+    begin: float
+    free_running: bool = False
+    idle: Callable[[], bool] = lambda: False
+
+    def __post_init__(self) -> None:
+        self.schedule = Schedule(self.clock, self.period_s, self.begin)
         self.lost = 0
-        self._action = action
-        self._free_running = free_running
-        self._idle = idle
-        self._clock = clock
         self._stop = threading.Event()
         self._busy_since: float | None = None
         # a hung driver cannot be stopped, and must not keep the process alive
-        self._thread = threading.Thread(target=self._run, name=link.called, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=self.link.called, daemon=True)
 
     def start(self) -> None:
         """Start at the next tick."""
@@ -292,18 +284,18 @@ class DeviceLoop:
     def busy_s(self) -> float:
         """Return how long the current call has taken, s; 0 between calls."""
         since = self._busy_since
-        return 0.0 if since is None else self._clock.monotonic() - since
+        return 0.0 if since is None else self.clock.monotonic() - since
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set() and not self.link.ended:
-                if not self._free_running and self.schedule.wait(self._stop) is None:
+                if not self.free_running and self.schedule.wait(self._stop) is None:
                     break
-                self._busy_since = self._clock.monotonic()
-                if self._idle():
+                self._busy_since = self.clock.monotonic()
+                if self.idle():
                     if self.link.state == "open":  # a device that is away stays "out"
                         self.link.close()
-                elif not self.link.do(self._action):
+                elif not self.link.do(self.action):
                     self.lost += 1
                 self._busy_since = None
         finally:
@@ -318,11 +310,9 @@ class OutputLoop:
         self.link = Link("output", name, output, clock, on_event=on_event)
         self.emitted = 0
         self.lost = 0
-        self._output = output
-        self._queue: deque[Mapping[str, Any]] = deque()
-        self._changed = threading.Condition()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=f"output {name}", daemon=True)
+        self._queue: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=self.link.called, daemon=True)
 
     def start(self) -> None:
         """Start the thread; the output is opened in it."""
@@ -330,39 +320,27 @@ class OutputLoop:
 
     def put(self, result: Mapping[str, Any]) -> None:
         """Queue a result; returns at once."""
-        with self._changed:
-            if len(self._queue) >= _QUEUE:
-                self._queue.popleft()
+        if self._queue.qsize() >= _QUEUE:
+            with suppress(Empty):
+                self._queue.get_nowait()
                 self.lost += 1
-            self._queue.append(result)
-            self._changed.notify_all()
+        self._queue.put(result)
 
     def stop(self, grace_s: float) -> bool:
         """Emit the waiting results within the grace and close; False if that took too long."""
-        with self._changed:
-            self._stopping = True
-            self._changed.notify_all()
+        self._stopping.set()
+        self._queue.put(None)
         self._thread.join(grace_s)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         self.link.do(lambda: None)
-        while True:
-            with self._changed:
-                while not self._queue and not self._stopping:
-                    self._changed.wait(1.0)
-                if not self._queue:
+        while (result := self._queue.get()) is not None:
+            while not self.link.do(partial(self.link.device.emit, result)):
+                # it is kept until the output is back
+                if self.link.ended or self._stopping.wait(_RETRY_S):
+                    self.lost += 1
                     break
-                result = self._queue[0]
-            if self.link.do(partial(self._output.emit, result)):
-                self.emitted += 1
-            elif self._stopping or self.link.ended:
-                self.lost += 1
             else:
-                with self._changed:
-                    self._changed.wait(0.5)  # the result is kept until the output is back
-                continue
-            with self._changed:
-                if self._queue and self._queue[0] is result:
-                    self._queue.popleft()
+                self.emitted += 1
         self.link.close()

@@ -77,10 +77,8 @@ class FrameFolder:
             import cv2
 
             assert frame.image is not None
-            done, png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, _FAST_PNG])
-            if not done:
-                return None
-            data = png.tobytes()
+            fast = [cv2.IMWRITE_PNG_COMPRESSION, _FAST_PNG]
+            data = cv2.imencode(".png", frame.image, fast)[1].tobytes()
         suffix = ".jpg" if data[:2] == b"\xff\xd8" else ".png"
         relative = Path(camera, series, f"{number // _PER_FOLDER:04d}", f"{number:07d}{suffix}")
         if not self._write(relative, data):

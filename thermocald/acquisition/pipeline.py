@@ -15,7 +15,7 @@ import logging
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
@@ -38,7 +38,8 @@ log = logging.getLogger(__name__)
 _DEPTH = 3  # epochs that may wait for their calibration
 _MOST_BYTES = 64_000_000  # of the frames that wait to be stored
 _MOST_WAITING = 200
-_PATIENCE_S = 2.0
+PATIENCE_S = 2.0
+"""How long a frame waits for a reading at most; at most half a period."""
 _IDLE_S = 0.5
 
 
@@ -65,16 +66,19 @@ class AcquiredEpoch:
     frame: Frame
     clock_trusted: bool
     epoch: Epoch | None = None
-    skew_s: float = float("nan")
+    skew_s: float = math.nan
     calibrated: CalibratedEpoch | None = None
-    state: Literal["waiting", "calibrating", "done", "dropped"] = field(default="waiting")
+    state: Literal["waiting", "calibrating", "done", "dropped"] = "waiting"
 
 
 class Keeper(Protocol):
-    """The store of a pipeline; one thread calls it, in the order of the epochs' numbers."""
+    """The store of a pipeline; one thread calls each method."""
+
+    def observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
+        """Return the epoch to be stored; in_order: it is no deferred one."""
 
     def keep(self, acquired: AcquiredEpoch) -> None:
-        """Store an epoch; `acquired.epoch` is set."""
+        """Store an epoch, in the order of the numbers; `acquired.epoch` is set."""
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
         """Store the calibration of an epoch that was stored uncalibrated."""
@@ -82,54 +86,39 @@ class Keeper(Protocol):
     def backlog(self, below: int) -> Epoch | None:
         """Return an uncalibrated epoch with a number below `below`, and with its frame's path."""
 
+    def lose(self, why: str) -> None:
+        """Count an acquired epoch that was not stored."""
 
+
+@dataclass(eq=False)
 class Pipeline:
     """The queue of one camera, with a thread that calibrates and one that stores.
 
     calibrator: None if epochs are only acquired; names: of the camera's thermometers, the reference
-    first; patience_s: how long to wait for a reading that is being taken, by default 2 s, at most
-    half a period; observe: (a calibrated epoch, whether it comes in order) → the epoch to be
-    stored; on_lost: receives why an acquired epoch was not stored.
+    first; patience_s: how long to wait for a reading that is being taken.
     """
 
-    def __init__(
-        self,
-        name: str,
-        calibrator: EpochCalibrator | None,
-        thermometers: Thermometers,
-        names: Sequence[str],
-        keeper: Keeper,
-        clock: Clock,
-        *,
-        first: int = 1,
-        period_s: float = 10.0,
-        patience_s: float | None = None,
-        trusted: Callable[[], bool] = lambda: True,
-        observe: Callable[[CalibratedEpoch, bool], CalibratedEpoch] = lambda epoch, _: epoch,
-        on_lost: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        self.name = name
-        self.calibrator = calibrator
+    name: str
+    calibrator: EpochCalibrator | None
+    thermometers: Thermometers
+    names: Sequence[str]
+    keeper: Keeper
+    clock: Clock
+    next_number: int = 1
+    patience_s: float = PATIENCE_S
+
+    def __post_init__(self) -> None:
         self.dropped = 0  # epochs whose calibration was deferred
         self.caught_up = 0
         self.lost = 0  # epochs that were acquired and not handed to the store
-        self.next_number = first
-        self._thermometers = thermometers
-        self._names = list(names)
-        self._keeper = keeper
-        self._clock = clock
-        self._patience_s = min(_PATIENCE_S, 0.5 * period_s) if patience_s is None else patience_s
-        self._trusted = trusted
-        self._observe = observe
-        self._on_lost = on_lost
         self._items: deque[AcquiredEpoch] = deque()
         self._amended: deque[CalibratedEpoch] = deque()
         self._changed = threading.Condition()
         self._stopping = self._all_calibrated = False
         self._busy_since: dict[str, float] = {}
         self._threads = [
-            threading.Thread(target=self._calibrate_all, name=f"calibrate {name}", daemon=True),
-            threading.Thread(target=self._store_all, name=f"store {name}", daemon=True),
+            threading.Thread(target=work, name=f"{what} {self.name}", daemon=True)
+            for what, work in (("calibrate", self._calibrate_all), ("store", self._store_all))
         ]
 
     def start(self) -> None:
@@ -137,13 +126,13 @@ class Pipeline:
         for thread in self._threads:
             thread.start()
 
-    def submit(self, frame: Frame) -> None:
+    def submit(self, frame: Frame, clock_trusted: bool = True) -> None:
         """Queue a frame; returns at once."""
         with self._changed:
             if len(self._items) > 2 * _DEPTH and self._is_full():
                 self._lose("frames cannot be stored fast enough")
                 return
-            self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
+            self._items.append(AcquiredEpoch(self.next_number, frame, clock_trusted))
             self.next_number += 1
             self._changed.notify_all()
 
@@ -157,7 +146,7 @@ class Pipeline:
 
     def _lose(self, why: str) -> None:
         self.lost += 1
-        self._on_lost(f"camera {self.name}: {why}")
+        self.keeper.lose(f"camera {self.name}: {why}")
 
     def wait_for_room(self, timeout_s: float) -> bool:
         """Wait until one more epoch defers no calibration: for replays; False after the timeout."""
@@ -175,9 +164,9 @@ class Pipeline:
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        deadline = self._clock.monotonic() + grace_s
+        deadline = self.clock.monotonic() + grace_s
         for thread in self._threads:
-            thread.join(max(0.0, deadline - self._clock.monotonic()))
+            thread.join(max(0.0, deadline - self.clock.monotonic()))
         with self._changed:
             while self._items:
                 self._items.popleft()
@@ -190,20 +179,25 @@ class Pipeline:
 
     def busy_s(self) -> float:
         """Return how long a thread has been busy with one epoch, s; 0 if none is busy."""
-        now = self._clock.monotonic()
+        now = self.clock.monotonic()
         return max((now - since for since in list(self._busy_since.values())), default=0.0)
 
     def _calibrate_all(self) -> None:
         while (item := self._next_to_calibrate()) is not None:
-            self._busy_since["calibrate"] = self._clock.monotonic()
+            self._busy_since["calibrate"] = self.clock.monotonic()
             if isinstance(item, AcquiredEpoch):
-                self._calibrate(item)
+                result = self._safely(self._pair(item, self.patience_s), item.frame)
+                if math.isfinite(item.skew_s):
+                    result = replace(result, extra={**result.extra, "skew_s": item.skew_s})
             else:
                 result = self._safely(item, None)
-                with self._changed:
+            with self._changed:
+                if isinstance(item, AcquiredEpoch) and item.state != "dropped":
+                    item.calibrated, item.state = result, "done"
+                else:  # stored uncalibrated already: it took too long
                     self._amended.append(result)
                     self.caught_up += 1
-                    self._changed.notify_all()
+                self._changed.notify_all()
             self._busy_since.pop("calibrate", None)
         with self._changed:
             self._all_calibrated = True
@@ -222,27 +216,12 @@ class Pipeline:
                 idle = not self._items and not self._amended
                 below = self.next_number
             if idle and self.calibrator is not None:
-                old = self._keeper.backlog(below)
+                old = self.keeper.backlog(below)
                 if old is not None:
                     return old
             with self._changed:
                 if not self._stopping and not any(i.state == "waiting" for i in self._items):
                     self._changed.wait(_IDLE_S)
-
-    def _calibrate(self, item: AcquiredEpoch) -> None:
-        self._pair(item, self._patience_s)
-        assert item.epoch is not None
-        result = self._safely(item.epoch, item.frame)
-        if item.skew_s == item.skew_s:
-            result = replace(result, extra={**result.extra, "skew_s": item.skew_s})
-        with self._changed:
-            if item.state == "dropped":  # already stored uncalibrated, it took too long
-                self._amended.append(result)
-                self.caught_up += 1
-            else:
-                item.calibrated = result
-                item.state = "done"
-            self._changed.notify_all()
 
     def _safely(self, epoch: Epoch, frame: Frame | None) -> CalibratedEpoch:
         """Calibrate an epoch from its frame, or from the file that it names; never raises."""
@@ -251,31 +230,31 @@ class Pipeline:
             return CalibratedEpoch(epoch, why, {})
         try:
             if frame is None:
-                return self._observe(self.calibrator.calibrate(epoch), False)
-            return self._observe(calibrate_frame(self.calibrator, epoch, frame), True)
+                return self.keeper.observe(self.calibrator.calibrate(epoch), False)
+            return self.keeper.observe(calibrate_frame(self.calibrator, epoch, frame), True)
         except Exception as error:
             # an epoch with an unexpected error must not stop months of acquisition
             log.exception("camera %s: epoch %d was not calibrated", self.name, epoch.number)
             self.calibrator.reset()
             return CalibratedEpoch(epoch, failed("program_error", str(error)), {})
 
-    def _pair(self, item: AcquiredEpoch, patience_s: float) -> None:
-        frame = item.frame
-        utc, temperatures, item.skew_s = self._thermometers.around(
-            self._names, frame.monotonic, patience_s
+    def _pair(self, item: AcquiredEpoch, patience_s: float) -> Epoch:
+        utc, temperatures, item.skew_s = self.thermometers.around(
+            self.names, item.frame.monotonic, patience_s
         )
-        item.epoch = Epoch(item.number, frame.utc, utc, temperatures)
+        item.epoch = Epoch(item.number, item.frame.utc, utc, temperatures)
+        return item.epoch
 
     def _store_all(self) -> None:
         while (item := self._next_to_store()) is not None:
-            self._busy_since["store"] = self._clock.monotonic()
+            self._busy_since["store"] = self.clock.monotonic()
             try:
                 if isinstance(item, CalibratedEpoch):
-                    self._keeper.amend(item)
+                    self.keeper.amend(item)
                 else:
                     if item.epoch is None:
                         self._pair(item, 0.0)
-                    self._keeper.keep(item)
+                    self.keeper.keep(item)
             except Exception as error:
                 log.exception("camera %s: an epoch was not stored", self.name)
                 if isinstance(item, AcquiredEpoch):

@@ -97,9 +97,7 @@ class Thermometers:
     ) -> None:  # fmt: skip
         self.links: dict[str, Link] = {}
         self._cameras = config.cameras
-        self._devices: dict[str, Thermometer] = {}
         self._channels: dict[str, tuple[str, ...]] = {}  # as named by the options, then as read
-        self._periods_s = {one.name: one.period_s for one in config.thermometers}
         self._kept: dict[str, deque[Reading]] = {}
         self._missed: set[tuple[str, str]] = set()  # channels that were reported as missing
         self._changed = threading.Condition()
@@ -107,14 +105,12 @@ class Thermometers:
         self.with_frames: set[str] = set()
         used = {name for camera in config.cameras for name in camera.thermometers}
         for one in config.thermometers:
-            device = open_device("thermometer", one.driver, one.options, clock)
-            self._devices[one.name] = device
+            device: Thermometer = open_device("thermometer", one.driver, one.options, clock)
             if fast or (device.recorded and one.name in used):
                 self.with_frames.add(one.name)
             self.links[one.name] = Link(
-                "thermometer", one.name, device, clock, period_s=one.period_s, on_event=on_event,
-                free_running=device.recorded,
-            )  # fmt: skip
+                "thermometer", one.name, device, clock, one.period_s, on_event, device.recorded
+            )
             self._channels[one.name] = tuple(device.named_channels())
             count = max(_REMEMBERED, round(_REMEMBERED_S / one.period_s))
             self._kept[one.name] = deque(maxlen=count)
@@ -139,7 +135,7 @@ class Thermometers:
 
     def read(self, name: str) -> Reading:
         """Read a thermometer that is open, and store the reading; raises DeviceError."""
-        reading = self._devices[name].read()
+        reading: Reading = self.links[name].device.read()
         self.add(name, reading)
         return reading
 
@@ -175,7 +171,7 @@ class Thermometers:
         """Return a thermometer's reading nearest to a time; None if it is over 1.5 periods away."""
         with self._changed:
             near = min(self._kept[name], key=lambda r: abs(r.monotonic - monotonic), default=None)
-        limit = _FARTHEST_IN_PERIODS * self._periods_s[name]
+        limit = _FARTHEST_IN_PERIODS * self.links[name].period_s
         return near if near is not None and abs(near.monotonic - monotonic) <= limit else None
 
     def around(
@@ -198,4 +194,4 @@ class Thermometers:
 
     def _is_near(self, name: str, monotonic: float) -> bool:
         kept = self._kept[name]
-        return bool(kept) and kept[-1].monotonic >= monotonic - 0.5 * self._periods_s[name]
+        return bool(kept) and kept[-1].monotonic >= monotonic - 0.5 * self.links[name].period_s

@@ -30,6 +30,8 @@ from thermocald.cli.common import (
     session_line,
     show,
 )
+from thermocald.config import load_config
+from thermocald.daemon.live_state import find_state, running_status, status_warnings
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, duration, with_sd
@@ -58,7 +60,6 @@ def run(
 
     Example: thermocald run --config config.yaml
     """
-    from thermocald.config import load_config
     from thermocald.daemon.plan import mock_config, recording_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
@@ -120,8 +121,6 @@ def dashboard(
 
     Example: thermocald dashboard --store thermocald.db
     """
-    from thermocald.config import load_config
-    from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
     from thermocald.store.sources import is_store
 
@@ -220,9 +219,6 @@ def keys() -> Iterator[Callable[[float], str]]:
 
 
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
-    from thermocald.config import load_config
-    from thermocald.daemon.live_state import running_status
-
     if store is None:
         store = load_config(require_config(config, "--config FILE or --store FILE")).store.path
     return running_status(store)
@@ -300,8 +296,6 @@ _OLD_S = 10.0
 
 def status_lines(document: dict[str, Any]) -> list[str]:
     """Return a `thermocald-status/1` document as lines; the first is the headline."""
-    from thermocald.daemon.live_state import status_warnings
-
     lines = [_headline(document), ""]
     for name, camera in document["cameras"].items():
         lines += _camera(name, camera)

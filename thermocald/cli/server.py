@@ -150,7 +150,7 @@ def fleet(
 
     Example: thermocald fleet postgresql://reader@db.example/thermocald --report fleet.html
     """
-    from thermocald.fleet.page import fleet_document, fleet_lines, render_fleet
+    from thermocald.fleet.overview import fleet_document, fleet_lines, render_fleet
 
     document = fleet_document([Path(server) for server in servers])
     if report is not None:

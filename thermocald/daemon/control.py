@@ -17,6 +17,7 @@ import os
 import socket
 import threading
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -69,15 +70,17 @@ class Request(BaseModel):
         return self
 
 
+@dataclass(eq=False)
 class ControlSocket:
     """A server that listens in one thread and serves each connection in another.
 
     answer(request): returns the answer's content or raises ThermocaldError.
     """
 
-    def __init__(self, folder: Path, answer: Callable[[Request], dict[str, Any]]) -> None:
-        self._folder = folder
-        self._answer = answer
+    folder: Path
+    answer: Callable[[Request], dict[str, Any]]
+
+    def __post_init__(self) -> None:
         self._socket: socket.socket | None = None
         self._free = threading.BoundedSemaphore(_AT_ONCE)
         self._thread = threading.Thread()
@@ -88,13 +91,13 @@ class ControlSocket:
 
         If that fails, log it once: the daemon works without the socket.
         """
-        if self._thread.is_alive() and os.path.exists(self._folder / _NAME):
+        if self._thread.is_alive() and os.path.exists(self.folder / _NAME):
             return
         self.close()
         channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with _short(self._folder) as path:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with _short(self.folder) as path:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(path)  # of a killed daemon, since this one holds the store's lock
                 os.fchmod(channel.fileno(), 0o600)  # nobody else may connect before the chmod
@@ -106,7 +109,7 @@ class ControlSocket:
             if not self._failed:
                 why = error.strerror or error
                 what = "sessions wait until the control socket can be opened"
-                log.warning("%s: %s: %s", self._folder, what, why)
+                log.warning("%s: %s: %s", self.folder, what, why)
             self._failed = True
             return
         self._failed, self._socket = False, channel
@@ -125,7 +128,7 @@ class ControlSocket:
         self._thread.join(_REQUEST_S)
         channel.close()
         with contextlib.suppress(OSError):
-            (self._folder / _NAME).unlink()
+            (self.folder / _NAME).unlink()
 
     def _serve(self, channel: socket.socket) -> None:
         while channel is self._socket:
@@ -147,7 +150,7 @@ class ControlSocket:
             with connection:
                 try:
                     request = _parse(_line(connection, _LONGEST, _REQUEST_S))
-                    answer = {"ok": True, **self._answer(request)}
+                    answer = {"ok": True, **self.answer(request)}
                 except ThermocaldError as error:
                     answer = {"ok": False, "error": str(error), "exit_status": error.exit_status}
                 connection.settimeout(_REQUEST_S)
@@ -237,12 +240,9 @@ def enforce_retention(config: Config) -> list[str]:
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.machine import machine_clock_trusted
 
-    guard = StoreGuard(config.store.path)
-    try:
+    with contextlib.closing(StoreGuard(config.store.path)) as guard:
         now = time.time() if machine_clock_trusted() else None
         sentences = FrameFolder(config.frames).enforce(now)
         for sentence in sentences:
             guard.event(time.time(), "frames_deleted", sentence)
-    finally:
-        guard.close()
     return sentences

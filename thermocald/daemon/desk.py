@@ -10,12 +10,20 @@ import shutil
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import ValidationError
 
+from thermocald.acquisition.pipeline import check_frame
+from thermocald.config import in_words, parse_config
+from thermocald.daemon.control import DaemonBusy, ask
+from thermocald.daemon.live_state import find_state
+from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.session import Session
+from thermocald.daemon.systemd import set_up_logging
 from thermocald.errors import (
     ConfigurationError,
     DataError,
@@ -23,14 +31,17 @@ from thermocald.errors import (
     ThermocaldError,
     UsageError,
 )
+from thermocald.files import read_yaml
+from thermocald.hal import SystemClock, load_driver, open_device
 from thermocald.numbers import with_sd
+from thermocald.store.database.store import Store
+from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from concurrent.futures import Future
 
     from thermocald.config import Config
-    from thermocald.daemon.session import Session
     from thermocald.daemon.station import Station
     from thermocald.discovery.experiment import Experiment, Separation
     from thermocald.thermal.series import SeriesInput
@@ -51,7 +62,6 @@ def take_on_the_desk(
     watch: ends the session when its effects are separated. Raises DataError if epochs are missing.
     """
     from thermocald.daemon.service import Service
-    from thermocald.daemon.systemd import set_up_logging
 
     done, epochs = _stored(config, session), session.epochs
     read = _prepare(config, session, done)
@@ -89,9 +99,6 @@ def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
 
 def _prepare(config: Config, session: Session, done: int) -> Config:
     """Return the configuration with the session's camera and series and its thermometers."""
-    from thermocald.config import parse_config
-    from thermocald.hal import load_driver
-
     document = config.model_dump(mode="python", by_alias=True)
     chosen = next(c for c in document["cameras"] if c["name"] == session.camera)
     chosen["series"] = session.series
@@ -109,8 +116,6 @@ def _prepare(config: Config, session: Session, done: int) -> Config:
 
 
 def _stored(config: Config, session: Session) -> int:
-    from thermocald.store.database.store import Store
-
     if not config.store.path.exists():
         return 0
     with Store.open(config.store.path) as store:
@@ -120,10 +125,6 @@ def _stored(config: Config, session: Session) -> int:
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
-    from thermocald.acquisition.pipeline import check_frame
-    from thermocald.daemon.plan import plan_cameras
-    from thermocald.hal import SystemClock, open_device
-
     clock = SystemClock()
     for one in config.thermometers:
         with open_device("thermometer", one.driver, one.options, clock) as thermometer:
@@ -145,8 +146,6 @@ def take_in_the_daemon(
     watch: Watch | None = None,
 ) -> None:  # fmt: skip
     """Let a running daemon take the session, and report its progress if `wait`."""
-    from thermocald.daemon.control import DaemonBusy, ask
-
     answer = ask(folder, "session start", session=session.model_dump(mode="json"))
     if answer is None:
         raise DataError("the daemon was just stopped; repeat the command")
@@ -205,12 +204,6 @@ def session_of(
     programme: Path | None, check: bool,
 ) -> Session:  # fmt: skip
     """Return the requested session; raises UsageError or ConfigurationError."""
-    from pydantic import ValidationError
-
-    from thermocald.config import in_words
-    from thermocald.daemon.session import Session
-    from thermocald.files import read_yaml
-
     request: dict[str, Any] = {"camera": only_camera(config, camera), "series": series}
     request |= {"start": condition, "epochs": epochs, "check": check}
     if programme is not None:
@@ -226,20 +219,19 @@ def session_of(
 
 def listening_daemon(config: Config) -> Path | None:
     """Return the live folder of the daemon that writes this store; None if none listens."""
-    from thermocald.daemon.control import ask
-    from thermocald.daemon.live_state import find_state
-
     folder = find_state(config.store.path)
     return None if ask(folder, "session status") is None else folder
 
 
+@dataclass(eq=False)
 class Progress:
-    """Prints a session's progress; total: its epochs; done: those of an earlier run."""
+    """Prints a session's progress; total: its epochs; shown: the last one printed or stored."""
 
-    def __init__(self, total: int, say: Callable[[str], None], done: int = 0) -> None:
-        self._total = total
-        self._say = say
-        self._shown = done
+    total: int
+    say: Callable[[str], None]
+    shown: int = 0
+
+    def __post_init__(self) -> None:
         self._printed_at = float("-inf")
         self._paused = False
 
@@ -249,15 +241,15 @@ class Progress:
         last: the last epoch's row, as outputs receive it; paused: why the session is paused, or "".
         """
         if paused and not self._paused:
-            self._say(f"paused: {paused}")
+            self.say(f"paused: {paused}")
         if self._paused and not paused:
-            self._say("the camera is back")
+            self.say("the camera is back")
         self._paused = bool(paused)
-        if not last or last["epoch"] <= self._shown:
+        if not last or last["epoch"] <= self.shown:
             return
-        self._shown = last["epoch"]
+        self.shown = last["epoch"]
         temperature = last.get("temperature")
-        line = f"epoch {last['epoch']} of {self._total}: "
+        line = f"epoch {last['epoch']} of {self.total}: "
         line += "" if temperature is None else f"{temperature:.2f} °C, "
         if last["status"] == "ok":
             line += f"c {with_sd(last['c'], last['sd_c'], 'mm')}, sigma0 {last['sigma0']:.2f}"
@@ -270,9 +262,9 @@ class Progress:
             room = shutil.get_terminal_size().columns - 1
             sys.stderr.write(f"\r\x1b[K{line[:room]}")
             sys.stderr.flush()
-        elif now - self._printed_at >= _LINE_EVERY_S or self._shown == self._total:
+        elif now - self._printed_at >= _LINE_EVERY_S or self.shown == self.total:
             self._printed_at = now
-            self._say(line)
+            self.say(line)
 
 
 def plan_separation(
@@ -292,7 +284,6 @@ def plan_separation(
         rank_experiments,
         read_alternatives,
     )
-    from thermocald.hal import load_driver
 
     if session.programme:
         raise UsageError("--until-separated plans the programme; omit --programme")
@@ -332,16 +323,17 @@ def _describe(found: list[Experiment], names: tuple[str, str]) -> str:
     return "\n".join(lines)
 
 
+@dataclass(eq=False)
 class Watch:
     """Compares two effects by the epochs so far, in a thread, until they are separated."""
 
-    def __init__(
-        self, store: Path, session: Session, names: tuple[str, str],
-        evidence: SeriesInput | None, say: Callable[[str], None],
-    ) -> None:  # fmt: skip
-        self._store, self._session, self._names = store, session, names
-        self._evidence = evidence
-        self._say = say
+    store: Path
+    session: Session
+    names: tuple[str, str]
+    evidence: SeriesInput | None
+    say: Callable[[str], None]
+
+    def __post_init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, "separation")
         self._pending: Future[Separation] | None = None
         self._seen = 0
@@ -360,7 +352,7 @@ class Watch:
                 sentence = self.found.sentence
             except ThermocaldError as error:
                 sentence = str(error)
-            self._say(f"after {self._seen} epochs: {sentence}")
+            self.say(f"after {self._seen} epochs: {sentence}")
             self._pending = None
         if self._pending is None and taken >= max(_FEWEST, self._seen + _EVERY) and not self.ended:
             self._seen = taken
@@ -372,17 +364,16 @@ class Watch:
         self._pool.shutdown(wait=True, cancel_futures=True)
         if not self.ended:
             reached = self.found.sentence if self.found else "too few epochs"
-            self._say(f"not separated: {reached}")
+            self.say(f"not separated: {reached}")
 
     def _compare(self) -> Separation:
         from thermocald.discovery.experiment import compare_effects
-        from thermocald.store.sources import open_source
         from thermocald.thermal.reduce import reduce_together
         from thermocald.thermal.source import epochs_input
 
-        with open_source(self._store) as store:
-            found = store.find_series(self._session.camera, self._session.series)
+        with open_source(self.store) as store:
+            found = store.find_series(self.session.camera, self.session.series)
             epochs = [s.epoch for s in store.epochs(found)]
-            now = epochs_input(found.head, found.testfield, epochs, self._session.series)
-        before = [] if self._evidence is None else [replace(self._evidence, camera=now.camera)]
-        return compare_effects(reduce_together([*before, now]), *self._names)
+            now = epochs_input(found.head, found.testfield, epochs, self.session.series)
+        before = [] if self.evidence is None else [replace(self.evidence, camera=now.camera)]
+        return compare_effects(reduce_together([*before, now]), *self.names)

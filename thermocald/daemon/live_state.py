@@ -74,10 +74,8 @@ class LiveState:
 
     def remove(self) -> None:
         """Delete status.json, when the daemon stops."""
-        try:
+        with contextlib.suppress(OSError):
             (self.folder / "status.json").unlink(missing_ok=True)
-        except OSError as error:
-            log.debug("%s: %s", self.folder, error)
 
     def _write(self, name: str, data: bytes) -> None:
         if name.endswith(".json"):  # room to grow in place: JSON allows trailing blanks

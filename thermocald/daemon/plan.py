@@ -237,35 +237,30 @@ def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]
 
 def mock_config() -> Config:
     """Return the configuration of a simulated camera and thermometer."""
-    return parse_config(
-        {
-            "store": {"path": "thermocald-mock.db"},
-            "frames": {"keep": "none", "folder": "thermocald-mock-frames", "min_free_gb": 0.1},
-            "cameras": [
-                {
-                    "name": "mock",
-                    "driver": "mock",
-                    "principal_distance_mm": 3.04,
-                    "thermometers": ["housing"],
-                    "options": {"seed": 1},
-                }
-            ],
-            "thermometers": [{"name": "housing", "driver": "mock", "seed": 2}],
-        },
-        Path("config.yaml"),
-    )
+    store = {"path": "thermocald-mock.db"}
+    return _rendered("mock", "housing", 1, store, Path("thermocald-mock-frames"))
 
 
 def demo_config(folder: Path, seed: int) -> Config:
     """Return the configuration of the demo, with its store `demo.db` in a folder."""
-    config = mock_config().model_dump(mode="json", by_alias=True)
-    config["store"] |= {"path": str(folder.absolute() / "demo.db"), "durable": False}
-    config["frames"] |= {"folder": str(folder.absolute() / "frames")}
-    config["cameras"][0] |= {
-        "name": "demo", "thermometers": ["temperature"], "options": {"seed": seed}
+    store = {"path": str(folder.absolute() / "demo.db"), "durable": False}
+    return _rendered("demo", "temperature", seed, store, folder.absolute() / "frames")
+
+
+def _rendered(
+    name: str, thermometer: str, seed: int, store: Mapping[str, Any], frames: Path
+) -> Config:
+    camera = {
+        "name": name, "driver": "mock", "principal_distance_mm": 3.04,
+        "thermometers": [thermometer], "options": {"seed": seed},
     }  # fmt: skip
-    config["thermometers"][0] |= {"name": "temperature", "options": {"seed": seed + 1}}
-    return parse_config(config, Path("config.yaml"))
+    document = {
+        "store": store,
+        "frames": {"keep": "none", "folder": str(frames), "min_free_gb": 0.1},
+        "cameras": [camera],
+        "thermometers": [{"name": thermometer, "driver": "mock", "options": {"seed": seed + 1}}],
+    }
+    return parse_config(document, Path("config.yaml"))
 
 
 def recording_config(path: Path, store: Path | None = None) -> Config:

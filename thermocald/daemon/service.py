@@ -21,14 +21,15 @@ import threading
 import time
 from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
-from thermocald.daemon.camera_line import Runtime
 from thermocald.daemon.control import ControlSocket
 from thermocald.daemon.live_state import LiveState, status_warnings
+from thermocald.daemon.series_run import Runtime
 from thermocald.daemon.session import Sessions
 from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
@@ -150,13 +151,11 @@ class Service:
         self.live = LiveState.beside(config.store.path)
         self._path = path
         self._with_options = with_options
-        self._options: dict[str, Any] = {
-            "fast": fast or clock is not None,
-            "free_running": fast and clock is None,
-            "epochs": epochs,
-            "hang_after_s": hang_after_s,
-            "start_condition": start_condition,
-        }
+        self._runtime_of = partial(
+            Runtime, clock=self.clock, live=self.live, fast=fast or clock is not None,
+            free_running=fast and clock is None, epochs=epochs, hang_after_s=hang_after_s,
+            start_condition=start_condition,
+        )  # fmt: skip
         self._until_finished = until_finished
         self._on_turn = on_turn
         self._started = self.clock.monotonic()
@@ -180,7 +179,7 @@ class Service:
     def _run(self) -> bool:
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
-        self._runtime = Runtime(self._guard, self.clock, self.live, **self._options)
+        self._runtime = self._runtime_of(self._guard)
         done = False
         self._control = ControlSocket(self.live.folder, self._ask)
         try:

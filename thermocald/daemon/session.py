@@ -20,8 +20,7 @@ from thermocald.errors import ConfigurationError, DataError, ThermocaldError, Us
 from thermocald.hal import HeatingStep  # noqa: TC001
 
 if TYPE_CHECKING:
-    from thermocald.daemon.camera_line import CameraLine
-    from thermocald.daemon.station import Station
+    from thermocald.daemon.station import CameraLine, Station
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Clock
     from thermocald.store.series import Event

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+    from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.series import EpochResult, LoggedReading, StoredEpoch, StoredSeries
 
 log = logging.getLogger(__name__)
@@ -335,24 +335,15 @@ class StoreGuard:
                 self.flush()
             return row.stored
 
-    def amend(
-        self,
-        series: StoredSeries,
-        number: int,
-        result: EpochResult,
-        observations: Observations | None,
-        extra: Mapping[str, float],
-    ) -> None:
+    def amend(self, series: StoredSeries, later: CalibratedEpoch, result: EpochResult) -> None:
         """Store a later calibration of an epoch; raises StoreError."""
         with self._lock:
             self._watch()
+            seen = None if self.thin else later.epoch.observations
             self.store.amend(
-                self.series(series),
-                number,
-                result,
-                observations=None if self.thin else observations,
-                extra=extra,
-            )
+                self.series(series), later.epoch.number, result, observations=seen,
+                extra=later.extra,
+            )  # fmt: skip
 
     def event(self, utc: float, kind: str, text: str, **more: Any) -> None:
         """Store an event, now or when the store can be written again; more: as of `Event`."""

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from thermocald.store.server.connection import ServerAddress
 
 _COUNTED = (*KEPT, "frame")
+_NO_FRAMES = ForwardConfig()
 
 
 class Cursor(BaseModel):
@@ -120,29 +121,24 @@ class Progress:
         return sum(self.sent.values())
 
 
+@dataclass(eq=False)
 class Forwarder:
     """The sender of a station's store to a server.
 
     cursor: the cursor's file, by default beside the store; frames: the folder in which the daemon
-    keeps them; rule: which frames are sent too, and how much per day; None: no frames.
+    keeps them; rule: which frames are sent too, and how much per day.
     """
 
-    def __init__(
-        self,
-        store: Path,
-        address: ServerAddress,
-        station: str,
-        cursor: Path | None = None,
-        batch: int = BATCH,
-        frames: Path = Path(),
-        rule: ForwardConfig | None = None,
-    ) -> None:
-        self.store = store
-        self.address = address
-        self.station = station
-        self.batch = batch
-        self.frames, self.rule = frames, rule or ForwardConfig()
-        self._path = cursor or store.with_name(f"{store.name}.forwarded")
+    store: Path
+    address: ServerAddress
+    station: str
+    cursor: Path | None = None
+    batch: int = BATCH
+    frames: Path = Path()
+    rule: ForwardConfig = _NO_FRAMES
+
+    def __post_init__(self) -> None:
+        self._path = self.cursor or self.store.with_name(f"{self.store.name}.forwarded")
         self._clock = time.time
         self._reported = -_REPORT_S
         self._waiting = 0  # rows, as last reported

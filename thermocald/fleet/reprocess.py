@@ -79,10 +79,9 @@ def _attempt(work: Callable[[Any], Outcome], task: Any) -> Outcome:
     """Run a task; an error of its data or output becomes its outcome."""
     try:
         return work(task)
-    except OutputError as error:
-        return Outcome(task, error=str(error), not_written=error.exit_status)
     except (ThermocaldError, OSError) as error:
-        return Outcome(task, error=str(error))
+        not_written = error.exit_status if isinstance(error, OutputError) else 0
+        return Outcome(task, error=str(error), not_written=not_written)
 
 
 def _processes(do: Callable[[Any], Outcome], tasks: Sequence[Any], jobs: int) -> Iterator[Outcome]:

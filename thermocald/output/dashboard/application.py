@@ -13,6 +13,7 @@ import io
 import json
 import math
 import shutil
+from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from itertools import chain
@@ -24,6 +25,7 @@ from prometheus_client import generate_latest
 from prometheus_client.core import GaugeMetricFamily
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
+from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 
@@ -35,7 +37,6 @@ from thermocald.output.dashboard.view import View
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 
-    from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 
@@ -103,9 +104,9 @@ def _families(status: Mapping[str, Any]) -> Iterator[GaugeMetricFamily]:
             yield family
 
 
-def _metrics(request: Request) -> Response:
+def _metrics(view: View, _: Request) -> Response:
     """Return the status in the text format of Prometheus."""
-    status = _view(request).status()
+    status = view.status()
     text = generate_latest(SimpleNamespace(collect=lambda: _families(status)))
     return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
@@ -145,10 +146,7 @@ def build_application(
             Route("/static/plotly.js", _plotly),
             Route("/static/{name}", _static),
             Route("/api/stream", _stream),
-            Route("/api/series.csv", _csv),
-            Route("/healthz", _health),
-            Route("/metrics", _metrics),
-            *(Route(path, partial(_answer, *how)) for path, how in _ANSWERS.items()),
+            *(Route(path, partial(_answer, read)) for path, read in _ANSWERS.items()),
         ],
         middleware=[
             Middleware(_Guard, token=token, names=HostNames(host, names)),
@@ -161,30 +159,28 @@ def build_application(
     return application
 
 
+@dataclass(eq=False)
 class _Guard:
     """A guard that refuses unknown host names (DNS rebinding) or, if set, requests without token.
 
     The token is sent as `Authorization: Bearer …`, or once as `?token=…`, which sets a cookie.
     """
 
-    def __init__(self, app: ASGIApp, token: str | None, names: HostNames) -> None:
-        self._app = app
-        self._token = token
-        self._names = names
+    app: ASGIApp
+    token: str | None
+    names: HostNames
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        from starlette.requests import Request
-
         request = Request(scope)
         response: Response | None = None
         if scope["method"] not in ("GET", "HEAD"):
             response = JSONResponse({"error": "this page only reads"}, 405)
         elif self._is_foreign(request):
             response = JSONResponse({"error": "requests from other sites are refused"}, 403)
-        elif self._token is None:
-            if not self._names.allow_host(",".join(request.headers.getlist("host"))):
+        elif self.token is None:
+            if not self.names.allow_host(",".join(request.headers.getlist("host"))):
                 response = JSONResponse({"error": "unknown host name"}, 400)
         elif request.url.path != "/healthz":
             response = self._check(request)
@@ -197,7 +193,7 @@ class _Guard:
                 ]
             await send(message)
 
-        await (response or self._app)(scope, receive, send_with_headers)
+        await (response or self.app)(scope, receive, send_with_headers)
 
     def _is_foreign(self, request: Request) -> bool:
         """Return whether the browser reports that the request comes from another site."""
@@ -205,25 +201,25 @@ class _Guard:
         if origin is not None:
             own = request.headers.get("host", "")
             return not (
-                self._names.allow_origin(origin)
-                if self._token is None
+                self.names.allow_origin(origin)
+                if self.token is None
                 else own and origin.partition("://")[2].lower() == own.lower()
             )
         site, mode = (request.headers.get(f"sec-fetch-{key}", "") for key in ("site", "mode"))
         return site == "cross-site" and mode != "navigate"
 
     def _check(self, request: Request) -> Response | None:
-        assert self._token is not None
+        assert self.token is not None
         asked = request.query_params.get("token")
-        if asked is not None and _same(asked, self._token):
+        if asked is not None and _same(asked, self.token):
             moved = RedirectResponse("/" + request.url.path.lstrip("/"), 303)  # //host is another
-            moved.set_cookie(_COOKIE, _digest(self._token), httponly=True, samesite="strict")
+            moved.set_cookie(_COOKIE, _digest(self.token), httponly=True, samesite="strict")
             return moved
         scheme, _, bearer = request.headers.get("authorization", "").partition(" ")
         bearer = bearer.strip().encode("latin-1").decode(errors="replace")
-        if scheme.lower() == "bearer" and _same(bearer, self._token):
+        if scheme.lower() == "bearer" and _same(bearer, self.token):
             return None
-        if _same(request.cookies.get(_COOKIE, ""), _digest(self._token)):
+        if _same(request.cookies.get(_COOKIE, ""), _digest(self.token)):
             return None
         return JSONResponse({"error": "a token is needed"}, 401, {"www-authenticate": "Bearer"})
 
@@ -239,11 +235,6 @@ def _digest(token: str) -> str:
 
 def _refuse(_: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, 400 if isinstance(error, UsageError) else 404)
-
-
-def _view(request: Request) -> View:
-    view: View = request.app.state.view
-    return view
 
 
 def _static(request: Request) -> Response:
@@ -274,7 +265,7 @@ def _plotly(_: Request) -> Response:
 
 
 async def _stream(request: Request) -> Response:
-    view = _view(request)
+    view: View = request.app.state.view
 
     async def events() -> AsyncIterator[str]:
         seen, silent, ends = -1.0, 0, False
@@ -302,31 +293,9 @@ def _columns(view: View, request: Request) -> dict[str, Any]:
     return view.columns(camera, series, since, until, int(points or 1000))
 
 
-# path → function that answers, and the media type if it is not JSON
-_ANSWERS: dict[str, tuple[Callable[[View, Request], Any], str]] = {
-    "/api/status": (lambda view, _: view.shown(), ""),
-    "/api/series": (lambda view, _: view.series(), ""),
-    "/api/columns": (_columns, ""),
-    "/api/events": (lambda view, r: view.events(_number(r, "since", 0.0, 1e11) or 0.0), ""),
-    "/api/cameras/{camera}/epoch": (lambda view, r: view.last_epoch(r.path_params["camera"]), ""),
-    "/api/cameras/{camera}/frame": (
-        lambda view, r: view.last_frame(r.path_params["camera"]), "image/jpeg"
-    ),
-    "/camera.json": (lambda view, r: view.current_camera(r.query_params.get("camera")), ""),
-    "/camera.yaml": (
-        lambda view, r: view.camera_info(r.query_params.get("camera")), "application/yaml"
-    ),
-}  # fmt: skip
-
-
-def _answer(read: Callable[[View, Request], Any], media_type: str, request: Request) -> Response:
-    found = read(_view(request), request)
-    return Response(found, media_type=media_type) if media_type else JSONResponse(found)
-
-
-def _csv(request: Request) -> Response:
+def _csv(view: View, request: Request) -> Response:
     camera, series = _camera_and_series(request)
-    text = _view(request).csv(camera, series)
+    text = view.csv(camera, series)
     head = next(text)  # an error is answered before the table begins
     name = f"{camera}-{series}.csv"
     if not all(c.isalnum() or c in "._-" for c in name):
@@ -338,9 +307,34 @@ def _csv(request: Request) -> Response:
     )
 
 
-def _health(request: Request) -> Response:
-    healthy, why = _view(request).healthy()
+def _health(view: View, _: Request) -> Response:
+    healthy, why = view.healthy()
     return JSONResponse({"ok": healthy, "why": why}, 200 if healthy else 503)
+
+
+# path → function that returns an answer, or a document for one as JSON
+_ANSWERS: dict[str, Callable[[View, Request], Any]] = {
+    "/healthz": _health,
+    "/metrics": _metrics,
+    "/api/status": lambda view, _: view.shown(),
+    "/api/series": lambda view, _: view.series(),
+    "/api/series.csv": _csv,
+    "/api/columns": _columns,
+    "/api/events": lambda view, r: view.events(_number(r, "since", 0.0, 1e11) or 0.0),
+    "/api/cameras/{camera}/epoch": lambda view, r: view.last_epoch(r.path_params["camera"]),
+    "/api/cameras/{camera}/frame": lambda view, r: Response(
+        view.last_frame(r.path_params["camera"]), media_type="image/jpeg"
+    ),
+    "/camera.json": lambda view, r: view.current_camera(r.query_params.get("camera")),
+    "/camera.yaml": lambda view, r: Response(
+        view.camera_info(r.query_params.get("camera")), media_type="application/yaml"
+    ),
+}
+
+
+def _answer(read: Callable[[View, Request], Any], request: Request) -> Response:
+    found = read(request.app.state.view, request)
+    return found if isinstance(found, Response) else JSONResponse(found)
 
 
 def _camera_and_series(request: Request) -> tuple[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,17 +35,17 @@ _OLD_S = 30.0
 _LOST_S = 3600.0  # the daemon is unhealthy for this long after an epoch was lost
 
 
+@dataclass(frozen=True)
 class View:
     """A view of a store and a live folder, which every call opens anew: threads may share it."""
 
-    def __init__(self, store: Path, live: Path) -> None:
-        self._store = store
-        self._live = live
+    store: Path
+    live: Path
 
     def status(self) -> dict[str, Any]:
         """Return status.json with its age in s; empty if no daemon runs."""
         written = self.changed()
-        document = read_json(self._live / "status.json") if written else {}
+        document = read_json(self.live / "status.json") if written else {}
         return document and {**document, "age_s": max(0.0, time.time() - written)}
 
     def shown(self) -> dict[str, Any]:
@@ -52,7 +53,7 @@ class View:
         if status := self.status():
             return status
         try:
-            with Store.open(self._store) as store:
+            with Store.open(self.store) as store:
                 ends = [e.utc for e in store.events() if e.kind == "stopped"]
         except ThermocaldError:
             return {}
@@ -77,7 +78,7 @@ class View:
     def changed(self) -> float:
         """Return the time at which status.json was last written, s; 0 if there is none."""
         try:
-            return (self._live / "status.json").stat().st_mtime
+            return (self.live / "status.json").stat().st_mtime
         except OSError:
             return 0.0
 
@@ -108,7 +109,7 @@ class View:
         pose = {n: row.get(n) for k in EOP_NAMES for n in (k, f"sd_{k}")}
         return {
             "format": "thermocald-current-camera/1", "camera": name,
-            "age_s": max(0.0, time.time() - (self._live / f"{name}.json").stat().st_mtime),
+            "age_s": max(0.0, time.time() - (self.live / f"{name}.json").stat().st_mtime),
             **{key: row.get(key) for key in about}, **row["opencv"],
             "pixel_pitch_mm": row.get("pixel_pitch"),
             "interior": {n: row.get(n) for k in IOP_NAMES for n in (k, f"sd_{k}")},
@@ -137,7 +138,7 @@ class View:
 
     def series(self) -> list[dict[str, Any]]:
         """Return all series of the store, oldest first."""
-        with Store.open(self._store) as store:
+        with Store.open(self.store) as store:
             return [
                 {
                     "camera": s.camera,
@@ -164,7 +165,7 @@ class View:
         which `unset` counts, are left out if the series has later ones.
         """
         names = ["sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
-        with Store.open(self._store) as store:
+        with Store.open(self.store) as store:
             found = store.find_series(camera, series)
             channels = list(found.head.channels)
             # one column at a time: all columns of a year would not fit into the page's memory
@@ -193,14 +194,14 @@ class View:
 
     def events(self, since: float) -> list[dict[str, Any]]:
         """Return the events since a UTC time, s, newest first, at most 200."""
-        with Store.open(self._store) as store:
+        with Store.open(self.store) as store:
             found = store.events(since_utc=since)[-200:]
         shown = ("utc", "kind", "text", "epoch")
         return [{name: getattr(event, name) for name in shown} for event in reversed(found)]
 
     def csv(self, camera: str, series: str) -> Iterator[str]:
         """Yield a series as CSV: epoch, times, temperatures, parameters with sds, status."""
-        with Store.open(self._store) as store:
+        with Store.open(self.store) as store:
             found = store.find_series(camera, series)
             names = [
                 "epoch", "frame_time", "temperature_time", *found.head.channels, *PARAMETER_NAMES,
@@ -215,7 +216,7 @@ class View:
         # a name from a request is checked before it becomes part of a path
         if camera not in self.status().get("cameras", {}):
             raise DataError(f"there is no camera {camera!r}")
-        return self._live / f"{camera}.{suffix}"
+        return self.live / f"{camera}.{suffix}"
 
 
 def _means(values: NDArray[Any], bins: list[NDArray[np.int64]]) -> list[float | None]:

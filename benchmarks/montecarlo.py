@@ -58,7 +58,9 @@ def main() -> int:
 
     plane = opencv_loop(sets, points) * [DISTANCE_MM, -DISTANCE_MM]
     theirs = np.linalg.norm(plane - on_plane(SENSOR, IOP, points, DISTANCE_MM), axis=2)
-    mine = np.linalg.norm(plane_errors(SENSOR, IOP, sets, points, DISTANCE_MM), axis=2)
+    mine = np.hypot(
+        *plane_errors(SENSOR, sets, points, on_plane(SENSOR, IOP, points, DISTANCE_MM), DISTANCE_MM)
+    ).T
     difference = float(np.abs(mine - theirs).max())
 
     def peak_mb(count: int) -> float:

@@ -23,15 +23,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import ideal_points, image_grid
+from thermocald.analysis.camera.undistortion import ideal_points, image_grid, solve_distortion
 from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
-    distort,
-    distortion_jacobian,
     image_to_mm,
     partials,
 )
@@ -93,8 +91,7 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
 
 _CHUNK = 1024
 _SAMPLE = 1500
-_STEPS = 30
-_CONVERGED = 1e-12  # fraction of the distance: 1e-8 mm at 10 m
+_CONVERGED = 1e-6  # px, a last step that leaves an error far below
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +168,9 @@ def simulate_errors(
     """
     points, sets = image_grid(sensor, settings.grid), settings.sets
     root = draw_root(sds, correlation)
-    project = _PlaneErrors(sensor, iop, points, settings.distance_mm)
+    expected = on_plane(sensor, iop, points, settings.distance_mm)
     k = len(points)
-    limits = np.asarray(settings.clusters_mm)
-    counts = np.zeros((k, len(limits) + 1), dtype=np.int64)
+    counts = np.zeros((k, len(settings.clusters_mm) + 1), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))
     sample: list[Array] = []
     rng = np.random.default_rng(settings.seed)
@@ -184,7 +180,7 @@ def simulate_errors(
         for done in range(0, sets, _CHUNK)
     )
     for drawn, ok, part_counts, part_largest, part_sums, first_errors in in_order(
-        _simulate, (project, iop, root, limits), draws, settings.jobs
+        _simulate, (sensor, iop, root, points, expected, settings), draws, settings.jobs
     ):
         folded += drawn - ok
         counts += part_counts
@@ -204,28 +200,28 @@ def simulate_errors(
     second = means[:, [3, 5, 5, 4]].reshape(k, 2, 2)
     covariance = second - mean_error[:, :, None] * mean_error[:, None, :]
     return MonteCarlo(
-        sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, project.expected,
+        sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, expected,
         counts, means[:, 0], largest, mean_error, covariance, np.concatenate(sample), folded,
     )  # fmt: skip
 
 
 def _simulate(
-    common: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
+    common: tuple[Sensor, Array, Array, Array, Array, StudySettings], draws: tuple[Array, int]
 ) -> tuple[int, int, NDArray[np.int64], Array, Array, Array]:
     """Simulate a chunk of sets.
 
-    common: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters;
-    draws: standard normal numbers (n, r), and how many sets the sample still needs. Returns the
-    numbers of sets drawn and of sets with rays; counts, largest as in `MonteCarlo`; sums (k, 6) of
-    distances, errors, their squares and product; errors (s, k, 2) of the sample.
+    common: the sensor, the mean IOP (10,), the root (r, 10) of their covariance, the image points
+    and where they are expected, the settings; draws: standard normal numbers (n, r), and how many
+    sets the sample still needs. Returns the numbers of sets drawn and of sets with rays; counts,
+    largest as in `MonteCarlo`; sums (k, 6) of distances, errors, their squares and product; errors
+    (s, k, 2) of the sample.
     """
-    (project, iop, root, limits), (normal, wanted) = common, draws
-    dx, dy, ok = project(iop + normal @ root)
-    if not ok.all():
-        dx, dy = dx[:, ok], dy[:, ok]
+    (sensor, iop, root, points, expected, settings), (normal, wanted) = common, draws
+    errors = plane_errors(sensor, iop + normal @ root, points, expected, settings.distance_mm)
+    dx, dy = errors if np.isfinite(errors).all() else errors[:, :, np.isfinite(errors[0, 0])]
     k, n = dx.shape
     distance = np.sqrt(dx * dx + dy * dy)
-    beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in limits]
+    beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in settings.clusters_mm]
     edges = np.stack([np.full(k, n), *beyond, np.zeros(k, dtype=np.int64)])
     squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
     sums = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
@@ -236,62 +232,22 @@ def _simulate(
 
 
 def plane_errors(
-    sensor: Sensor, iop: Array, sets: Array, points: Array, distance_mm: float
+    sensor: Sensor, sets: Array, points: Array, expected: Array, distance_mm: float
 ) -> Array:
-    """Return errors (n, k, 2) mm of image points (k, 2) px for sets (n, 10); NaN without rays."""
-    dx, dy, ok = _PlaneErrors(sensor, iop, points, distance_mm)(sets)
-    errors = np.stack([dx.T, dy.T], axis=-1)
-    errors[~ok] = np.nan
-    return errors
+    """Return the errors in X and Y (2, k, n) mm of image points (k, 2) px for sets (n, 10).
 
-
-class _PlaneErrors:
-    """The errors of fixed image points for many sets of IOP.
-
-    The ideal point of each set starts at its first-order value, where its Jacobian is evaluated
-    once, so that two or three steps are enough. A general inversion would start at the image point.
+    expected (k, 2): points on the plane, mm, as `on_plane` gives them. A set that has no ray for
+    one of the points has NaN for all.
     """
-
-    def __init__(self, sensor: Sensor, iop: Array, points: Array, distance_mm: float) -> None:
-        self.expected = on_plane(sensor, iop, points, distance_mm)
-        self._distance = distance_mm
-        self._mm = image_to_mm(sensor, points)
-        self._iop = iop
-        scale = iop[0] / distance_mm
-        self._tolerance = _CONVERGED * iop[0]
-        self._ideal = self.expected * scale
-        by_iop = plane_jacobian(sensor, iop, points, distance_mm) * scale
-        # x̄ = X c / D depends on c also directly, not only through X
-        by_iop[:, :, 0] += self.expected / distance_mm
-        self._by_iop = by_iop
-
-    # a set that folds the image may diverge; it has no rays
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def __call__(self, sets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the errors in X and Y (k, n) mm of sets (n, 10), and which sets (n,) have rays."""
-        sets = np.asfortranarray(sets)
-        step = (sets - self._iop).T
-        # (k, n, 1): one point per camera at a time, as the camera model broadcasts
-        x = (self._ideal[:, :1] + self._by_iop[:, 0] @ step)[..., None]
-        y = (self._ideal[:, 1:] + self._by_iop[:, 1] @ step)[..., None]
-        xm, ym = self._mm[:, 0, None, None], self._mm[:, 1, None, None]
-        jxx, jxy, jyx, jyy = distortion_jacobian(sets, x, y)
-        inverse = 1.0 / (jxx * jyy - jxy * jyx)
-        ok: NDArray[np.bool_] = np.asarray((inverse > 0).all(axis=(0, 2)))
-        jxx, jxy, jyx, jyy = jyy * inverse, jxy * inverse, jyx * inverse, jxx * inverse
-        for _ in range(_STEPS):
-            xd, yd = distort(sets, x, y)
-            rx, ry = xm - xd, ym - yd
-            if max(rx.max(), -rx.min(), ry.max(), -ry.min()) <= self._tolerance:
-                break
-            x += jxx * rx - jxy * ry
-            y += jyy * ry - jyx * rx
-        else:
-            far = np.fmax(np.abs(rx), np.abs(ry))
-            ok &= (far <= self._tolerance).all(axis=(0, 2))
-        scale = self._distance / sets[:, 0]
-        found_x, found_y = x[..., 0] * scale, y[..., 0] * scale
-        return found_x - self.expected[:, :1], found_y - self.expected[:, 1:], ok
+    sets, middle = np.asfortranarray(sets), expected.T[..., None]
+    scale = distance_mm / sets[:, 0]
+    # (k, n, 1): one point per camera at a time, as the camera model broadcasts
+    ideal = (middle / scale)[..., None]
+    measured = image_to_mm(sensor, points).T[..., None, None]
+    solved = solve_distortion(sets, *measured, *ideal, _CONVERGED * sensor.pixel_pitch)
+    errors = ideal[..., 0] * scale - middle
+    errors[:, :, ~solved.all(axis=(0, 2))] = np.nan
+    return np.asarray(errors)
 
 
 REFERENCES = ("first", "mean", "last")
@@ -337,9 +293,10 @@ def trajectories(
             rows = spread_rows(len(one), _MOST_EPOCHS)
             fixed = {"first": one.values[0], "mean": one.mean, "last": one.values[-1]}[reference]
             points = image_grid(one.sensor, size)
-            errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)
-            away = np.linalg.norm(errors, axis=-1)
-            distances.append(away[np.isfinite(away).all(axis=1)])
+            expected = on_plane(one.sensor, fixed, points, distance_mm)
+            errors = plane_errors(one.sensor, one.values[rows], points, expected, distance_mm)
+            away = np.hypot(*errors).T
+            distances.append(away[np.isfinite(away[:, 0])])
         every = np.concatenate(distances)
         below = [float(np.mean(every < limit)) for limit in clusters_mm]
         found.append(

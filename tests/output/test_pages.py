@@ -22,7 +22,7 @@ from tests.blind.generator import generate
 from tests.commands import call
 from tests.conftest import watch
 from tests.daemon.conftest import make_recording
-from tests.pictures import ORIENTATION, from_five_places, save_photograph
+from tests.pictures import from_five_places
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table
@@ -31,7 +31,7 @@ from thermocald.discovery.result import discover_series
 from thermocald.fleet.page import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
-from thermocald.output.study.report import cut_clip, render_study, save_figures
+from thermocald.output.study.report import render_study, save_figures
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
@@ -210,7 +210,7 @@ def _fleet(**_):
 def _epochs(tmp_path_factory, **_):
     folder = tmp_path_factory.mktemp("epochs")
     recording = open_recording(make_recording(folder / "small", 60))
-    epochs = with_drifts(recorded_table(recording, AdjustmentSettings(), "auto", None, 1)[0])
+    epochs = with_drifts(recorded_table(recording, AdjustmentSettings(), "auto"))
     return epochs.report(folder / "epochs.html").read_text(encoding="utf-8")
 
 
@@ -494,24 +494,6 @@ def test_three_epochs_are_correlated_by_chance_which_is_not_told(warm_up, undraw
     assert "Correlation matrix, M1" not in words
     assert "change together" not in words
     assert "Record more epochs, over a wider range of temperatures." in words
-
-
-def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(
-    page_text, warm_study, tmp_path
-):
-    html = page_text("study")
-    clip = warm_study.cameras[0].series[0].series.clip
-    cut = cut_clip(clip.first, clip.centre, 15)
-    assert cut[7, 7] == 250
-    assert (cut[:, :2] == 0).all()
-    assert (cut[:, 2] == 50).all()
-    assert len(re.findall(r'src="data:image/png;base64,', html)) == 2
-    assert "Image around target 17" in html
-    # the orientation for display in EXIF does not rotate the target's position
-    turned = np.zeros((30, 40), np.uint8)
-    turned[10, 5] = 250
-    save_photograph(tmp_path / "turned.jpg", {ORIENTATION: 6}, turned, quality=100)
-    assert cut_clip(tmp_path / "turned.jpg", clip.centre, 15)[7, 7] > 200
 
 
 @pytest.mark.slow

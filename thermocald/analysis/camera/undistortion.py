@@ -28,7 +28,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 
 def image_grid(sensor: Sensor, size: int = 3) -> Array:
@@ -57,14 +57,14 @@ def ideal_points(
     out, inverse = np.empty_like(points), _inverse_radial(sensor, i)
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        solved = np.False_
+        solved = False
         if inverse is not None:
             measured = np.ascontiguousarray(image_to_mm(sensor, points[part]).T)
             ideal = measured - i[1:3, None]
             ideal *= np.polyval(inverse, ideal[0] ** 2 + ideal[1] ** 2)
-            solved = solve_distortion(i, *measured, *ideal, _STEP_PX * sensor.pixel_pitch)
+            solved = bool(solve_distortion(i, measured, ideal, _STEP_PX * sensor.pixel_pitch).all())
             ideal /= i[0]
-        if not solved.all():
+        if not solved:
             r = rays(sensor, i, points[part]).T
             ideal = r[:2] / -r[2]
         for k in range(2):
@@ -74,17 +74,16 @@ def ideal_points(
 
 # a camera that folds the image may diverge; it has no rays
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def solve_distortion(
-    iop: Array, xm: Array, ym: Array, x: Array, y: Array, tolerance: float
-) -> NDArray[np.bool_]:
-    """Replace approximate ideal points x, y (..., n) mm by those of measured points xm, ym.
+def solve_distortion(iop: Array, measured: Array, ideal: Array, tolerance: float) -> Mask:
+    """Replace approximate ideal points (2, ..., n) mm by those of measured points (2, ..., n).
 
     iop (..., 10), as `distort` takes it. Newton's method with the Jacobian of the start, until all
     steps are below `tolerance`, mm. Returns which points (..., n) have a solution.
     """
+    (xm, ym), (x, y) = measured, ideal
     jxx, jxy, jyx, jyy = distortion_jacobian(iop, x, y)
     inverse = 1.0 / (jxx * jyy - jxy * jyx)
-    solved: NDArray[np.bool_] = inverse > 0
+    solved: Mask = inverse > 0
     jxx, jxy, jyx, jyy = jyy * inverse, jxy * inverse, jyx * inverse, jxx * inverse
     for _ in range(_STEPS):
         xd, yd = distort(iop, x, y)
@@ -94,7 +93,7 @@ def solve_distortion(
         y += dy
         if max(dx.max(), -dx.min(), dy.max(), -dy.min()) <= tolerance:
             return solved
-    return solved & (np.fmax(np.abs(dx), np.abs(dy)) <= tolerance)
+    return np.asarray(solved & (np.fmax(np.abs(dx), np.abs(dy)) <= tolerance))
 
 
 def directions(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:

@@ -244,7 +244,7 @@ def plane_errors(
     # (k, n, 1): one point per camera at a time, as the camera model broadcasts
     ideal = (middle / scale)[..., None]
     measured = image_to_mm(sensor, points).T[..., None, None]
-    solved = solve_distortion(sets, *measured, *ideal, _CONVERGED * sensor.pixel_pitch)
+    solved = solve_distortion(sets, measured, ideal, _CONVERGED * sensor.pixel_pitch)
     errors = ideal[..., 0] * scale - middle
     errors[:, :, ~solved.all(axis=(0, 2))] = np.nan
     return np.asarray(errors)

@@ -129,8 +129,8 @@ def reference_studies(
                 path = Path(folder) / name
                 preset_simulation(preset, seed, name).write(path)
                 recording = open_recording(path)
-                table, seen = recorded_table(recording, AdjustmentSettings(), "series")
-                one = measured_series(recording, table, seen, preset)
+                table = recorded_table(recording, AdjustmentSettings(), "series")
+                one = measured_series(recording, table, preset)
                 # the folder no longer exists when the study is read
                 source = f"preset {preset}, series {name}, seed {seed}"
                 measured.append(replace(one, source=source))

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.arrays import eight_bit
-from thermocald.errors import ImageError
-from thermocald.figures import Figure, draw_figure, save
+from thermocald.figures import draw_figure, save
 from thermocald.files import make_folder
 from thermocald.numbers import enumerated, plain
 from thermocald.output.study import tables
@@ -23,7 +21,6 @@ from thermocald.output.study.figures import (
     study_figures,
 )
 from thermocald.output.study.summary import answer_sentences, detail_sentences
-from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day, render_report
 from thermocald.store.recording.sense import doubt_lines
 
@@ -31,13 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import CameraStudy, Study
 
-_CLIP_PX = 96
-_CLIP_LONGEST_PX = 480
 _LEAD = (
     "How the interior orientation of a camera changes with its temperature, whether the changes "
     "are significant, and what they do to measurements in object space; the analysis is that of "
@@ -128,18 +121,18 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
 
     def section(
         title: str, names: Sequence[str], found: Sequence[Table],
-        more: Sequence[Figure] = (), text: Sequence[str] = (), folded: bool = False,
+        text: Sequence[str] = (), folded: bool = False,
     ) -> Section:  # fmt: skip
-        shown = [drawn[name] for name in names if name in drawn]
+        shown = tuple(drawn[name] for name in names if name in drawn)
         rows = tuple(t for t in found if t.rows)
-        return Section(title, tuple(text), (*shown, *more), rows, folded=folded)
+        return Section(title, tuple(text), shown, rows, folded=folded)
 
     matrices = [name for name in drawn if name.startswith("correlation-")]
     depends = tables.dependence_tables(camera)
     parts = [
         section(
             "How the camera changed", ("deviations", "principal-point", "movement"),
-            [tables.deviation_table(camera)], _clips(camera),
+            [tables.deviation_table(camera)],
         ),
         section(
             "How it depends on the temperature", ("temperature-dependence",),
@@ -177,60 +170,6 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
     lens = f"f/{settings.f_number:g} and focused at {settings.focus_mm / 1000:g} m"
     change = f"its depth of field would change by {enumerated(changes)}"
     return (f"If the lens were {lens}, {change}. Neither was measured.",)
-
-
-def _clips(camera: CameraStudy) -> list[Figure]:
-    """Show the first and last image around one target for every series that has frames."""
-    made = []
-    for i, study in enumerate(camera.series):
-        clip = study.series.clip
-        if clip is None:
-            continue
-        images = tuple(
-            (f"{study.series.name}, epoch {epoch}", clip_png(cut_clip(path, clip.centre, _CLIP_PX)))
-            for path, epoch in ((clip.first, clip.first_epoch), (clip.last, clip.last_epoch))
-        )
-        made.append(
-            Figure(
-                f"clips-{i}",
-                f"Image around target {clip.target}",
-                f"The same {_CLIP_PX} × {_CLIP_PX} px of the first and the last frame; the cross "
-                "marks the position of the target in the first.",
-                images=images,
-            )
-        )
-    return made
-
-
-def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.uint8]:
-    """Return a grey square of `size` px about `centre` (px), black beyond the image's edge.
-
-    Raises ImageError for a file that is not an image.
-    """
-    image = eight_bit(decode_grey(path))
-    left, top = (round(v - (size - 1) / 2) for v in centre)
-    clip = np.zeros((size, size), dtype=np.uint8)
-    height, width = image.shape
-    x0, x1 = max(left, 0), min(left + size, width)
-    y0, y1 = max(top, 0), min(top + size, height)
-    if x0 < x1 and y0 < y1:
-        clip[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
-    return clip
-
-
-def clip_png(clip: NDArray[np.uint8]) -> bytes:
-    """Return a clip as PNG, enlarged by whole pixels, with a cross at its centre."""
-    import cv2
-
-    factor = max(1, _CLIP_LONGEST_PX // len(clip))
-    large = cv2.cvtColor(np.kron(clip, np.ones((factor, factor), np.uint8)), cv2.COLOR_GRAY2BGR)
-    middle = len(large) // 2
-    cv2.line(large, (middle, 0), (middle, len(large)), (0, 94, 213), 1)
-    cv2.line(large, (0, middle), (len(large), middle), (0, 94, 213), 1)
-    done, png = cv2.imencode(".png", large)
-    if not done:
-        raise ImageError("an image clip could not be written as PNG")
-    return bytes(png.tobytes())
 
 
 def _notes(camera: CameraStudy) -> list[str]:

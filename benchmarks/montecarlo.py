@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.store import best
 from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.montecarlo import draw_root, on_plane, plane_errors, simulate_errors
-from thermocald.analysis.study.series_study import StudySettings
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.online.equilibrium import EquilibriumWatch, fit_approach
+from thermocald.analysis.online.observer import EquilibriumWatch, fit_approach
 
 GAIN, POSE = np.zeros((3, 6)), np.zeros(6)
 

@@ -8,6 +8,7 @@ import pytest
 from benchmarks.montecarlo import CORRELATION, IOP, SDS, SENSOR, opencv_loop
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study import montecarlo
+from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.montecarlo import (
     draw_root,
     mean_and_largest,
@@ -17,7 +18,6 @@ from thermocald.analysis.study.montecarlo import (
     shares_within,
     simulate_errors,
 )
-from thermocald.analysis.study.series_study import StudySettings
 from thermocald.errors import GeometryError
 
 OTHER_IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4, 1e-4, -2e-4])

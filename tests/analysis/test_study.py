@@ -7,19 +7,19 @@ import pytest
 
 from tests.analysis.conftest import INTERIOR, NEXUS
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.study.measured import Thermometer
+from thermocald.analysis.study.measured import StudySettings, Thermometer
 from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
-from thermocald.analysis.study.series_study import (
-    StudySettings,
+from thermocald.analysis.study.study import (
     circle_of_confusion,
     depth_of_field,
     deviation,
     displacement_covariance,
     image_displacement,
+    study,
+    study_camera,
     study_series,
 )
-from thermocald.analysis.study.study import study, study_camera
-from thermocald.output.study.summary import answer_sentences
+from thermocald.output.study.report import answer_sentences
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 
 SETTINGS = StudySettings(sets=2000)

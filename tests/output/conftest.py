@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.analysis.conftest import WarmUp
-from thermocald.analysis.study.study import StudySettings, study
+from thermocald.analysis.study.measured import StudySettings
+from thermocald.analysis.study.study import study
 
 
 @pytest.fixture(scope="session")

@@ -26,7 +26,8 @@ from tests.pictures import from_five_places
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table
-from thermocald.analysis.study.study import StudySettings, study
+from thermocald.analysis.study.measured import StudySettings
+from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
 from thermocald.fleet.page import render_fleet
 from thermocald.output.calibration import render_calibration

@@ -20,6 +20,7 @@ import numpy as np
 from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
+from thermocald.names import checked
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.store.recording.reader import interpolate_readings
 from thermocald.store.sources import StoredRecording
@@ -35,6 +36,30 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.store.recording.reader import Recording
+
+
+@checked
+@dataclass(frozen=True)
+class StudySettings:
+    """The options of a study; lengths in mm, temperatures in K.
+
+    window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo
+    simulation; focus_mm, f_number, confusion_mm (None: 1/2000 of the image diagonal): of the depth
+    of field; thermometer_sd: None estimates it from the readings; jobs: processes that simulate.
+    """
+
+    window: int = 31
+    alpha: float = 0.05
+    sets: int = 50_000
+    seed: int = 0
+    distance_mm: float = 10_000.0
+    grid: int = 3
+    clusters_mm: tuple[float, ...] = (15.0, 50.0, 100.0)
+    focus_mm: float = 1000.0
+    f_number: float = 2.0
+    confusion_mm: float | None = None
+    thermometer_sd: float | None = None
+    jobs: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +125,16 @@ class MeasuredSeries:
         """Return the values and standard deviations (E,) of one IOP; do not write to them."""
         k = IOP_NAMES.index(name)
         return np.ascontiguousarray(self.values[:, k]), np.ascontiguousarray(self.sds[:, k])
+
+    @cached_property
+    def columns(self) -> dict[str, tuple[Array, Array]]:
+        """{name: values and sds (E,)} of the estimated IOP, of sigma0, and of the thermometers."""
+        sd_sigma0 = self.sigma0 / np.sqrt(2 * np.maximum(self.redundancy, 1.0))
+        return {
+            **{name: self.column(name) for name in self.free},
+            "sigma0": (self.sigma0, sd_sigma0),
+            **{t.name: (t.values, np.full(len(self), t.sd)) for t in self.thermometers},
+        }
 
     @property
     def reference(self) -> Thermometer | None:

@@ -39,8 +39,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.analysis.study.measured import MeasuredSeries
-    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.measured import MeasuredSeries, StudySettings
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
@@ -250,9 +249,6 @@ def plane_errors(
     return np.asarray(errors)
 
 
-REFERENCES = ("first", "mean", "last")
-"""Names of the interior orientations that are held fixed."""
-
 _MOST_EPOCHS = 2000  # per series, evenly spread
 
 
@@ -287,7 +283,7 @@ def trajectories(
     """
     found = []
     series = [one for one in series if len(one) > 1]
-    for reference in REFERENCES if series else ():
+    for reference in ("first", "mean", "last") if series else ():
         distances = []
         for one in series:
             rows = spread_rows(len(one), _MOST_EPOCHS)
@@ -317,14 +313,9 @@ def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
     NaN for parameters that were held or did not change.
     """
     columns = []
-    every = [name for name in IOP_NAMES if any(name in one.free for one in series)]
-    for name in every:
-        within = []
-        for one in series:
-            values = one.column(name)[0] if name in one.free else np.full(len(one), np.nan)
-            within.append(values - values.mean())  # a single epoch's column is no copy
-        columns.append(within[0] if len(within) == 1 else np.concatenate(within))
-    rows = [IOP_NAMES.index(name) for name in every]
-    matrix = np.full((len(IOP_NAMES), len(IOP_NAMES)), np.nan)
-    matrix[np.ix_(rows, rows)] = correlation_matrix(columns)
-    return matrix
+    for name in IOP_NAMES:
+        known = [
+            one.column(name)[0] if name in one.free else np.full(len(one), np.nan) for one in series
+        ]
+        columns.append(np.concatenate([values - values.mean() for values in known]))
+    return correlation_matrix(columns)

@@ -25,7 +25,7 @@ from thermocald.store.recording.reader import open_recording
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.measured import StudySettings
     from thermocald.analysis.study.study import CameraStudy
 
     _Row = tuple[str, str, str, float, float, float]

@@ -27,8 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from thermocald.analysis.study.series_study import SeriesStudy
-    from thermocald.analysis.study.study import CameraStudy
+    from thermocald.analysis.study.study import CameraStudy, SeriesStudy
     from thermocald.arrays import Array
 
 _DRAWN = 400  # points of a cloud

@@ -24,13 +24,13 @@ from thermocald.report import Table
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.study.series_study import (
+    from thermocald.analysis.study.measured import StudySettings
+    from thermocald.analysis.study.study import (
+        CameraStudy,
         ChannelStudy,
         Deviation,
         SeriesStudy,
-        StudySettings,
     )
-    from thermocald.analysis.study.study import CameraStudy
     from thermocald.arrays import Array
 
 _FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}

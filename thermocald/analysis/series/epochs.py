@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
-from thermocald.analysis.series.drift import Course, carried_by_c, table_of
+from thermocald.analysis.series.course import Course, carried_by_c, table_of
 from thermocald.errors import DataError, DriverMissing, UsageError
 from thermocald.figures import BAND
 from thermocald.files import write_parts

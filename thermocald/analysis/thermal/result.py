@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from scipy.linalg import block_diag
 
-from thermocald.analysis.series.drift import carried_by_c
+from thermocald.analysis.series.course import carried_by_c
 from thermocald.analysis.thermal.level import (
     AFFINITY_SD,
     average_residuals,

@@ -134,15 +134,6 @@ def test_any_number_of_sets_needs_less_than_20_mb_and_reports_progress(sets):
     assert result.counts.sum() == 9 * sets
 
 
-def test_two_processes_give_the_bits_of_one():
-    one, two = (
-        simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=5000, seed=3, jobs=jobs))
-        for jobs in (1, 2)
-    )
-    for name in ("counts", "mean", "largest", "mean_error", "covariance", "sample"):
-        np.testing.assert_array_equal(getattr(two, name), getattr(one, name))
-
-
 def test_the_jacobian_equals_differences():
     points = image_grid(SENSOR)
     jacobian = plane_jacobian(SENSOR, OTHER_IOP, points, 1e4)

@@ -45,7 +45,8 @@ class StudySettings:
 
     window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo
     simulation; focus_mm, f_number, confusion_mm (None: 1/2000 of the image diagonal): of the depth
-    of field; thermometer_sd: None estimates it from the readings; jobs: processes that simulate.
+    of field; thermometer_sd: None estimates it from the readings; jobs: processes that adjust
+    the presets.
     """
 
     window: int = 31

@@ -27,7 +27,6 @@ from thermocald.analysis.camera.undistortion import ideal_points, image_grid, so
 from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
-from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     image_to_mm,
@@ -89,7 +88,7 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
 
 
 _CHUNK = 1024
-_SAMPLE = 1500
+_SAMPLE = 400  # of the first sets, whose errors are drawn
 _CONVERGED = 1e-6  # px, a last step that leaves an error far below
 
 
@@ -162,38 +161,40 @@ def simulate_errors(
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
     sds (10,) in the units of the IOP, correlation (10, 10); progress receives the number of sets
-    done. The result is the same, bit for bit, with any number of processes. Raises GeometryError if
-    a grid point has no expected point, or if fewer than two sets have rays.
+    done. Raises GeometryError if a grid point has no expected point, or if fewer than two sets have
+    rays.
     """
-    points, sets = image_grid(sensor, settings.grid), settings.sets
+    points, sets, limits = image_grid(sensor, settings.grid), settings.sets, settings.clusters_mm
     root = draw_root(sds, correlation)
     expected = on_plane(sensor, iop, points, settings.distance_mm)
     k = len(points)
-    counts = np.zeros((k, len(settings.clusters_mm) + 1), dtype=np.int64)
+    beyond = np.zeros((k, len(limits)), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))
     sample: list[Array] = []
     rng = np.random.default_rng(settings.seed)
-    folded = 0
-    draws = (
-        (rng.standard_normal((min(_CHUNK, sets - done), len(root))), max(_SAMPLE - done, 0))
-        for done in range(0, sets, _CHUNK)
-    )
-    for drawn, ok, part_counts, part_largest, part_sums, first_errors in in_order(
-        _simulate, (sensor, iop, root, points, expected, settings), draws, settings.jobs
-    ):
-        folded += drawn - ok
-        counts += part_counts
-        np.maximum(largest, part_largest, out=largest)
-        sums += part_sums
-        sample.append(first_errors)
+    used = 0
+    for done in range(0, sets, _CHUNK):
+        drawn = iop + rng.standard_normal((min(_CHUNK, sets - done), len(root))) @ root
+        errors = plane_errors(sensor, drawn, points, expected, settings.distance_mm)
+        dx, dy = errors if np.isfinite(errors).all() else errors[:, :, np.isfinite(errors[0, 0])]
+        distance = np.sqrt(dx * dx + dy * dy)
+        used += distance.shape[1]
+        beyond += np.stack([np.count_nonzero(distance >= one, axis=1) for one in limits], axis=1)
+        np.maximum(largest, distance.max(axis=1, initial=0.0), out=largest)
+        squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
+        rows = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
+        sums += np.stack(rows, axis=1)
+        if done < _SAMPLE:
+            sample.append(np.stack([dx.T, dy.T], axis=-1))
         if progress is not None:
-            progress(drawn)
-    used = sets - folded
+            progress(len(drawn))
+    folded = sets - used
     if used < 2:
         raise GeometryError(
             f"{folded} of {sets} drawn interior orientations fold the image over itself: the "
             "standard deviations of the distortion parameters are too large to simulate with"
         )
+    counts = -np.diff(beyond, axis=1, prepend=used, append=0)
     means = sums / used
     mean_error = means[:, 1:3]
     second = means[:, [3, 5, 5, 4]].reshape(k, 2, 2)
@@ -201,32 +202,6 @@ def simulate_errors(
     return MonteCarlo(
         sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, expected,
         counts, means[:, 0], largest, mean_error, covariance, np.concatenate(sample), folded,
-    )  # fmt: skip
-
-
-def _simulate(
-    common: tuple[Sensor, Array, Array, Array, Array, StudySettings], draws: tuple[Array, int]
-) -> tuple[int, int, NDArray[np.int64], Array, Array, Array]:
-    """Simulate a chunk of sets.
-
-    common: the sensor, the mean IOP (10,), the root (r, 10) of their covariance, the image points
-    and where they are expected, the settings; draws: standard normal numbers (n, r), and how many
-    sets the sample still needs. Returns the numbers of sets drawn and of sets with rays; counts,
-    largest as in `MonteCarlo`; sums (k, 6) of distances, errors, their squares and product; errors
-    (s, k, 2) of the sample.
-    """
-    (sensor, iop, root, points, expected, settings), (normal, wanted) = common, draws
-    errors = plane_errors(sensor, iop + normal @ root, points, expected, settings.distance_mm)
-    dx, dy = errors if np.isfinite(errors).all() else errors[:, :, np.isfinite(errors[0, 0])]
-    k, n = dx.shape
-    distance = np.sqrt(dx * dx + dy * dy)
-    beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in settings.clusters_mm]
-    edges = np.stack([np.full(k, n), *beyond, np.zeros(k, dtype=np.int64)])
-    squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
-    sums = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
-    return (
-        len(normal), n, -np.diff(edges, axis=0).T, distance.max(axis=1, initial=0.0),
-        np.stack(sums, axis=1), np.stack([dx[:, :wanted].T, dy[:, :wanted].T], axis=-1),
     )  # fmt: skip
 
 

@@ -129,7 +129,9 @@ def reference_studies(
                 path = Path(folder) / name
                 preset_simulation(preset, seed, name).write(path)
                 recording = open_recording(path)
-                table = recorded_table(recording, AdjustmentSettings(), "series")
+                table = recorded_table(
+                    recording, AdjustmentSettings(), "series", jobs=settings.jobs
+                )
                 one = measured_series(recording, table, preset)
                 # the folder no longer exists when the study is read
                 source = f"preset {preset}, series {name}, seed {seed}"

@@ -225,8 +225,8 @@ def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_
     calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
     adjusted, restarted = running._adjust_newest, []
 
-    def contradicted():
-        own, whole = adjusted()
+    def contradicted(alone):
+        own, whole = adjusted(alone)
         return own, replace(whole, status="global_test")
 
     running._adjust_newest = contradicted

@@ -127,6 +127,11 @@ class MeasuredSeries:
         k = IOP_NAMES.index(name)
         return np.ascontiguousarray(self.values[:, k]), np.ascontiguousarray(self.sds[:, k])
 
+    @property
+    def path_px(self) -> Array:
+        """The principal point (E, 2) from its first position, px, right and up."""
+        return np.asarray((self.values[:, 1:3] - self.values[0, 1:3]) / self.sensor.pixel_pitch)
+
     @cached_property
     def columns(self) -> dict[str, tuple[Array, Array]]:
         """{name: values and sds (E,)} of the estimated IOP, of sigma0, and of the thermometers."""

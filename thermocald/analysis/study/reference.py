@@ -154,7 +154,7 @@ def compare(camera: CameraStudy) -> list[Comparison]:
     # direction of the principal point's largest shift, degrees from right towards up
     steps = []
     for one in series:
-        path = one.series.values[:, 1:3] - one.series.values[0, 1:3]
+        path = one.series.path_px
         steps.append(path[int(np.argmax(np.linalg.norm(path, axis=1)))])
     right, up = np.mean(steps, axis=0)
     where = float(np.degrees(np.arctan2(up, right)))

@@ -355,10 +355,9 @@ def _change(study: SeriesStudy) -> str:
         return ""
     words = []
     if "x0" in d and "y0" in d:
-        pitch = s.sensor.pixel_pitch
-        way = np.hypot(*((s.values[:, k] - s.values[0, k]) / pitch for k in (1, 2)))
+        way = np.hypot(*s.path_px.T)
         moved, farthest = float(way[-1]), float(way.max())
-        sd = float(np.hypot(d["x0"].sd_change, d["y0"].sd_change)) / pitch
+        sd = float(np.hypot(d["x0"].sd_change, d["y0"].sd_change)) / s.sensor.pixel_pitch
         if farthest > max(1.5 * moved, 6 * sd):
             words.append(
                 f"the principal point moved by up to {plain(farthest, 'px', 3)} and ended "

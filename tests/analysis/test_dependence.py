@@ -82,6 +82,16 @@ def _slope(y, x):
     return float(x @ y / (x @ x))
 
 
+def _error_over_sd(x, coloured, phi, thermometer=0.0):
+    rng, off = np.random.default_rng(2), []
+    for _ in range(400):
+        y = noise(rng, coloured, phi, len(x))
+        read = x + thermometer * rng.standard_normal(len(x))
+        b = _slope(y, read)
+        off.append(b / slope_noise(y, read, b, thermometer).sd)
+    return float(np.sqrt(np.mean(np.square(off))))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("x", [WARM_UP, HEATED], ids=["warm-up", "up and down"])
 @pytest.mark.parametrize(
@@ -89,12 +99,11 @@ def _slope(y, x):
 )
 def test_errors_of_the_slope_are_as_large_as_its_sd(x, coloured, phi):
     """400 draws of 150 epochs give the ratio to 4 %, with slow noise to 8 %; it once was 1.5."""
-    rng, off = np.random.default_rng(2), []
-    for _ in range(400):
-        y = noise(rng, coloured, phi, len(x))
-        b = _slope(y, x)
-        off.append(b / slope_noise(y, x, b).sd)
-    assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.2
+    assert 0.75 < _error_over_sd(x, coloured, phi) < 1.2
+
+
+def test_a_thermometer_whose_noise_is_an_eighth_of_the_rise():
+    assert 0.65 < _error_over_sd(WARM_UP, 0.0, 0.0, 0.125) < 1.1
 
 
 @pytest.mark.parametrize(

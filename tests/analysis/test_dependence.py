@@ -48,6 +48,7 @@ def test_the_correlation_matrix_equals_numpys_and_is_nan_for_constants():
     assert matrix[0, 3] == pytest.approx(np.corrcoef(columns[0][keep], columns[3][keep])[0, 1])
 
 
+@pytest.mark.slow
 def test_slope_is_unbiased_and_its_sd_true():
     """With 1.5 K of noise on a rise of 12 K, ordinary least squares is 20 % too flat."""
     rng = np.random.default_rng(5)

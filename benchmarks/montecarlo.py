@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.store import best
 from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.montecarlo import draw_root, on_plane, plane_errors, simulate_errors
-from thermocald.analysis.study.series_study import StudySettings
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
@@ -58,7 +58,9 @@ def main() -> int:
 
     plane = opencv_loop(sets, points) * [DISTANCE_MM, -DISTANCE_MM]
     theirs = np.linalg.norm(plane - on_plane(SENSOR, IOP, points, DISTANCE_MM), axis=2)
-    mine = np.linalg.norm(plane_errors(SENSOR, IOP, sets, points, DISTANCE_MM), axis=2)
+    mine = np.hypot(
+        *plane_errors(SENSOR, sets, points, on_plane(SENSOR, IOP, points, DISTANCE_MM), DISTANCE_MM)
+    ).T
     difference = float(np.abs(mine - theirs).max())
 
     def peak_mb(count: int) -> float:

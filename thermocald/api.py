@@ -32,7 +32,7 @@ from thermocald.series import (
 from thermocald.series import open as open_series
 
 if TYPE_CHECKING:
-    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.measured import StudySettings
     from thermocald.discovery.plan import Plan
     from thermocald.physics.model import ModelEffect
     from thermocald.physics.presets import Catalogue
@@ -449,7 +449,7 @@ def simulate(
 
 
 def _study_settings(**given: Any) -> StudySettings:
-    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.measured import StudySettings
 
     s = StudySettings(**given)
     require_within(

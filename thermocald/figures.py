@@ -8,7 +8,6 @@ searched, copied and edited.
 
 from __future__ import annotations
 
-import base64
 import io
 import re
 import warnings
@@ -121,7 +120,7 @@ def image_panel(title: str, *curves: Curve, arrows: Arrows | None = None) -> Pan
 class Figure:
     """Panels or one matplotlib drawing, with a name that is also its file's.
 
-    images: (label, PNG bytes), shown on a page only; columns: greatest number of panels in a row.
+    columns: greatest number of panels in a row.
     """
 
     name: str
@@ -130,12 +129,11 @@ class Figure:
     panels: tuple[Panel, ...] = ()
     columns: int = 3
     drawing: Any = None
-    images: tuple[tuple[str, bytes], ...] = ()
 
     @property
     def in_a_row(self) -> int:
-        """The number of panels or images side by side."""
-        return max(1, min(self.columns, len(self.panels) + len(self.images)))
+        """The number of panels side by side."""
+        return max(1, min(self.columns, len(self.panels)))
 
     @property
     def width_rem(self) -> float:
@@ -151,11 +149,6 @@ class Figure:
             inline_svg(draw_panel(panel, legend=i == 0), f"{name}-{i}", panel.title)
             for i, panel in enumerate(self.panels)
         ]
-
-    def sources(self) -> list[tuple[str, str]]:
-        """Return the label and the data URL of each image."""
-        start = "data:image/png;base64,"
-        return [(label, start + base64.b64encode(png).decode()) for label, png in self.images]
 
 
 def thin(x: Array, *ys: Array) -> tuple[Array, ...]:

@@ -98,13 +98,10 @@ def rounded(value: float, sd: float, unit: str = "") -> str:
     """Write a number, without its standard deviation, to the latter's second digit."""
     if not math.isfinite(value) or not math.isfinite(sd) or sd <= 0:
         return plain(value, unit, 6)
-    if max(abs(value), sd) < 1e-3:
-        exponent = math.floor(math.log10(max(abs(value), sd)))
-        decimals = max(0, 1 + exponent - math.floor(math.log10(sd)))
-        body = f"{value / 10**exponent:.{decimals}f}·10{superscript(exponent)}"
-        return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
-    decimals = max(0, 1 - math.floor(math.log10(sd)))
-    return f"{value:.{decimals}f} {unit}".rstrip().replace("-", _MINUS)
+    largest = max(abs(value), sd)
+    exponent = math.floor(math.log10(largest)) if largest < 1e-3 else 0
+    decimals = max(0, 1 + exponent - math.floor(math.log10(sd)))
+    return _times_power(value, exponent, decimals, unit)
 
 
 def plain(value: float, unit: str = "", digits: int = 4) -> str:
@@ -115,9 +112,14 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
         return f"0 {unit}".rstrip()
     exponent = math.floor(math.log10(abs(value)))
     if -3 <= exponent < 5:
-        body = f"{value:.{max(0, digits - 1 - exponent)}f}"
-    else:
-        body = f"{value / 10**exponent:.{digits - 1}f}·10{superscript(exponent)}"
+        return _times_power(value, 0, max(0, digits - 1 - exponent), unit)
+    return _times_power(value, exponent, digits - 1, unit)
+
+
+def _times_power(value: float, exponent: int, decimals: int, unit: str) -> str:
+    """Write a number as a multiple of a power of ten, if that is not 1."""
+    power = f"·10{superscript(exponent)}" if exponent else ""
+    body = f"{value / 10**exponent:.{decimals}f}{power}"
     return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 

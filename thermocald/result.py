@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     Columns = dict[str, Column]
 
 
+_ROWS = 20_000
+
+
 @checked
 class Result(ABC):
     """The result of an analysis; `print` shows what the command prints."""
@@ -154,6 +157,12 @@ def csv_text(
         cells = [_cells(name, values, decimal) for name, values in columns.items()]
         writer.writerows(zip(*cells, strict=True))
         yield text.getvalue()
+
+
+def in_parts(columns: Columns) -> Iterator[Columns]:
+    """Yield columns some thousand rows at a time: the text of a year's takes gigabytes."""
+    for first in range(0, max(len(next(iter(columns.values()))), 1), _ROWS):
+        yield {name: values[first : first + _ROWS] for name, values in columns.items()}
 
 
 def _cells(name: str, values: Column, decimal: str) -> Iterable[str]:

@@ -19,7 +19,7 @@ from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
 from thermocald.numbers import typeset_powers, with_sd
-from thermocald.output.study.summary import study_document, study_lines
+from thermocald.output.study.report import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
 from thermocald.store.logger.photographs import known_photograph

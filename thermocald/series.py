@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.simulation import Simulation
     from thermocald.result import Columns
     from thermocald.store.recording.head import Head
@@ -190,7 +190,7 @@ class Series:
         settings = AdjustmentSettings(free=free_names(free))
         if store is None:
             with self._opened() as source:
-                return with_drifts(_adjust(source, settings, exterior, progress, jobs)[0])
+                return with_drifts(_adjust(source, settings, exterior, progress, jobs))
         path = source_of(store)
         if not isinstance(self._measured, Recording):
             raise UsageError(f"{path}: {self.source} is in a store already")
@@ -249,8 +249,8 @@ class Series:
         settings = AdjustmentSettings(free=tuple(free))
         with self._opened() as source:
             source.head.require_calibrated(source.title)
-            table, observations = _adjust(source, settings, exterior, None, jobs)
-            found = measured_series(source, table, observations, label or usual, thermometer_sd)
+            table = _adjust(source, settings, exterior, None, jobs)
+            found = measured_series(source, table, label or usual, thermometer_sd)
         return replace(found, doubts=tuple(self.doubts(table, found.mean)))
 
     def observed(self, progress: Progress = None, jobs: int = 1, say: Say = None) -> SeriesInput:
@@ -278,11 +278,11 @@ def _adjust(
     exterior: str,
     progress: Progress,
     jobs: int,
-) -> tuple[Epochs, Callable[[int], Observations | None]]:
-    """Return a source's adjusted epochs, and a function that returns an epoch's observations."""
+) -> Epochs:
+    """Return a source's adjusted epochs."""
     if isinstance(source, Recording):
         return recorded_table(source, settings, exterior, progress, jobs)
-    return table_of_stored(source, settings, exterior, jobs), source.observations
+    return table_of_stored(source, settings, exterior, jobs)
 
 
 def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001

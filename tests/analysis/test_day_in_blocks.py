@@ -12,7 +12,8 @@ from benchmarks.adjustment import INTERIOR
 from benchmarks.long_recording import write_long_recording
 from tests.blocks import InBlocks
 from thermocald.analysis.series import adjusted, recorded
-from thermocald.analysis.study.study import StudySettings, study
+from thermocald.analysis.study.measured import StudySettings
+from thermocald.analysis.study.study import study
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.series import long_series
 from thermocald.photogrammetry.series.normals import gathered

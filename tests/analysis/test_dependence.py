@@ -49,25 +49,23 @@ def test_the_correlation_matrix_equals_numpys_and_is_nan_for_constants():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("thermometer_sd", [0.05, 1.5])
-def test_slope_is_unbiased_and_its_sd_true(thermometer_sd):
+def test_slope_is_unbiased_and_its_sd_true():
     """With 1.5 K of noise on a rise of 12 K, ordinary least squares is 20 % too flat."""
     rng = np.random.default_rng(5)
-    truth, sd = 0.4, 0.3
+    truth, sd, thermometer_sd = 0.4, 0.3, 1.5
     slopes, sds, ordinary = [], [], []
-    for _ in range(600):
+    for _ in range(200):
         temperature = 25 + 12 * WARM_UP + thermometer_sd * rng.standard_normal(N)
         values = truth * 12 * WARM_UP + sd * rng.standard_normal(N)
         result = dependence(values, np.full(N, sd), temperature, thermometer_sd)
         slopes.append(result.slope)
         sds.append(result.sd_slope)
         ordinary.append(np.polyfit(temperature, values, 1)[0])
-    assert np.mean(slopes) == pytest.approx(truth, abs=4 * np.std(slopes) / np.sqrt(600))
+    assert np.mean(slopes) == pytest.approx(truth, abs=4 * np.std(slopes) / np.sqrt(200))
     # Allowing for autocorrelation makes the sd cautious, by 10 to 20 % for white noise
     off = (np.array(slopes) - truth) / sds
     assert 0.75 <= np.sqrt(np.mean(off**2)) <= 1.05
-    if thermometer_sd > 1:
-        assert np.mean(ordinary) < 0.9 * truth
+    assert np.mean(ordinary) < 0.9 * truth
 
 
 def test_the_sd_of_the_slope_includes_scatter_beyond_the_sds():
@@ -85,10 +83,9 @@ def _slope(y, x):
     return float(x @ y / (x @ x))
 
 
-def _error_over_sd(x, coloured, phi, draws, seed, thermometer=0.0):
-    rng = np.random.default_rng(seed)
-    off = []
-    for _ in range(draws):
+def _error_over_sd(x, coloured, phi, thermometer=0.0):
+    rng, off = np.random.default_rng(2), []
+    for _ in range(400):
         y = noise(rng, coloured, phi, len(x))
         read = x + thermometer * rng.standard_normal(len(x))
         b = _slope(y, read)
@@ -103,11 +100,11 @@ def _error_over_sd(x, coloured, phi, draws, seed, thermometer=0.0):
 )
 def test_errors_of_the_slope_are_as_large_as_its_sd(x, coloured, phi):
     """400 draws of 150 epochs give the ratio to 4 %, with slow noise to 8 %; it once was 1.5."""
-    assert 0.75 < _error_over_sd(x, coloured, phi, 400, 2) < 1.2
+    assert 0.75 < _error_over_sd(x, coloured, phi) < 1.2
 
 
 def test_a_thermometer_whose_noise_is_an_eighth_of_the_rise():
-    assert 0.65 < _error_over_sd(WARM_UP, 0.0, 0.0, 400, 4, 0.125) < 1.1
+    assert 0.65 < _error_over_sd(WARM_UP, 0.0, 0.0, 0.125) < 1.1
 
 
 @pytest.mark.parametrize(
@@ -124,8 +121,8 @@ def test_a_coarse_thermometer_of_few_steps_gives_a_finite_sd(steps):
 
 def test_a_memory_as_long_as_the_series_is_reported():
     rng = np.random.default_rng(5)
-    short = [slope_noise(noise(rng, 1.0, 0.99), WARM_UP, 0.0).too_short for _ in range(40)]
-    white = [slope_noise(noise(rng, 0.0, 0.0), WARM_UP, 0.0).too_short for _ in range(40)]
+    short = [slope_noise(noise(rng, 1.0, 0.99), WARM_UP, 0.0).too_short for _ in range(20)]
+    white = [slope_noise(noise(rng, 0.0, 0.0), WARM_UP, 0.0).too_short for _ in range(20)]
     assert np.mean(short) > 0.5
     assert not any(white)
 
@@ -169,11 +166,6 @@ def test_pearsons_data_with_yorks_weights():
     assert slope == pytest.approx(-0.480533407, abs=5e-9)
     assert chi2 == pytest.approx(11.8663532, abs=5e-7)
     assert sd_slope == pytest.approx(0.0579850, abs=5e-6)
-
-
-def test_constant_x_is_refused():
-    with pytest.raises(ValueError, match="x that varies"):
-        fit_straight_line(np.full(5, 20.0), np.arange(5.0), 0.1, 0.1)
 
 
 def test_the_f_test_equals_scipys():

@@ -65,9 +65,7 @@ def series(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "epochs"), [(0, 60), (1, 60), (2, 60), (101, 30), (101, 80), (101, 150)]
-)
+@pytest.mark.parametrize(("seed", "epochs"), [(0, 60), (101, 30), (101, 150)])
 def test_a_warm_up_of_any_length_is_a_drift_and_no_target_is_blamed(seed, epochs):
     """A test with a straight line once took the bend of 150 epochs for noise with a memory."""
     table = with_drifts(series(seed, epochs=epochs))
@@ -145,7 +143,7 @@ def test_replay_reports_no_drift_in_noise_with_a_memory(coloured, phi, epochs):
     from scipy.signal import lfilter  # half a second, of one worker
 
     rng, claims = np.random.default_rng(16), []
-    for _ in range(120):
+    for _ in range(80):
         values = np.zeros((epochs, 16))
         slow = lfilter([1], [1, -phi], rng.standard_normal((600 + epochs, 3)), axis=0)[600:]
         values[:, :3] = np.sqrt(coloured * (1 - phi**2)) * slow

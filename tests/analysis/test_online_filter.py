@@ -74,7 +74,7 @@ def test_the_covariance_of_estimate_and_rates_is_true():
 
 
 def test_no_alarm_over_a_warm_up():
-    for seed in range(5):
+    for seed in range(3):
         _, take = Surveyed(0.0, seed).filter()
         assert all(take(0.35 * max(k - 20, 0)).change == "" for k in range(60))
 
@@ -106,7 +106,7 @@ def test_an_epoch_without_a_result_changes_nothing():
 
 
 @pytest.mark.parametrize("missing", mostly_slow([0.0, 0.1], 0.1))
-@pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.0, 0.05))
+@pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.05))
 def test_innovations_agree_with_their_covariance_for_any_field(sigma_mm, missing):
     """With the field's errors as noise of each epoch, χ² per degree of freedom was 0.09."""
     ratios = []
@@ -141,18 +141,17 @@ def test_the_sds_of_the_estimate_include_the_field(sigma_mm):
 @pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.05))
 def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
     noticed = 0
-    for seed in range(20):
+    for seed in range(8):
         camera = Surveyed(sigma_mm, seed)
         _, take = camera.filter()
         assert all(take().change == "" for _ in range(20))
         change = one_changed(11, 0.1 * camera.sensor.pixel_pitch / camera.iop[0])  # phi, rad
         noticed += any(take(change=change).change not in ("", "outlier") for _ in range(4))
-    assert noticed >= 18
+    assert noticed >= 7
 
 
-@pytest.mark.parametrize("sigma_mm", [0.0, 0.05])
-def test_a_steady_camera_is_ready_in_time_before_any_field(sigma_mm):
-    camera = Surveyed(sigma_mm, 1)
+def test_a_steady_camera_is_ready_in_time_before_an_uncertain_field():
+    camera = Surveyed(0.05, 1)
     events, states = [], []
     observer = OnlineObserver(camera.sensor, camera.field, lambda *a: events.append(a))
     for k in range(80):

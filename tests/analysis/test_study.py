@@ -7,19 +7,19 @@ import pytest
 
 from tests.analysis.conftest import INTERIOR, NEXUS
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.study.measured import Thermometer
+from thermocald.analysis.study.measured import StudySettings, Thermometer
 from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
-from thermocald.analysis.study.series_study import (
-    StudySettings,
+from thermocald.analysis.study.study import (
     circle_of_confusion,
     depth_of_field,
     deviation,
     displacement_covariance,
     image_displacement,
+    study,
+    study_camera,
     study_series,
 )
-from thermocald.analysis.study.study import study, study_camera
-from thermocald.output.study.summary import answer_sentences
+from thermocald.output.study.report import answer_sentences
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 
 SETTINGS = StudySettings(sets=2000)
@@ -102,27 +102,19 @@ def test_gaps_are_reported_and_not_tested_across(warm_up):
 
 
 def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
-    series = warm_up()()
+    series = warm_up()(without_result={"too few targets": 7})
     values = series.thermometers[0].values.copy()
     values[40:50] = np.nan
+    series.values[:, 3] = series.values[0, 3]
     found = study_series(
         replace(series, thermometers=(Thermometer("temperature", values, 0.05),)), SETTINGS
     )
-    assert found.channels[0].dependences["x0"].n == 140
-    assert abs(found.channels[0].dependences["x0"].r) > 0.99
-
-
-def test_lost_epochs_are_counted_by_reason(warm_up):
-    found = study_series(warm_up()(without_result={"too few targets": 7}), SETTINGS)
     assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
-
-
-def test_a_constant_parameter_has_no_dependence(warm_up):
-    series = warm_up()()
-    series.values[:, 3] = series.values[0, 3]
-    found = study_series(series, SETTINGS)
+    # a constant parameter has no dependence
     assert "A1" not in found.channels[0].dependences
     assert found.deviations["A1"].change == 0
+    assert found.channels[0].dependences["x0"].n == 140
+    assert abs(found.channels[0].dependences["x0"].r) > 0.99
 
 
 def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
@@ -131,7 +123,7 @@ def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
         warm_up(seed=2)("M2", "cold"),
         warm_up(seed=3, drift={"c": 0.003, "x0": 0.0097, "y0": -0.0056})("M1", "warm"),
     ]
-    result = study(series, StudySettings(sets=20_000))
+    result = study(series, StudySettings(sets=5000))
     assert [c.label for c in result.cameras] == ["cold", "warm"]
     cold, warm = result.cameras
     assert [len(c.series) for c in result.cameras] == [2, 1]
@@ -194,14 +186,6 @@ def test_correlations_over_time_refer_to_each_series_mean(warm_up):
     assert abs(correlations_over_time([one, other])[1, 2]) < 0.3
 
 
-def test_the_summary_explains_the_draws_and_the_cameras_course(warm_up):
-    camera = study_camera("nexus", [warm_up()()], StudySettings(sets=500))
-    text = " ".join(answer_sentences(camera))
-    assert "drawn normally about the series' mean with the correlations of an epoch's" in text
-    assert "along its own path" in text
-    assert "x₀ and y₀ −0.999" in text or "x₀ and y₀ −1" in text
-
-
 def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
     """The text does not claim that nothing changed, though last equals first."""
     make = warm_up()
@@ -215,6 +199,9 @@ def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
     camera = study_camera("rpi", [cycle], StudySettings(sets=500))
     change = camera.series[0].deviations
     assert change["c"].range > 0.006
+    text = " ".join(answer_sentences(camera))
+    assert "drawn normally about the series' mean with the correlations of an epoch's" in text
+    assert "along its own path" in text
     text = answer_sentences(camera)[1]
     assert "did not change" not in text
     assert "the principal distance grew by up to" in text
@@ -252,8 +239,8 @@ def test_the_covariance_of_displacements_is_their_scatter(warm_up):
     rng = np.random.default_rng(9)
     sds = np.nan_to_num(series.sds[0])
     of_epoch = series.correlations[0] * np.outer(sds, sds)
-    drawn = rng.multivariate_normal(INTERIOR, of_epoch, (2000, 2))
-    moved = [image_displacement(NEXUS, first, last, points) for first, last in drawn]
+    later = rng.multivariate_normal(INTERIOR, 2 * of_epoch, 2000)  # of two independent epochs
+    moved = image_displacement(NEXUS, INTERIOR, later, points)
 
     found = np.einsum("nki,nkj->kij", moved, moved) / len(moved)
     # 2000 draws give a variance to 3 %

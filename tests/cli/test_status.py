@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from thermocald.analysis.online.equilibrium import Equilibrium
+from thermocald.analysis.online.observer import Equilibrium
 from thermocald.cli import run
 from thermocald.cli.run import WIDTH, status_lines
 

@@ -100,11 +100,10 @@ def test_wrong_usage_is_one_error(run, recording, arguments, error, words):
 
 
 @pytest.mark.slow
-def test_frames_that_are_not_measured_yet_are_measured_and_clipped(run, tmp_path):
+def test_frames_that_are_not_measured_yet_are_measured(run, tmp_path):
     tc.simulate("rpi-v2.1-heating", seed=3, epochs=3, frames=True, out=tmp_path / "frames")
     run(tmp_path / "frames", "--sets", "200", "--free", "c,x0,y0", "--report", tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert page.count('src="data:image/png;base64,') == 2
     assert "The F-test needs 31 consecutive epochs; the series has 3" in page
 
 

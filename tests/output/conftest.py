@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import cv2
-import numpy as np
 import pytest
 
 from tests.analysis.conftest import WarmUp
-from thermocald.analysis.study.measured import Clip
-from thermocald.analysis.study.study import StudySettings, study
+from thermocald.analysis.study.measured import StudySettings
+from thermocald.analysis.study.study import study
 
 
 @pytest.fixture(scope="session")
@@ -20,18 +16,9 @@ def warm_up():
 
 
 @pytest.fixture(scope="session")
-def warm_study(warm_up, tmp_path_factory):
-    """The first series has a clip; camera and second series have names with HTML in them."""
-    folder = tmp_path_factory.mktemp("clip")
-    frame = np.full((30, 40), 50, np.uint8)
-    frame[10, 5] = 250
-    for name in ("first.png", "last.png"):
-        cv2.imwrite(str(folder / name), frame)
-    clip = Clip("17", folder / "first.png", folder / "last.png", 0, 149, (5.0, 10.0))
-    series = [
-        replace(warm_up(seed=1)("M1", label="a & <b>"), clip=clip),
-        warm_up(seed=2)("<script>M2", label="a & <b>"),
-    ]
+def warm_study(warm_up):
+    """The camera and its second series have names with HTML in them."""
+    series = [warm_up(seed=k)(n, label="a & <b>") for k, n in ((1, "M1"), (2, "<script>M2"))]
     return study(series, StudySettings(sets=5000))
 
 

@@ -27,7 +27,7 @@ from thermocald.files import write_text
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, ExteriorOrientation
 from thermocald.photogrammetry.frame.templates import Templates
 from thermocald.photogrammetry.targets.image_file import decode_grey
-from thermocald.result import jsonable
+from thermocald.result import in_parts, jsonable
 from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
@@ -85,14 +85,14 @@ def column_parts(
     They come some thousand rows at a time, because of the memory for a year. pixel_pitch: mm.
     """
     done = 0
-    for part in table.parts():
+    for part in in_parts(table.columns()):
         columns: Columns = {}
-        for name, values in part.columns().items():
+        for name, values in part.items():
             suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
             columns[name + suffix] = values if not suffix else np.asarray(values) * factor
         if style.time == "iso":
-            columns["frame_time"] = tuple(iso(t, "microseconds") for t in part.frame_time)
-        rows = slice(done, done + len(part.number))
+            columns["frame_time"] = tuple(iso(float(t), "microseconds") for t in part["frame_time"])
+        rows = slice(done, done + len(part["epoch"]))
         for name, column in (others or {}).items():
             columns[name if name not in columns else f"extra {name}"] = column[rows]
         yield columns

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -129,17 +127,8 @@ class StoredRecording:
 
     def observations(self, row: int) -> Observations | None:
         """Return the observations of one epoch (from 0)."""
-        return self._epoch(row).observations
-
-    def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:
-        """Return the first and the last epoch (from 0) of `ok` (E,) and their frames, if stored."""
-        rows = np.flatnonzero(ok).tolist()
-        ends = [(row, self._epoch(row).frame) for row in rows[:1] + rows[1:][-1:]]
-        return [(row, self.store.path.parent / frame) for row, frame in ends if frame is not None]
-
-    def _epoch(self, row: int) -> Epoch:
         number = int(self.columns.numbers[row])
-        return next(self.store.epochs(self.series, number, number)).epoch
+        return next(self.store.epochs(self.series, number, number)).epoch.observations
 
     def blocks(
         self, windows: Sequence[slice] | None = None

@@ -245,18 +245,10 @@ class Camera(Result):
 
     def plot(self) -> Figure:
         """Draw the distortion of a grid of image points, px."""
-        figure, axes = new_figure(1, panel=(5.0, 3.75))
-        axis = axes[0, 0]
-        width, height = self.sensor.width, self.sensor.height
-        u, v = np.meshgrid(np.linspace(0, width - 1, 25), np.linspace(0, height - 1, 19))
-        points = np.stack([u.ravel(), v.ravel()], axis=1)
+        points = image_grid(self.sensor, _DRAWN)
         centred = InteriorOrientation(*self.values[:3].tolist())
-        dx, dy = (points - self.undistort(points, centred)).T
-        drawn = axis.quiver(*points.T, dx, dy, np.hypot(dx, dy), angles="xy", width=0.003)
-        figure.colorbar(drawn, label="distortion, px")
-        axis.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px")
-        axis.set_title(self.lines()[0])
-        return figure
+        distortion = points - self.undistort(points, centred)
+        return _draw(self.sensor, points, distortion, self.lines()[0])
 
 
 def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Array:
@@ -268,6 +260,18 @@ def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Arra
     if found.ndim == 0 or found.shape[-1] != columns:
         raise UsageError(f"{name}: must be an array (n, {columns}) of numbers")
     return found
+
+
+def _draw(sensor: Sensor, points: Array, vectors: Array, title: str) -> Figure:
+    """Draw vectors (n, 2) px at image points (n, 2) px, enlarged."""
+    from thermocald.figures import Arrows, draw_arrows
+
+    figure, axes = new_figure(1, panel=(5.0, 3.75))
+    axis = axes[0, 0]
+    draw_arrows(axis, Arrows(points, vectors, (sensor.width, sensor.height)))
+    axis.set(xlabel="x in px", ylabel="y in px, down")
+    axis.set_title(title, loc="left")
+    return figure
 
 
 def _format_of(path: Path) -> str:
@@ -284,7 +288,7 @@ def _format_of(path: Path) -> str:
     return fitting[0]
 
 
-_GRID = 25  # points per side
+_GRID, _DRAWN = 25, 13  # points per side, and those that a drawing shows
 _IN_PX = ("c", "x0", "y0")
 
 
@@ -401,16 +405,8 @@ class CameraDifference(Result):
 
     def plot(self) -> Figure:
         """Draw the shifts over the image, enlarged."""
-        sensor = self.first.sensor
-        figure, axes = new_figure(1, 1, (5.0, 5.0 * sensor.height / sensor.width))
-        axis = axes[0, 0]
         every = np.arange(_GRID**2).reshape(_GRID, _GRID)[::2, ::2].ravel()
-        arrows = axis.quiver(*self._grid[every].T, *self.shifts[every].T, angles="xy", width=0.002)
-        longest = float(np.linalg.norm(self.shifts, axis=1).max())
-        axis.quiverkey(arrows, 0.9, 1.03, longest, f"{plain(longest, 'px', 2)}")
-        axis.set(xlim=(0, sensor.width), ylim=(sensor.height, 0), xlabel="x, px", ylabel="y, px")
-        axis.set_aspect("equal")
-        return figure
+        return _draw(self.first.sensor, self._grid[every], self.shifts[every], self.lines()[0])
 
     @cached_property
     def _grid(self) -> Array:

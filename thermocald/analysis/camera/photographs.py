@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -222,10 +222,10 @@ def calibrate_observations(
     found: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
     if together is None or reason:
         # the given camera is held
-        status, interior, estimated = "held", camera.interior, False
-        if settings.free:
-            status = "weak_geometry"
-        covariance, sigma0, redundancy, disagreement = np.zeros((16, 16)), float("nan"), 0, 1.0
+        status, interior = "weak_geometry" if settings.free else "held", camera.interior
+        result = Photographs(
+            status, reason, interior, False, np.zeros((16, 16)), float("nan"), 0, ()
+        )
         for k in seen.keys() - failures.keys():
             if interior is None:
                 why = f"without an interior orientation there is no pose: {reason}"
@@ -238,9 +238,10 @@ def calibrate_observations(
             else:
                 failures[k] = (pose.status, pose.reason)
     else:
-        status, interior, estimated = "ok", together.interior, True
-        covariance, sigma0 = together.covariance, together.sigma0
-        redundancy, disagreement = together.redundancy, together.disagreement
+        result = Photographs(
+            "ok", reason, together.interior, True, together.covariance, together.sigma0,
+            together.redundancy, (), together.disagreement,
+        )  # fmt: skip
         sds = np.sqrt(np.diagonal(together.exterior_covariances, axis1=1, axis2=2))
         each = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
         found = dict(zip(rows, each, strict=True))
@@ -257,10 +258,7 @@ def calibrate_observations(
         results.append(
             PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, rest, used)
         )
-    return Photographs(
-        status, reason, interior, estimated, covariance, sigma0, redundancy, tuple(results),
-        disagreement,
-    )  # fmt: skip
+    return replace(result, photographs=tuple(results))
 
 
 def _first_camera(

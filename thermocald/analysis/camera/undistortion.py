@@ -16,12 +16,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import Sensor, project, rays
+from thermocald.photogrammetry.camera.camera_model import (
+    Sensor,
+    distort,
+    distortion_jacobian,
+    image_to_mm,
+    project,
+    rays,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 
 def image_grid(sensor: Sensor, size: int = 3) -> Array:
@@ -33,7 +40,8 @@ def image_grid(sensor: Sensor, size: int = 3) -> Array:
 
 _BLOCK = 8192
 _DEGREE = 6
-_STEP_PX = 3e-6  # a second Newton step below this leaves less than 1e-9 px
+_STEP_PX = 3e-6  # a step below this leaves less than 1e-9 px
+_STEPS = 30
 
 
 def ideal_points(
@@ -49,14 +57,43 @@ def ideal_points(
     out, inverse = np.empty_like(points), _inverse_radial(sensor, i)
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        found = None if inverse is None else _newton(sensor, i, points[part], inverse)
-        if found is None:
-            r = rays(sensor, i, points[part])
-            found = r[:, 0] / -r[:, 2], r[:, 1] / -r[:, 2]
-        for k, ideal in enumerate(found):
-            ideal *= scale[k]
-            np.add(ideal, shift[k], out=out[part, k])
+        solved = False
+        if inverse is not None:
+            measured = np.ascontiguousarray(image_to_mm(sensor, points[part]).T)
+            ideal = measured - i[1:3, None]
+            ideal *= np.polyval(inverse, ideal[0] ** 2 + ideal[1] ** 2)
+            solved = bool(solve_distortion(i, measured, ideal, _STEP_PX * sensor.pixel_pitch).all())
+            ideal /= i[0]
+        if not solved:
+            r = rays(sensor, i, points[part]).T
+            ideal = r[:2] / -r[2]
+        for k in range(2):
+            np.add(ideal[k] * scale[k], shift[k], out=out[part, k])
     return out
+
+
+# a camera that folds the image may diverge; it has no rays
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def solve_distortion(iop: Array, measured: Array, ideal: Array, tolerance: float) -> Mask:
+    """Replace approximate ideal points (2, ..., n) mm by those of measured points (2, ..., n).
+
+    iop (..., 10), as `distort` takes it. Newton's method with the Jacobian of the start, until all
+    steps are below `tolerance`, mm. Returns which points (..., n) have a solution.
+    """
+    (xm, ym), (x, y) = measured, ideal
+    jxx, jxy, jyx, jyy = distortion_jacobian(iop, x, y)
+    inverse = 1.0 / (jxx * jyy - jxy * jyx)
+    solved: Mask = inverse > 0
+    jxx, jxy, jyx, jyy = jyy * inverse, jxy * inverse, jyx * inverse, jxx * inverse
+    for _ in range(_STEPS):
+        xd, yd = distort(iop, x, y)
+        rx, ry = xm - xd, ym - yd
+        dx, dy = jxx * rx - jxy * ry, jyy * ry - jyx * rx
+        x += dx
+        y += dy
+        if max(dx.max(), -dx.min(), dy.max(), -dy.min()) <= tolerance:
+            return solved
+    return np.asarray(solved & (np.fmax(np.abs(dx), np.abs(dy)) <= tolerance))
 
 
 def directions(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
@@ -66,7 +103,7 @@ def directions(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array
 
 
 def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
-    """Return coefficients of r̄ = r (1 + a₁ r² + …), highest first; None if the distortion folds."""
+    """Return coefficients of r̄/r = 1 + a₁ r² + …, highest first; None if the distortion folds."""
     corner = np.hypot(sensor.width, sensor.height) * sensor.pixel_pitch / 2
     r = np.linspace(0.0, 1.1 * corner, 80)[1:]
     r2 = r * r
@@ -77,58 +114,7 @@ def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
     powers = (distorted[:, None] / corner) ** (2 * np.arange(1, _DEGREE + 1))
     found = np.linalg.lstsq(powers, r / distorted - 1, rcond=None)[0]
     scaled: Array = found / corner ** (2 * np.arange(1, _DEGREE + 1))
-    return scaled[::-1]
-
-
-def _newton(sensor: Sensor, i: Array, points: Array, inverse: Array) -> tuple[Array, Array] | None:
-    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (float(v) for v in i)
-    (cx, cy), p = sensor.centre, sensor.pixel_pitch
-    # contiguous coordinates relative to the principal point
-    xm, ym = points[:, 0] - (cx + x0 / p), (cy - y0 / p) - points[:, 1]
-    xm *= p
-    ym *= p
-    r2 = xm * xm + ym * ym
-    turn = np.zeros_like(r2)
-    for a in inverse:
-        turn += a
-        turn *= r2
-    turn += 1.0
-    x, y = xm * turn, ym * turn
-    x2, y2, xy = x * x, y * y, x * y
-    r2 = x2 + y2
-    radial = r2 * (A1 + r2 * (A2 + r2 * A3))
-    slope = 2 * (A1 + r2 * (2 * A2 + 3 * r2 * A3))
-    jxx = (1 + C1) + radial + slope * x2 + (6 * B1) * x + (2 * B2) * y
-    jyy = 1 + radial + slope * y2 + (6 * B2) * y + (2 * B1) * x
-    cross = slope * xy + (2 * B1) * y + (2 * B2) * x
-    jxy = cross + C2
-    determinant = 1.0 / (jxx * jyy - jxy * cross)
-    jxx *= determinant
-    jxy *= determinant
-    jyy *= determinant
-    cross *= determinant
-    size = np.inf
-    for step in range(3):
-        if step:
-            x2, y2, xy = x * x, y * y, x * y
-            r2 = x2 + y2
-            radial = r2 * (A1 + r2 * (A2 + r2 * A3))
-        rx = xm - x * ((1 + C1) + radial) - B1 * (r2 + 2 * x2) - (2 * B2) * xy - C2 * y
-        ry = ym - y * (1 + radial) - B2 * (r2 + 2 * y2) - (2 * B1) * xy
-        # the Jacobian stays that of the first step: it changes by less than the step itself
-        dx = jyy * rx - jxy * ry
-        dy = jxx * ry - cross * rx
-        x += dx
-        y += dy
-        if step:
-            size = max(float(np.abs(dx).max()), float(np.abs(dy).max()))
-            if size < _STEP_PX * sensor.pixel_pitch:
-                break
-    if not size < _STEP_PX * sensor.pixel_pitch:
-        return None
-    x /= c
-    y /= c
-    return x, y
+    return np.append(scaled[::-1], 1.0)
 
 
 _RENEWED_PX = 0.05

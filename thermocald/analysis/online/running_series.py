@@ -87,23 +87,6 @@ class _Kept:
     reported: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Epoch:
-    """An epoch's result in a series.
-
-    values (16,), covariance (16, 16) relative to the series, rejected (T,), residuals (T, 2) px.
-    """
-
-    status: str
-    reason: str
-    values: Array
-    covariance: Array
-    sigma0: float
-    redundancy: int
-    rejected: Mask
-    residuals: Array
-
-
 @dataclass(eq=False)
 class _Together:
     """The joint adjustment of the stored epochs.
@@ -127,21 +110,46 @@ class _Together:
         """The size of the mount's movements in the image, px."""
         return image_px(self.sample.movement.covariance, self.estimate.system.design.at.A)
 
-    def epoch(self, row: int, s: SeriesAdjustment | None = None) -> _Epoch:
-        """Return the result of one of the epochs, or of one of another series `s`."""
-        s = s or self.sample
-        return _Epoch(
-            s.status[row], s.reasons[row], s.values[row], s.covariance[row], float(s.sigma0[row]),
-            int(s.redundancy[row]), s.rejected[row], s.residuals[row],
-        )  # fmt: skip
+    def epoch(self, alone: Adjustment, row: int, s: SeriesAdjustment | None = None) -> Adjustment:
+        """Return the result of one of the epochs, or of one of another series `s`.
 
-    def further(self, grid: ObservationGrid, epochs: int) -> _Epoch:
+        alone: its own calibration; the covariance is relative to the series.
+        """
+        s = s or self.sample
+        return replace(
+            _placed(alone, s.values[row]),
+            status=s.status[row],
+            reason=s.reasons[row],
+            covariance=s.covariance[row],
+            sigma0=float(s.sigma0[row]),
+            redundancy=int(s.redundancy[row]),
+            residuals=s.residuals[row][alone.targets],
+            rejected=tuple(np.flatnonzero(s.rejected[row]).tolist()),
+        )
+
+    def further(self, alone: Adjustment, grid: ObservationGrid, epochs: int) -> Adjustment:
         """Adjust a later epoch, given its series."""
         if self.moved:
             grid = taken_off(grid, self.moved, slice(-1, None))
         seen = grid.targets(self.seen)
         _, block = self.known.adjusted(seen, epochs, np.array([0.5]))  # the last of the series
-        return self.epoch(0, block.spread(self.seen, grid.points.shape[1]))
+        return self.epoch(alone, 0, block.spread(self.seen, grid.points.shape[1]))
+
+
+def _placed(result: Adjustment, values: Array) -> Adjustment:
+    """Return a result with other parameters (16,)."""
+    return replace(
+        result,
+        interior=InteriorOrientation.from_array(values[IOP]),
+        exterior=ExteriorOrientation.from_array(values[EOP]),
+    )
+
+
+def _rejecting(result: Adjustment, more: Mask) -> Adjustment:
+    """Return a result that rejects more targets (T,)."""
+    return replace(
+        result, rejected=tuple(sorted({*result.rejected, *np.flatnonzero(more).tolist()}))
+    )
 
 
 class RunningSeries:
@@ -253,8 +261,8 @@ class RunningSeries:
         self.remember(calibrated, seen)
         if alone.status == "global_test" and len(self._kept) < FEW_EPOCHS:
             return alone, columns  # too few to show whether the noise is larger than stated
-        own, whole = self._adjust_newest()
-        if not given and whole.status != "ok":
+        own, whole = self._adjust_newest(alone)
+        if not given and not whole.ok:
             self._kept.pop()
             self.epochs -= 1
             self._refused += 1
@@ -265,29 +273,14 @@ class RunningSeries:
             against = any(e is not None and e.status in _AGAINST for e in (own, whole))
             self._doubts = self._doubts + 1 if against else 0
         refined = alone
-        if own is not None and own.status == "ok":
-            values = own.values - self._level
-            self._kept[-1].reported = values
-        elif carried and whole.status == "ok" and self._series is not None:
+        wrong = self._wrong & self._kept[-1].grid.observed[0]
+        if own is not None and own.ok:
+            values = self._kept[-1].reported = own.values - self._level
+            refined = _rejecting(_placed(own, values), wrong)
+        elif carried and whole.ok and self._series is not None:
             # too weak by itself: its result in the series, plus the uncertainty of the level
-            values, level = whole.values, np.diag(self._series.sample.level_sd**2)
-            own = replace(whole, covariance=whole.covariance + level)
-        else:
-            own = None
-        if own is not None:
-            wrong = self._wrong & self._kept[-1].grid.observed[0]
-            refined = replace(
-                alone,
-                status="ok",
-                reason="",
-                interior=InteriorOrientation.from_array(values[IOP]),
-                exterior=ExteriorOrientation.from_array(values[EOP]),
-                covariance=own.covariance,
-                sigma0=own.sigma0,
-                redundancy=own.redundancy,
-                residuals=own.residuals[alone.targets],
-                rejected=tuple(np.flatnonzero(own.rejected | wrong).tolist()),
-            )
+            level = np.diag(self._series.sample.level_sd**2)
+            refined = _rejecting(replace(whole, covariance=whole.covariance + level), wrong)
         if self._doubts >= _DOUBTED:
             self.reset(calibrated.epoch.number)
             columns["series_restarted"] = 1.0
@@ -318,9 +311,9 @@ class RunningSeries:
             text += f"; begun again after epoch {self._restarted}"
         return {"orientation": text, "exterior": series.sample.exterior, "series_epochs": n}
 
-    def _columns(self, whole: _Epoch) -> dict[str, float]:
+    def _columns(self, whole: Adjustment) -> dict[str, float]:
         """Return an epoch's result in its series as columns for the store."""
-        if self._series is None or whole.status != "ok":
+        if self._series is None or not whole.ok:
             return {}
         sd, level = np.sqrt(np.diag(whole.covariance)), self._series.sample.level_sd
         columns = {"series_epochs": float(len(self._kept))}
@@ -347,16 +340,16 @@ class RunningSeries:
         there = project(self._sensor, last[IOP], last[EOP], self._field.points[seen.targets])
         return bool(np.median(np.abs(seen.points - there)) > _TURNED_PX)
 
-    def _adjust_newest(self) -> tuple[_Epoch | None, _Epoch]:
+    def _adjust_newest(self, alone: Adjustment) -> tuple[Adjustment | None, Adjustment]:
         """Return the newest epoch's own result, None if unchanged, and that in its series."""
         whole, newest = None, self._without_wrong(self._kept[-1].grid)
         more = (newest.observed[0] & ~self._shown).any()  # targets that no earlier epoch showed
         if self._series is not None and not more and self.epochs < self._look_at[1]:
-            whole = self._series.further(newest, len(self._kept))
+            whole = self._series.further(alone, newest, len(self._kept))
         if whole is None or whole.status in _AGAINST:
             row = self._adjust_all()
             assert self._series is not None
-            whole = self._series.epoch(row)
+            whole = self._series.epoch(alone, row)
             if not self._offsets:
                 return None, whole
             if self._each is None and (last := self._own_schedule()[0]) < self.epochs:
@@ -364,14 +357,13 @@ class RunningSeries:
             due = self._each is None or self.epochs >= self._look_at[0]
             if due or whole.status in _AGAINST:
                 self._each = self._adjust_each()
-                own = self._each.epoch(row)
-                return replace(own, rejected=own.rejected | self._gross()[row]), whole
+                return _rejecting(self._each.epoch(alone, row), self._gross()[row]), whole
         if self._each is None:
             return None, whole
-        gross = whole.rejected & (self._binds and whole.status == "ok")
+        gross = np.isin(np.arange(len(self._field)), whole.rejected) & (self._binds and whole.ok)
         newest = self._without_wrong(self._kept[-1].grid).reject(gross[None])
-        own = self._each.further(newest, len(self._kept))
-        return replace(own, rejected=own.rejected | gross), whole
+        own = self._each.further(alone, newest, len(self._kept))
+        return _rejecting(own, gross), whole
 
     def _gross(self) -> Mask:
         """Return which image points (E, T) of the stored epochs contradict their series.

@@ -183,7 +183,7 @@ def _adjust(
         if sampled is not None:
             windows = list(spread_windows(len(source), len(sampled)))
             some = replace(
-                apart.part(slice(0, 0)),
+                apart,
                 **{n: getattr(apart, n)[sampled] for n in _AS_READ},
                 status=tuple(apart.status[i] for i in sampled),
                 reasons=tuple(apart.reasons[i] for i in sampled),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
@@ -26,10 +26,10 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.covariances import AFFINITY
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.result import Result, csv_text, document_of, jsonable, new_figure
+from thermocald.result import Result, csv_text, document_of, in_parts, jsonable, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     import pandas as pd
     import xarray as xr
@@ -56,13 +56,6 @@ _TESTS_A_FIELD = 18  # redundancy of a level that tests the field: 16 targets
 _SHOWN_SDS = 5.0  # significance of an affinity that the targets show
 _LEVEL_OF_FEW = 1.6  # error over sd with 12 to 14 targets whose field is 3 to 10 times worse
 _UNEVEN = 1.3  # outer noise over that in the middle, which is reported
-_ROWS = 20_000  # of a table that are processed at a time
-
-
-BY_EPOCH = (
-    "number", "frame_time", "temperature", "values", "sd", "sigma0", "n_observations",
-    "n_rejected", "status", "reasons", "redundancy", "stillness",
-)  # fmt: skip
 
 
 _EXTERIOR_WORDS = {
@@ -137,19 +130,6 @@ class Epochs(Result):
     def __getstate__(self) -> dict[str, Any]:
         """Return what is pickled: not `without`, a function that holds the observations."""
         return {**vars(self), "without": None}
-
-    def part(self, rows: slice) -> Epochs:
-        """Return some rows, without the results for the whole series."""
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in BY_EPOCH},
-            adjustment=None, sampled=None, without=None, drifts=(),
-        )  # fmt: skip
-
-    def parts(self) -> Iterator[Epochs]:
-        """Yield all rows, thousands at a time."""
-        for first in range(0, max(len(self.number), 1), _ROWS):
-            yield self.part(slice(first, first + _ROWS))
 
     @cached_property
     def ok(self) -> NDArray[np.bool_]:
@@ -412,7 +392,7 @@ class Epochs(Result):
 
     def to_csv(self, path: Path | str) -> Path:
         """Write what `thermocald export` writes (CONVENTIONS §4); return the file's path."""
-        write_parts(Path(path), csv_text(part.columns() for part in self.parts()))
+        write_parts(Path(path), csv_text(in_parts(self.columns())))
         return Path(path)
 
     @property

@@ -52,8 +52,8 @@ def recorded_table(
     exterior: str,
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
-) -> tuple[Epochs, Callable[[int], Observations | None]]:
-    """Adjust a recording as one series; return its epochs and a function for their observations.
+) -> Epochs:
+    """Adjust a recording as one series.
 
     Frames without observations are measured. If a series with observations is too long to be
     adjusted at once, only some epochs are calibrated one by one. advance: receives the number of
@@ -71,15 +71,13 @@ def recorded_table(
             columns.numbers, columns.frame_time, _temperature(recording), nothing, nothing,
             nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
         )  # fmt: skip
-        table = table_of_series(head, targets, apart, recording, adjusted, start, jobs, advance)
-        return table, recording.observations
+        return table_of_series(head, targets, apart, recording, adjusted, start, jobs, advance)
     apart, observations = calibrate_epochs(
         recording.iter_epochs(), calibrator, _temperature(recording), advance, jobs
     )
     begin = None if apart.ok.any() else _start(recording, observations.__getitem__, calibrator)
     grid = ObservationGrid.from_observations(targets, observations)
-    table = table_of_series(head, targets, apart, grid, adjusted, begin, jobs=jobs)
-    return table, lambda row: observations[row]
+    return table_of_series(head, targets, apart, grid, adjusted, begin, jobs=jobs)
 
 
 def _start(

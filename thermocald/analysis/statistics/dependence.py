@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -50,6 +51,7 @@ from thermocald.analysis.statistics.noise_models import (
     largest_p_value,
     mixtures,
 )
+from thermocald.photogrammetry.linalg import unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -174,10 +176,8 @@ def fit_straight_line(
 
     extra_variance_y: scatter of y about the line that neither sd explains. Returns the slope, its
     sd (from the stated sds, not scaled), and the chi-square of the residuals with n - 2 degrees of
-    freedom. Raises ValueError for fewer than 3 points or constant x.
+    freedom.
     """
-    if len(x) < 3 or not np.ptp(x) > 0:
-        raise ValueError("a straight line needs three points and x that varies")
     var_x = np.square(np.asarray(sd_x, dtype=float))
     var_y = np.square(np.asarray(sd_y, dtype=float)) + extra_variance_y
     # about the means: an intercept far outside the data would cost digits of the slope
@@ -269,7 +269,7 @@ def dependence(
     if n < 4 or not np.ptp(values) > 0 or not np.ptp(temperature) > 0:
         raise ValueError("a dependence needs four epochs, values and a temperature that vary")
     x, y = temperature - temperature.mean(), values - values.mean()
-    r = float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
+    r = _pearson(x, y)
     size = abs(r) * np.sqrt((n - 2) / (1 - r * r)) if abs(r) < 1.0 else np.inf
 
     slope, sd_slope, square = fit_straight_line(temperature, values, temperature_sd, sds)
@@ -284,10 +284,8 @@ def dependence(
             temperature, values, temperature_sd, sds, unexplained
         )
     # an epoch with few targets does not show the noise of the others
-    usual = sds <= _UNUSUAL * float(np.median(sds))
-    those: slice | Mask = usual
-    if usual.all() or not np.ptp(temperature[usual]) > 0:
-        those = slice(None)  # without a copy
+    usual: Mask = sds <= _UNUSUAL * float(np.median(sds))
+    those = usual if np.ptp(temperature[usual]) > 0 else np.ones(n, dtype=bool)
     noise = slope_noise(
         values[those], temperature[those], slope, temperature_sd,
         None if times is None else times[those],
@@ -313,7 +311,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
     corrected = np.empty_like(p)
     corrected[order] = np.minimum(stepped, 1.0)
-    return [float(v) for v in corrected]
+    return list(map(float, corrected))
 
 
 def correlation_matrix(columns: Sequence[Array]) -> Array:
@@ -323,20 +321,17 @@ def correlation_matrix(columns: Sequence[Array]) -> Array:
     """
     k = len(columns)
     matrix = np.full((k, k), np.nan)
-    finite = [np.isfinite(column) for column in columns]
-    whole = [bool(f.all()) and np.ptp(c) > 0 for f, c in zip(finite, columns, strict=True)]
-    for i in range(k):
-        for j in range(i, k):
-            a, b = columns[i], columns[j]
-            if not (whole[i] and whole[j]):
-                both = finite[i] & finite[j]
-                a, b = a[both], b[both]
-                if len(a) < 3 or not (np.ptp(a) > 0 and np.ptp(b) > 0):
-                    continue
-            a, b = a - a.mean(), b - b.mean()
-            r = np.dot(a, b) / np.sqrt(np.dot(a, a) * np.dot(b, b))
-            matrix[i, j] = matrix[j, i] = np.clip(r, -1.0, 1.0)
+    for i, j in combinations_with_replacement(range(k), 2):
+        both = np.isfinite(columns[i]) & np.isfinite(columns[j])
+        a, b = columns[i][both], columns[j][both]
+        if len(a) > 2 and np.ptp(a) > 0 and np.ptp(b) > 0:
+            matrix[i, j] = matrix[j, i] = _pearson(a - a.mean(), b - b.mean())
     return matrix
+
+
+def _pearson(x: Array, y: Array) -> float:
+    """Return the correlation of two columns (n,) of mean 0."""
+    return float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
 
 
 _CHUNK = 1 << 15
@@ -382,8 +377,6 @@ def moving_f_test(
     """
     from scipy.special import fdtri
 
-    if window < 3 or window % 2 == 0:
-        raise ValueError(f"the window must be an odd number of at least 3, not {window}")
     starts = unbroken_windows(time_s, window)
     degrees = np.rint(moving(redundancy, window, np.mean)[starts] * window)
     degrees_sd = np.maximum(degrees, 0).astype(np.int32)
@@ -414,12 +407,9 @@ class IopCorrelations:
 
 def correlations_of(covariances: Array) -> Array:
     """Return the correlations of covariances (n, k, k); 0 for held parameters, diagonal 1."""
-    sd = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
-    inverse = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
-    r = covariances * inverse[..., :, None] * inverse[..., None, :]
-    k = r.shape[-1]
-    r[..., np.arange(k), np.arange(k)] = 1.0
-    return np.asarray(np.clip(r, -1.0, 1.0))
+    r, _ = unit_diagonal(covariances)
+    np.einsum("...ii->...i", r)[...] = 1.0
+    return np.clip(r, -1.0, 1.0)
 
 
 def median_correlations(series: list[Array]) -> IopCorrelations | None:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _SINGLE_FREQUENCIES = 2000
 _POOLED_FREQUENCIES = 1000
 _ANY_LENGTH = 200_000  # epochs: up to here a transform of any length is cheap
-_SMALL_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31)
+_SMALL_PRIMES = 2 * 3 * 5 * 7 * 11 * 13 * 17 * 19 * 23 * 29 * 31
 
 _PHI = (0.2, 0.4, 0.6, 0.75, 0.85, 0.92, 0.95, 0.97, 0.985, 0.995)
 _COLOURED = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
@@ -135,10 +135,7 @@ class Frequencies:
 
     def means_covariance(self, phi: float) -> Array:
         """Return the covariance (K, K) of the stretches' means times √length, for unit variance."""
-        if phi == 0.0:
-            return np.eye(len(self.pieces))
         size = np.array([p.stop - p.start for p in self.pieces], dtype=float)
-        phi = min(phi, 1.0 - 1e-9)
         geometric = (1.0 - phi**size) / (1.0 - phi)
         own = (size * (1 + phi) - 2 * phi * geometric) / (1.0 - phi) / size
         scaled = geometric / np.sqrt(size)
@@ -203,16 +200,9 @@ def cosines(y: Array) -> Array:
 @lru_cache(maxsize=64)
 def _with_small_factors(n: int) -> int:
     """Return the largest number up to n without a prime factor above 31; a small n itself."""
-    if n <= _ANY_LENGTH:
-        return n
-    for found in range(n, 0, -1):
-        rest = found
-        for prime in _SMALL_PRIMES:
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            break
-    return found
+    while n > _ANY_LENGTH and pow(_SMALL_PRIMES, n.bit_length(), n):  # 0 if they divide n to 1
+        n -= 1
+    return n
 
 
 def largest_p_value(p: Array, deviance: Array) -> float:
@@ -323,10 +313,7 @@ def _few_far(distance: Array, steps: Array) -> Mask:
 def _without_spikes(y: Array) -> Array:
     """Return the series with single epochs that contradict both neighbours replaced: no drift."""
     out = y.copy()
-    # the median of three neighbours
-    between = np.minimum(y[:-2], y[1:-1])
-    np.maximum(between, np.minimum(np.maximum(y[:-2], y[1:-1]), y[2:]), out=between)
-    inner = out[1:-1]
+    between, inner = np.median([y[:-2], y[1:-1], y[2:]], axis=0), out[1:-1]
     spike = _few_far(inner - between, np.diff(y))
     inner[spike] = between[spike]
     return out

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 _FEWEST = 2
 _FEWEST_FOR_CORRELATIONS = 4
-_ROUNDS = 60
 _STEP = 0.05
 _NODES = 49  # of the mixture over Σ
 
@@ -172,19 +171,18 @@ def odd_specimens(values: Array, covariances: Array) -> Array:
 
 def _paule_mandel(values: Array, noise: Array) -> float:
     """Return the variance between specimens that gives their weighted squares the expected sum."""
-    low, high = 0.0, float(np.var(values, ddof=1)) * 4 + 1e-300
+    from scipy.optimize import brentq
+
+    high = float(np.var(values, ddof=1)) * 4 + 1e-300
 
     def excess(variance: float) -> float:
         weight = 1.0 / np.maximum(variance + noise, 1e-300)
         mean = (weight * values).sum() / weight.sum()
         return float((weight * (values - mean) ** 2).sum() - (len(values) - 1))
 
-    if excess(low) <= 0:
+    if excess(0.0) <= 0:
         return 0.0
-    for _ in range(_ROUNDS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return (low + high) / 2
+    return float(brentq(excess, 0.0, high, xtol=1e-15 * high))
 
 
 def _posterior(prior: Array, information: Array) -> Array:

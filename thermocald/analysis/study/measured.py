@@ -20,23 +20,47 @@ import numpy as np
 from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
+from thermocald.names import checked
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.store.recording.reader import interpolate_readings
 from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
-    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.store.recording.reader import Recording
+
+
+@checked
+@dataclass(frozen=True)
+class StudySettings:
+    """The options of a study; lengths in mm, temperatures in K.
+
+    window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo
+    simulation; focus_mm, f_number, confusion_mm (None: 1/2000 of the image diagonal): of the depth
+    of field; thermometer_sd: None estimates it from the readings; jobs: processes that adjust
+    the presets.
+    """
+
+    window: int = 31
+    alpha: float = 0.05
+    sets: int = 50_000
+    seed: int = 0
+    distance_mm: float = 10_000.0
+    grid: int = 3
+    clusters_mm: tuple[float, ...] = (15.0, 50.0, 100.0)
+    focus_mm: float = 1000.0
+    f_number: float = 2.0
+    confusion_mm: float | None = None
+    thermometer_sd: float | None = None
+    jobs: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,21 +70,6 @@ class Thermometer:
     name: str
     values: Array
     sd: float
-
-
-@dataclass(frozen=True, slots=True)
-class Clip:
-    """A section of the image around one target, in the first and the last frame that exist.
-
-    first, last: image files; first_epoch, last_epoch: epoch numbers; centre: px in the first frame.
-    """
-
-    target: str
-    first: Path
-    last: Path
-    first_epoch: int
-    last_epoch: int
-    centre: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +102,6 @@ class MeasuredSeries:
     correlations: Array
     exterior: str
     without_result: Mapping[str, int] = field(default_factory=dict)
-    clip: Clip | None = None
     start_utc: float = 0.0
     choice: str = ""
     image_noise_ratio: float = float("nan")
@@ -120,6 +128,21 @@ class MeasuredSeries:
         return np.ascontiguousarray(self.values[:, k]), np.ascontiguousarray(self.sds[:, k])
 
     @property
+    def path_px(self) -> Array:
+        """The principal point (E, 2) from its first position, px, right and up."""
+        return np.asarray((self.values[:, 1:3] - self.values[0, 1:3]) / self.sensor.pixel_pitch)
+
+    @cached_property
+    def columns(self) -> dict[str, tuple[Array, Array]]:
+        """{name: values and sds (E,)} of the estimated IOP, of sigma0, and of the thermometers."""
+        sd_sigma0 = self.sigma0 / np.sqrt(2 * np.maximum(self.redundancy, 1.0))
+        return {
+            **{name: self.column(name) for name in self.free},
+            "sigma0": (self.sigma0, sd_sigma0),
+            **{t.name: (t.values, np.full(len(self), t.sd)) for t in self.thermometers},
+        }
+
+    @property
     def reference(self) -> Thermometer | None:
         """The reference thermometer, or None."""
         return self.thermometers[0] if self.thermometers else None
@@ -136,15 +159,14 @@ _MOST_MATRICES = 5000
 def measured_series(
     source: Recording | StoredRecording,
     table: Epochs,
-    observations: Callable[[int], Observations | None],
     label: str,
     thermometer_sd: float | None = None,
 ) -> MeasuredSeries:
     """Return calibrated epochs as the study reads them.
 
-    table: the series, adjusted together or as stored; observations: those of an epoch (row from 0);
-    label: what the study treats as one camera; thermometer_sd K: by default estimated from the
-    readings. Raises DataError if no epoch has a result.
+    table: the series, adjusted together or as stored; label: what the study treats as one camera;
+    thermometer_sd K: by default estimated from the readings. Raises DataError if no epoch has a
+    result.
     """
     ok, without_result = _find_results(table)
     if not ok.any():
@@ -177,8 +199,7 @@ def measured_series(
         label, source.head.series, source.head.camera.name, source.head.camera.sensor, source.title,
         table.number[ok], time_s - time_s[0], tuple(thermometers),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
-        correlations_of(covariances), exterior, without_result,
-        _clip(source, ok, observations), float(time_s[0]),
+        correlations_of(covariances), exterior, without_result, float(time_s[0]),
         "" if adjustment is None else adjustment.choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
         slow=table.slow_between_ends[:10],
@@ -199,29 +220,3 @@ def _find_results(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:
     if missing := int(np.count_nonzero(ok & ~whole)):
         counted["no standard deviation"] = missing
     return whole, counted
-
-
-def _clip(
-    source: Recording | StoredRecording,
-    ok: NDArray[np.bool_],
-    observations: Callable[[int], Observations | None],
-) -> Clip | None:
-    """Return a clip around the most central target that both ends show; None if there is none."""
-    ends = source.framed(ok)
-    if len(ends) != 2 or not all(frame.is_file() for _, frame in ends):
-        return None
-    (i, first_frame), (k, last_frame) = ends
-    first, last = observations(i), observations(k)
-    if first is None or last is None:
-        return None
-    both = np.isin(first.targets, last.targets)
-    if not both.any():
-        return None
-    points = first.points[both]
-    nearest = int(np.argmin(np.linalg.norm(points - source.head.camera.sensor.centre, axis=1)))
-    target = source.testfield.names[int(first.targets[both][nearest])]
-    numbers = source.columns.numbers
-    return Clip(
-        target, first_frame, last_frame, int(numbers[i]), int(numbers[k]),
-        (float(points[nearest, 0]), float(points[nearest, 1])),
-    )  # fmt: skip

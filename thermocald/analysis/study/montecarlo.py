@@ -23,15 +23,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import ideal_points, image_grid
+from thermocald.analysis.camera.undistortion import ideal_points, image_grid, solve_distortion
 from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
-from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
-    distort,
-    distortion_jacobian,
     image_to_mm,
     partials,
 )
@@ -41,8 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.analysis.study.measured import MeasuredSeries
-    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.measured import MeasuredSeries, StudySettings
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
@@ -92,9 +88,8 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
 
 
 _CHUNK = 1024
-_SAMPLE = 1500
-_STEPS = 30
-_CONVERGED = 1e-12  # fraction of the distance: 1e-8 mm at 10 m
+_SAMPLE = 400  # of the first sets, whose errors are drawn
+_CONVERGED = 1e-6  # px, a last step that leaves an error far below
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,136 +161,68 @@ def simulate_errors(
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
     sds (10,) in the units of the IOP, correlation (10, 10); progress receives the number of sets
-    done. The result is the same, bit for bit, with any number of processes. Raises GeometryError if
-    a grid point has no expected point, or if fewer than two sets have rays.
+    done. Raises GeometryError if a grid point has no expected point, or if fewer than two sets have
+    rays.
     """
-    points, sets = image_grid(sensor, settings.grid), settings.sets
+    points, sets, limits = image_grid(sensor, settings.grid), settings.sets, settings.clusters_mm
     root = draw_root(sds, correlation)
-    project = _PlaneErrors(sensor, iop, points, settings.distance_mm)
+    expected = on_plane(sensor, iop, points, settings.distance_mm)
     k = len(points)
-    limits = np.asarray(settings.clusters_mm)
-    counts = np.zeros((k, len(limits) + 1), dtype=np.int64)
+    beyond = np.zeros((k, len(limits)), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))
     sample: list[Array] = []
     rng = np.random.default_rng(settings.seed)
-    folded = 0
-    draws = (
-        (rng.standard_normal((min(_CHUNK, sets - done), len(root))), max(_SAMPLE - done, 0))
-        for done in range(0, sets, _CHUNK)
-    )
-    for drawn, ok, part_counts, part_largest, part_sums, first_errors in in_order(
-        _simulate, (project, iop, root, limits), draws, settings.jobs
-    ):
-        folded += drawn - ok
-        counts += part_counts
-        np.maximum(largest, part_largest, out=largest)
-        sums += part_sums
-        sample.append(first_errors)
+    used = 0
+    for done in range(0, sets, _CHUNK):
+        drawn = iop + rng.standard_normal((min(_CHUNK, sets - done), len(root))) @ root
+        errors = plane_errors(sensor, drawn, points, expected, settings.distance_mm)
+        dx, dy = errors if np.isfinite(errors).all() else errors[:, :, np.isfinite(errors[0, 0])]
+        distance = np.sqrt(dx * dx + dy * dy)
+        used += distance.shape[1]
+        beyond += np.stack([np.count_nonzero(distance >= one, axis=1) for one in limits], axis=1)
+        np.maximum(largest, distance.max(axis=1, initial=0.0), out=largest)
+        squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
+        rows = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
+        sums += np.stack(rows, axis=1)
+        if done < _SAMPLE:
+            sample.append(np.stack([dx.T, dy.T], axis=-1))
         if progress is not None:
-            progress(drawn)
-    used = sets - folded
+            progress(len(drawn))
+    folded = sets - used
     if used < 2:
         raise GeometryError(
             f"{folded} of {sets} drawn interior orientations fold the image over itself: the "
             "standard deviations of the distortion parameters are too large to simulate with"
         )
+    counts = -np.diff(beyond, axis=1, prepend=used, append=0)
     means = sums / used
     mean_error = means[:, 1:3]
     second = means[:, [3, 5, 5, 4]].reshape(k, 2, 2)
     covariance = second - mean_error[:, :, None] * mean_error[:, None, :]
     return MonteCarlo(
-        sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, project.expected,
+        sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, expected,
         counts, means[:, 0], largest, mean_error, covariance, np.concatenate(sample), folded,
     )  # fmt: skip
 
 
-def _simulate(
-    common: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
-) -> tuple[int, int, NDArray[np.int64], Array, Array, Array]:
-    """Simulate a chunk of sets.
-
-    common: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters;
-    draws: standard normal numbers (n, r), and how many sets the sample still needs. Returns the
-    numbers of sets drawn and of sets with rays; counts, largest as in `MonteCarlo`; sums (k, 6) of
-    distances, errors, their squares and product; errors (s, k, 2) of the sample.
-    """
-    (project, iop, root, limits), (normal, wanted) = common, draws
-    dx, dy, ok = project(iop + normal @ root)
-    if not ok.all():
-        dx, dy = dx[:, ok], dy[:, ok]
-    k, n = dx.shape
-    distance = np.sqrt(dx * dx + dy * dy)
-    beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in limits]
-    edges = np.stack([np.full(k, n), *beyond, np.zeros(k, dtype=np.int64)])
-    squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
-    sums = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
-    return (
-        len(normal), n, -np.diff(edges, axis=0).T, distance.max(axis=1, initial=0.0),
-        np.stack(sums, axis=1), np.stack([dx[:, :wanted].T, dy[:, :wanted].T], axis=-1),
-    )  # fmt: skip
-
-
 def plane_errors(
-    sensor: Sensor, iop: Array, sets: Array, points: Array, distance_mm: float
+    sensor: Sensor, sets: Array, points: Array, expected: Array, distance_mm: float
 ) -> Array:
-    """Return errors (n, k, 2) mm of image points (k, 2) px for sets (n, 10); NaN without rays."""
-    dx, dy, ok = _PlaneErrors(sensor, iop, points, distance_mm)(sets)
-    errors = np.stack([dx.T, dy.T], axis=-1)
-    errors[~ok] = np.nan
-    return errors
+    """Return the errors in X and Y (2, k, n) mm of image points (k, 2) px for sets (n, 10).
 
-
-class _PlaneErrors:
-    """The errors of fixed image points for many sets of IOP.
-
-    The ideal point of each set starts at its first-order value, where its Jacobian is evaluated
-    once, so that two or three steps are enough. A general inversion would start at the image point.
+    expected (k, 2): points on the plane, mm, as `on_plane` gives them. A set that has no ray for
+    one of the points has NaN for all.
     """
+    sets, middle = np.asfortranarray(sets), expected.T[..., None]
+    scale = distance_mm / sets[:, 0]
+    # (k, n, 1): one point per camera at a time, as the camera model broadcasts
+    ideal = (middle / scale)[..., None]
+    measured = image_to_mm(sensor, points).T[..., None, None]
+    solved = solve_distortion(sets, measured, ideal, _CONVERGED * sensor.pixel_pitch)
+    errors = ideal[..., 0] * scale - middle
+    errors[:, :, ~solved.all(axis=(0, 2))] = np.nan
+    return np.asarray(errors)
 
-    def __init__(self, sensor: Sensor, iop: Array, points: Array, distance_mm: float) -> None:
-        self.expected = on_plane(sensor, iop, points, distance_mm)
-        self._distance = distance_mm
-        self._mm = image_to_mm(sensor, points)
-        self._iop = iop
-        scale = iop[0] / distance_mm
-        self._tolerance = _CONVERGED * iop[0]
-        self._ideal = self.expected * scale
-        by_iop = plane_jacobian(sensor, iop, points, distance_mm) * scale
-        # x̄ = X c / D depends on c also directly, not only through X
-        by_iop[:, :, 0] += self.expected / distance_mm
-        self._by_iop = by_iop
-
-    # a set that folds the image may diverge; it has no rays
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def __call__(self, sets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the errors in X and Y (k, n) mm of sets (n, 10), and which sets (n,) have rays."""
-        sets = np.asfortranarray(sets)
-        step = (sets - self._iop).T
-        # (k, n, 1): one point per camera at a time, as the camera model broadcasts
-        x = (self._ideal[:, :1] + self._by_iop[:, 0] @ step)[..., None]
-        y = (self._ideal[:, 1:] + self._by_iop[:, 1] @ step)[..., None]
-        xm, ym = self._mm[:, 0, None, None], self._mm[:, 1, None, None]
-        jxx, jxy, jyx, jyy = distortion_jacobian(sets, x, y)
-        inverse = 1.0 / (jxx * jyy - jxy * jyx)
-        ok: NDArray[np.bool_] = np.asarray((inverse > 0).all(axis=(0, 2)))
-        jxx, jxy, jyx, jyy = jyy * inverse, jxy * inverse, jyx * inverse, jxx * inverse
-        for _ in range(_STEPS):
-            xd, yd = distort(sets, x, y)
-            rx, ry = xm - xd, ym - yd
-            if max(rx.max(), -rx.min(), ry.max(), -ry.min()) <= self._tolerance:
-                break
-            x += jxx * rx - jxy * ry
-            y += jyy * ry - jyx * rx
-        else:
-            far = np.fmax(np.abs(rx), np.abs(ry))
-            ok &= (far <= self._tolerance).all(axis=(0, 2))
-        scale = self._distance / sets[:, 0]
-        found_x, found_y = x[..., 0] * scale, y[..., 0] * scale
-        return found_x - self.expected[:, :1], found_y - self.expected[:, 1:], ok
-
-
-REFERENCES = ("first", "mean", "last")
-"""Names of the interior orientations that are held fixed."""
 
 _MOST_EPOCHS = 2000  # per series, evenly spread
 
@@ -331,15 +258,16 @@ def trajectories(
     """
     found = []
     series = [one for one in series if len(one) > 1]
-    for reference in REFERENCES if series else ():
+    for reference in ("first", "mean", "last") if series else ():
         distances = []
         for one in series:
             rows = spread_rows(len(one), _MOST_EPOCHS)
             fixed = {"first": one.values[0], "mean": one.mean, "last": one.values[-1]}[reference]
             points = image_grid(one.sensor, size)
-            errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)
-            away = np.linalg.norm(errors, axis=-1)
-            distances.append(away[np.isfinite(away).all(axis=1)])
+            expected = on_plane(one.sensor, fixed, points, distance_mm)
+            errors = plane_errors(one.sensor, one.values[rows], points, expected, distance_mm)
+            away = np.hypot(*errors).T
+            distances.append(away[np.isfinite(away[:, 0])])
         every = np.concatenate(distances)
         below = [float(np.mean(every < limit)) for limit in clusters_mm]
         found.append(
@@ -360,14 +288,9 @@ def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
     NaN for parameters that were held or did not change.
     """
     columns = []
-    every = [name for name in IOP_NAMES if any(name in one.free for one in series)]
-    for name in every:
-        within = []
-        for one in series:
-            values = one.column(name)[0] if name in one.free else np.full(len(one), np.nan)
-            within.append(values - values.mean())  # a single epoch's column is no copy
-        columns.append(within[0] if len(within) == 1 else np.concatenate(within))
-    rows = [IOP_NAMES.index(name) for name in every]
-    matrix = np.full((len(IOP_NAMES), len(IOP_NAMES)), np.nan)
-    matrix[np.ix_(rows, rows)] = correlation_matrix(columns)
-    return matrix
+    for name in IOP_NAMES:
+        known = [
+            one.column(name)[0] if name in one.free else np.full(len(one), np.nan) for one in series
+        ]
+        columns.append(np.concatenate([values - values.mean() for values in known]))
+    return correlation_matrix(columns)

@@ -25,7 +25,7 @@ from thermocald.store.recording.reader import open_recording
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.measured import StudySettings
     from thermocald.analysis.study.study import CameraStudy
 
     _Row = tuple[str, str, str, float, float, float]
@@ -129,8 +129,10 @@ def reference_studies(
                 path = Path(folder) / name
                 preset_simulation(preset, seed, name).write(path)
                 recording = open_recording(path)
-                table, seen = recorded_table(recording, AdjustmentSettings(), "series")
-                one = measured_series(recording, table, seen, preset)
+                table = recorded_table(
+                    recording, AdjustmentSettings(), "series", jobs=settings.jobs
+                )
+                one = measured_series(recording, table, preset)
                 # the folder no longer exists when the study is read
                 source = f"preset {preset}, series {name}, seed {seed}"
                 measured.append(replace(one, source=source))
@@ -152,7 +154,7 @@ def compare(camera: CameraStudy) -> list[Comparison]:
     # direction of the principal point's largest shift, degrees from right towards up
     steps = []
     for one in series:
-        path = one.series.values[:, 1:3] - one.series.values[0, 1:3]
+        path = one.series.path_px
         steps.append(path[int(np.argmax(np.linalg.norm(path, axis=1)))])
     right, up = np.mean(steps, axis=0)
     where = float(np.degrees(np.arctan2(up, right)))

@@ -1,7 +1,17 @@
-"""The study of one or several cameras: section 4 of Elias et al. 2020 for the user's own cameras.
+"""The study of cameras and their series: section 4 of Elias et al. 2020 for the user's own.
 
 Series with the same label are one camera: their correlations are pooled for a single Monte-Carlo
 simulation. The reference treats a cold- and a warm-started camera as two; use two labels for that.
+
+A result that cannot be computed is None, and `notes` gives the reason.
+
+Deviations are last minus first of every parameter, the path of the principal point, and the
+displacement of the image points of a static scene (Elias et al. 2020, Table 2 and Figures 3 to 6).
+
+Depth of field by the exact formulas of the thin lens (Luhmann et al. 2014, section 3.1.2): with the
+hyperfocal distance H = f²/(N u) + f, focused at s, sharp from s (H - f)/(H + s - 2f) to
+s (H - f)/(H - s). The reference quotes changes of 2 to 5 mm at 1 m but neither f-number nor circle
+of confusion.
 """
 
 from __future__ import annotations
@@ -9,11 +19,23 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from thermocald.analysis.statistics.dependence import IopCorrelations, median_correlations
+from thermocald.analysis.camera.undistortion import directions, image_grid
+from thermocald.analysis.statistics.dependence import (
+    Dependence,
+    IopCorrelations,
+    correlation_matrix,
+    dependence,
+    holm,
+    median_correlations,
+    moving_f_test,
+    unbroken_windows,
+)
+from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
+from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.montecarlo import (
     MonteCarlo,
     Trajectory,
@@ -25,15 +47,373 @@ from thermocald.analysis.study.montecarlo import (
     simulate_errors,
     trajectories,
 )
-from thermocald.analysis.study.series_study import SeriesStudy, StudySettings, study_series
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.numbers import parameter_label
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from thermocald.analysis.study.measured import MeasuredSeries
+    from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+
+    _Test = TypeVar("_Test", Dependence, DriftTest)
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """The change of a parameter over a series.
+
+    change: last minus first value; largest: signed, from the first value; range: largest minus
+    smallest value. The latter two, some sds from noise alone, reveal a camera that returned.
+    """
+
+    first: float
+    last: float
+    change: float
+    sd_change: float
+    largest: float
+    range: float
+    sd_over_time: float
+
+    @property
+    def returned(self) -> bool:
+        """True if the parameter changed by much more than `change`, which would hide it."""
+        return abs(self.largest) > max(1.5 * abs(self.change), 6 * self.sd_change)
+
+
+def deviation(values: Array, sds: Array, slow: float = 0.0) -> Deviation | None:
+    """Return the deviation of a column (n,) with standard deviations (n,); NaN epochs are left out.
+
+    slow: variance of last minus first beyond that of independent epochs, by errors that change
+    slowly within the series. Returns None for fewer than two values.
+    """
+    have = np.flatnonzero(np.isfinite(values))
+    if len(have) < 2:
+        return None
+    first, last = int(have[0]), int(have[-1])
+    difference = values[have] - values[first]
+    return Deviation(
+        float(values[first]),
+        float(values[last]),
+        float(difference[-1]),
+        float(np.sqrt(sds[first] ** 2 + sds[last] ** 2 + slow)),
+        float(difference[np.argmax(np.abs(difference))]),
+        float(np.ptp(difference)),
+        float(np.std(values[have], ddof=1)),
+    )
+
+
+def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array) -> Array:
+    """Return the displacement of a static scene's image points (k, 2) px by a change of the IOP.
+
+    first (10,), later (10,) or (n, 10); returns px (k, 2) or (n, k, 2), y down. Raises
+    GeometryError if the first IOP have no ray for a point.
+    """
+    scene = directions(sensor, first, points)
+    seen = project(sensor, later, np.zeros((*later.shape[:-1], 6)), scene)
+    return np.asarray(seen - points)
+
+
+def displacement_covariance(series: MeasuredSeries, points: Array) -> Array | None:
+    """Return the covariance (k, 2, 2) px² of `image_displacement` from the first to the last epoch.
+
+    It is None, unknown, if the series has no correlations.
+    """
+    if not len(series.correlations):
+        return None
+    scene = directions(series.sensor, series.values[0], points)
+    J = partials(series.sensor, series.values[-1], np.zeros(6), scene)[1][..., :10]
+    sds = np.nan_to_num(series.sds[[0, -1]])
+    covariance = series.correlations[[0, -1]] * sds[:, :, None] * sds[:, None, :]
+    return np.asarray(J @ covariance.sum(axis=0) @ np.swapaxes(J, 1, 2))
+
+
+def circle_of_confusion(sensor: Sensor) -> float:
+    """Return the largest blur that counts as sharp, mm: 1/2000 of the image diagonal, 2 to 3 px."""
+    return float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch / 2000
+
+
+def depth_of_field(
+    principal_distance: float, focus_distance: float, f_number: float, confusion: float
+) -> tuple[float, float]:
+    """Return the near and far limits between which a lens focused at `focus_distance` is sharp, mm.
+
+    A lens focused beyond the hyperfocal distance is sharp to infinity. The principal distance is
+    used as the focal length, which it exceeds by f²/s: 0.4 % at 1 m for these lenses. Raises
+    ValueError for lengths that are not positive.
+    """
+    f, s = principal_distance, focus_distance
+    if min(f, f_number, confusion) <= 0 or s <= f:
+        raise ValueError(
+            f"no depth of field for c {f} mm focused at {s} mm, f/{f_number}, circle {confusion} mm"
+        )
+    hyperfocal = f * f / (f_number * confusion) + f
+    near = s * (hyperfocal - f) / (hyperfocal + s - 2 * f)
+    far = s * (hyperfocal - f) / (hyperfocal - s) if hyperfocal > s else float("inf")
+    return near, far
+
+
+_COURSE = 500
+_GAP_IN_INTERVALS = 1.5
+_LEAST_DEPENDENCE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Significance:
+    """The moving F-test of one parameter in summary, and the drift test of the whole series.
+
+    success_ratio: over `tests` epochs; left_out: epochs without a window; degrees of freedom of the
+    variance and (median) of the mean squared sd; critical: median; course (k, 2): time s and ratio
+    of the variances, thinned for drawing; drift: None if it cannot be tested.
+    """
+
+    JSON: ClassVar = {"critical": "critical_ratio", "course": "", "drift": "drift_test"}
+
+    success_ratio: float
+    tests: int
+    left_out: int
+    degrees_variance: int
+    degrees_sd: float
+    critical: float
+    median_ratio: float
+    course: Array
+    drift: DriftTest | None
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelStudy:
+    """The dependence of free parameters and sigma0 on a thermometer, or the `reason` for none."""
+
+    thermometer: Thermometer
+    dependences: Mapping[str, Dependence]
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FocusChange:
+    """The depth of field at the first and the last epoch, mm, and its change with sd."""
+
+    JSON: ClassVar = {
+        "change": "change_mm", "sd_change": "sd_change_mm", "confusion": "confusion_mm",
+    }  # fmt: skip
+
+    near_first_mm: float
+    far_first_mm: float
+    near_last_mm: float
+    far_last_mm: float
+    change: float
+    sd_change: float
+    confusion: float
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesStudy:
+    """The study of one series.
+
+    deviations: of the IOP, `sigma0` and the thermometers; grid, displacement (k, 2) px: image
+    points of a static scene and their shifts from the first to the last epoch, y down;
+    displacement_covariance (k, 2, 2) px²: of the shifts, None if unknown; columns,
+    matrix (n, n): Pearson's r among free IOP, sigma0 and thermometers; noise_ratio: scatter between
+    neighbouring epochs over the stated standard deviations, NaN if it could not be estimated.
+    """
+
+    series: MeasuredSeries
+    deviations: Mapping[str, Deviation]
+    focus: FocusChange | None
+    grid: Array
+    displacement: Array | None
+    displacement_covariance: Array | None
+    significance: Mapping[str, Significance]
+    channels: tuple[ChannelStudy, ...]
+    columns: tuple[str, ...]
+    matrix: Array
+    notes: tuple[str, ...]
+    noise_ratio: float
+
+
+def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
+    """Study one series. Never raises because of data; `notes` states what they do not allow."""
+    notes = _circumstances(series)
+    slow = dict(zip(IOP_NAMES, series.slow.tolist(), strict=True))
+    deviations = {
+        name: d
+        for name, column in series.columns.items()
+        if (d := deviation(*column, slow.get(name, 0.0))) is not None
+    }
+    significance = _significance(series, settings, notes)
+    channels = tuple(_channel(series, t) for t in series.thermometers)
+    notes += [c.reason for c in channels if c.reason]
+    short: dict[str, list[str]] = {}
+    for c in channels:
+        if slopes := [parameter_label(n) for n, d in c.dependences.items() if d.too_short]:
+            short.setdefault(", ".join(slopes), []).append(parameter_label(c.thermometer.name))
+    notes += [
+        f"Slopes of {of} on {' and '.join(on)}: the noise is correlated over more than a seventh "
+        "of the series, which is too short for their standard deviations; take those as an order "
+        "of magnitude."
+        for of, on in short.items()
+    ]
+    grid = image_grid(series.sensor)
+    displacement = covariance = None
+    if len(series) > 1:
+        try:
+            displacement = image_displacement(
+                series.sensor, series.values[0], series.values[-1], grid
+            )
+            covariance = displacement_covariance(series, grid)
+        except GeometryError as error:
+            notes.append(f"The displacement of the image cannot be computed: {error}.")
+    focus = _focus(series, settings, deviations, notes)
+    # root mean square over all parameters
+    ratios = [one.drift.noise_ratio for one in significance.values() if one.drift is not None]
+    noise_ratio = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
+    return SeriesStudy(
+        series, deviations, focus, grid, displacement, covariance, significance, channels,
+        tuple(series.columns), correlation_matrix([v for v, _ in series.columns.values()]),
+        tuple(notes), noise_ratio,
+    )  # fmt: skip
+
+
+def _circumstances(series: MeasuredSeries) -> list[str]:
+    """Return notes on the series that a reader needs before its results."""
+    notes = []
+    lost = sum(series.without_result.values())
+    if lost:
+        reasons = ", ".join(f"{n} × {reason}" for reason, n in series.without_result.items())
+        notes.append(f"{lost} of {lost + len(series)} epochs have no result ({reasons}).")
+    if len(series) == 1:
+        notes.append("The series has a single epoch: nothing can be said about change.")
+    elif len(series) > 1:
+        steps = np.diff(series.time_s)
+        gaps = steps > _GAP_IN_INTERVALS * series.interval_s
+        if gaps.any():
+            count = int(gaps.sum())
+            notes.append(
+                f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
+                f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s. Windows "
+                "across gaps are not tested; the noise decorrelates in a gap as between epochs."
+            )
+    held = [name for name in IOP_NAMES if name not in series.free]
+    if held:
+        notes.append(
+            f"{', '.join(held)} {'was' if len(held) == 1 else 'were'} held fixed in the "
+            "adjustment: not tested, not correlated, not varied in the simulation."
+        )
+    if series.choice:
+        notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
+    notes += [f"The test field moved: {m.sentence}; corrected." for m in series.field_movements]
+    if series.exterior == "per_epoch":
+        notes.append(
+            "Every epoch has an exterior orientation of its own: its movements and those of the "
+            "principal point are weakly separated, which the standard deviations include."
+        )
+    if not series.thermometers:
+        notes.append("The series has no temperature: no dependence on it can be computed.")
+    return notes
+
+
+def _significance(
+    series: MeasuredSeries, settings: StudySettings, notes: list[str]
+) -> dict[str, Significance]:
+    starts = unbroken_windows(series.time_s, settings.window)
+    if not len(starts):
+        notes.append(
+            f"The F-test needs {settings.window} consecutive epochs; the series has {len(series)}"
+            f"{' but too many gaps' if len(series) >= settings.window else ''}: not tested."
+        )
+        return {}
+    drifts = {
+        name: drift_test(*series.column(name), series.redundancy, settings.window, series.time_s)
+        for name in series.free
+    }
+    tested = _corrected(
+        {name: drift for name, drift in drifts.items() if drift is not None},
+        p_holm="p_value", p_excess_holm="p_excess",
+    )  # fmt: skip
+    result = {}
+    for name in series.free:
+        values, sds = series.column(name)
+        index, ratio, critical, degrees_sd = moving_f_test(
+            values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
+        )
+        some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
+        result[name] = Significance(
+            float(np.mean(ratio > critical)), len(ratio), len(values) - len(ratio),
+            settings.window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
+            float(np.median(ratio)), np.column_stack([series.time_s[index[some]], ratio[some]]),
+            tested.get(name),
+        )  # fmt: skip
+    return result
+
+
+def _corrected(tests: dict[str, _Test], **names: str) -> dict[str, _Test]:
+    """Correct p-values for the number of tests (Holm); names: {corrected p-value: p-value}."""
+    for name, of in names.items():
+        p = holm([getattr(test, of) for test in tests.values()])
+        changes: list[dict[str, Any]] = [{name: value} for value in p]
+        tests = {
+            key: replace(test, **change)
+            for (key, test), change in zip(tests.items(), changes, strict=True)
+        }
+    return tests
+
+
+def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
+    """Return the dependence of all parameters on one thermometer, or why there is none."""
+    name, sd = thermometer.name, thermometer.sd
+    have = np.isfinite(thermometer.values)
+    t = thermometer.values[have]
+    reason = ""
+    if len(t) < _LEAST_DEPENDENCE:
+        reason = f"{name} has too few readings ({len(t)}) for a dependence on it."
+    elif not np.ptp(t) > 0:
+        reason = f"{name} stayed at {t[0]:.2f} °C: no dependence on it can be computed."
+    elif float(np.var(t, ddof=1)) < 2 * sd**2:
+        reason = (
+            f"{name} varied by {np.std(t, ddof=1):.3f} K, which its noise of {sd:.3f} K explains: "
+            "no dependence on it can be computed."
+        )
+    if reason:
+        return ChannelStudy(thermometer, {}, reason)
+    found = {}
+    for column in (*series.free, "sigma0"):
+        values, sds = series.columns[column]
+        if np.ptp(values[have]) > 0:
+            found[column] = dependence(values[have], sds[have], t, sd, series.time_s[have])
+    return ChannelStudy(thermometer, _corrected(found, p_naive_holm="p_naive", p_holm="p_value"))
+
+
+def _focus(
+    series: MeasuredSeries,
+    settings: StudySettings,
+    deviations: Mapping[str, Deviation],
+    notes: list[str],
+) -> FocusChange | None:
+    if "c" not in deviations:
+        notes.append("The principal distance was held or has one value only: no change of focus.")
+        return None
+    confusion = settings.confusion_mm or circle_of_confusion(series.sensor)
+    c = deviations["c"]
+    try:
+        ends = [
+            depth_of_field(value, settings.focus_mm, settings.f_number, confusion)
+            for value in (c.first, c.last, c.first * (1 + 1e-6))
+        ]
+    except ValueError as error:
+        notes.append(f"The depth of field cannot be computed: {error}.")
+        return None
+    first, last, nudged = (far - near for near, far in ends)
+    change = last - first
+    if not np.isfinite(change):
+        notes.append(
+            f"Focused at {settings.focus_mm / 1000:g} m, everything up to infinity is sharp: the "
+            "depth of field has no far limit that could change."
+        )
+        return None
+    slope = (nudged - first) / (c.first * 1e-6)
+    return FocusChange(*ends[0], *ends[1], change, abs(slope) * c.sd_change, confusion)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from thermocald.analysis.study.series_study import SeriesStudy
-    from thermocald.analysis.study.study import CameraStudy
+    from thermocald.analysis.study.study import CameraStudy, SeriesStudy
     from thermocald.arrays import Array
 
 _DRAWN = 400  # points of a cloud
@@ -99,8 +98,8 @@ def deviation_figure(camera: CameraStudy) -> Figure:
                 curve = Curve(s.name, t, celsius, "line", colour)
                 temperatures.setdefault(thermometer.name, []).append(curve)
         if "x0" in d and "y0" in d:
-            way = np.hypot(*(s.values[:, 1:3] - s.values[0, 1:3]).T) / s.sensor.pixel_pitch
-            words.append(f"in {s.name} by up to {plain(float(way.max()), 'px', 3)}")
+            farthest = float(np.hypot(*s.path_px.T).max())
+            words.append(f"in {s.name} by up to {plain(farthest, 'px', 3)}")
     panels.append(Panel("σ₀ / first σ₀", "time in min", "ratio (no unit)", tuple(ratios)))
     panels += [
         Panel(parameter_label(name), "time in min", "temperature in °C", tuple(curves))
@@ -122,7 +121,7 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
     curves, words = [], []
     for study, colour in _coloured(camera):
         s = study.series
-        x, y = ((s.values[:, k] - s.values[0, k]) / s.sensor.pixel_pitch for k in (1, 2))
+        x, y = s.path_px.T
         rows = spread_rows(len(s), 600)
         curves.append(Curve(s.name, x[rows], y[rows], "line", colour))
         curves.append(Curve("", x[:1], y[:1], "points", "#000000"))

@@ -1,4 +1,6 @@
-"""The report of a study: the change of a camera with its temperature, and its effects.
+"""The results of a study: in sentences, as a JSON document, and as the report's page.
+
+The document follows CONVENTIONS §4: units of the model, `sd_<name>` beside a value.
 
 `save_figures` writes the figures of the report for a publication.
 """
@@ -6,38 +8,49 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.arrays import eight_bit
-from thermocald.errors import ImageError
-from thermocald.figures import Figure, draw_figure, save
+from thermocald.figures import draw_figure, save
 from thermocald.files import make_folder
-from thermocald.numbers import enumerated, plain
+from thermocald.numbers import (
+    coefficient,
+    duration,
+    enumerated,
+    parameter_label,
+    percent,
+    plain,
+    signed,
+    with_sd,
+)
 from thermocald.output.study import tables
 from thermocald.output.study.figures import (
+    FEWEST_FOR_R,
     dependence_figure,
     file_name,
     principal_point_figure,
     study_figures,
 )
-from thermocald.output.study.summary import answer_sentences, detail_sentences
-from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day, render_report
+from thermocald.result import document_of, jsonable
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
+    from thermocald.analysis.study.measured import StudySettings
+    from thermocald.analysis.study.reference import Comparison
+    from thermocald.analysis.study.study import (
+        CameraStudy,
+        ChannelStudy,
+        Deviation,
+        SeriesStudy,
+        Study,
+    )
 
-    from thermocald.analysis.study.series_study import StudySettings
-    from thermocald.analysis.study.study import CameraStudy, Study
-
-_CLIP_PX = 96
-_CLIP_LONGEST_PX = 480
 _LEAD = (
     "How the interior orientation of a camera changes with its temperature, whether the changes "
     "are significant, and what they do to measurements in object space; the analysis is that of "
@@ -128,18 +141,18 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
 
     def section(
         title: str, names: Sequence[str], found: Sequence[Table],
-        more: Sequence[Figure] = (), text: Sequence[str] = (), folded: bool = False,
+        text: Sequence[str] = (), folded: bool = False,
     ) -> Section:  # fmt: skip
-        shown = [drawn[name] for name in names if name in drawn]
+        shown = tuple(drawn[name] for name in names if name in drawn)
         rows = tuple(t for t in found if t.rows)
-        return Section(title, tuple(text), (*shown, *more), rows, folded=folded)
+        return Section(title, tuple(text), shown, rows, folded=folded)
 
     matrices = [name for name in drawn if name.startswith("correlation-")]
     depends = tables.dependence_tables(camera)
     parts = [
         section(
             "How the camera changed", ("deviations", "principal-point", "movement"),
-            [tables.deviation_table(camera)], _clips(camera),
+            [tables.deviation_table(camera)],
         ),
         section(
             "How it depends on the temperature", ("temperature-dependence",),
@@ -179,60 +192,6 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
     return (f"If the lens were {lens}, {change}. Neither was measured.",)
 
 
-def _clips(camera: CameraStudy) -> list[Figure]:
-    """Show the first and last image around one target for every series that has frames."""
-    made = []
-    for i, study in enumerate(camera.series):
-        clip = study.series.clip
-        if clip is None:
-            continue
-        images = tuple(
-            (f"{study.series.name}, epoch {epoch}", clip_png(cut_clip(path, clip.centre, _CLIP_PX)))
-            for path, epoch in ((clip.first, clip.first_epoch), (clip.last, clip.last_epoch))
-        )
-        made.append(
-            Figure(
-                f"clips-{i}",
-                f"Image around target {clip.target}",
-                f"The same {_CLIP_PX} × {_CLIP_PX} px of the first and the last frame; the cross "
-                "marks the position of the target in the first.",
-                images=images,
-            )
-        )
-    return made
-
-
-def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.uint8]:
-    """Return a grey square of `size` px about `centre` (px), black beyond the image's edge.
-
-    Raises ImageError for a file that is not an image.
-    """
-    image = eight_bit(decode_grey(path))
-    left, top = (round(v - (size - 1) / 2) for v in centre)
-    clip = np.zeros((size, size), dtype=np.uint8)
-    height, width = image.shape
-    x0, x1 = max(left, 0), min(left + size, width)
-    y0, y1 = max(top, 0), min(top + size, height)
-    if x0 < x1 and y0 < y1:
-        clip[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
-    return clip
-
-
-def clip_png(clip: NDArray[np.uint8]) -> bytes:
-    """Return a clip as PNG, enlarged by whole pixels, with a cross at its centre."""
-    import cv2
-
-    factor = max(1, _CLIP_LONGEST_PX // len(clip))
-    large = cv2.cvtColor(np.kron(clip, np.ones((factor, factor), np.uint8)), cv2.COLOR_GRAY2BGR)
-    middle = len(large) // 2
-    cv2.line(large, (middle, 0), (middle, len(large)), (0, 94, 213), 1)
-    cv2.line(large, (0, middle), (len(large), middle), (0, 94, 213), 1)
-    done, png = cv2.imencode(".png", large)
-    if not done:
-        raise ImageError("an image clip could not be written as PNG")
-    return bytes(png.tobytes())
-
-
 def _notes(camera: CameraStudy) -> list[str]:
     """Return the notes of all series, each once, with the series to which it applies."""
     holders: dict[str, list[str]] = {}
@@ -249,3 +208,342 @@ def _notes(camera: CameraStudy) -> list[str]:
         for line in doubt_lines(study.series.doubts, study.series.name)
     ]
     return doubts + notes + list(camera.notes)
+
+
+_CLOSE = 0.9
+_TOGETHER = 0.9
+_NOISE_AGREES = 1.15
+_SIGNIFICANT = 0.05
+_DISTANCE_MM = 10_000.0
+_OF_SERIES = (
+    "name", "camera", "source", "without_result", "image_noise_ratio", "field_movements",
+    "exterior", "free", "doubts",
+)  # fmt: skip
+_OF_STUDY = ("noise_ratio", "deviations", "significance", "notes")
+_FIXED = {
+    "first": "the first epoch's interior orientation",
+    "mean": "the mean",
+    "last": "the last epoch's",
+}
+
+
+def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[str]:
+    """Return the lines that `thermocald study` prints, or those of the comparisons if given."""
+    if comparisons:
+        rows = [f"{'camera':17}{'quantity':43}{'reference':>12}{'ours':>9}  met"]
+        for c in comparisons:
+            quantity = f"{c.quantity} {c.unit}" if c.unit else c.quantity
+            met = "yes" if c.reproduced else "NO"
+            rows.append(f"{c.camera:17}{quantity:43}{c.text:>12}{c.ours:>9.3g}  {met}")
+        return rows
+    lines = []
+    for camera in study.cameras:
+        lines.append(camera.label)
+        lines += [f"  {s}" for s in (*answer_sentences(camera), *detail_sentences(camera))]
+        for one in camera.series:
+            lines += [f"  {line}" for line in doubt_lines(one.series.doubts, one.series.name)]
+        for one in camera.series:
+            lines += [f"  note, {one.series.name}: {note}" for note in one.notes]
+        lines += [f"  note: {note}" for note in camera.notes]
+    return lines
+
+
+def answer_sentences(camera: CameraStudy) -> list[str]:
+    """Return the results in sentences, the rates first, without those the data do not support."""
+    mc = camera.montecarlo
+    distance = mc.distance_mm if mc is not None else _DISTANCE_MM
+    sentences = [s for study in camera.series if (s := rates(study, distance))]
+    sentences += [s for study in camera.series if (s := _change(study))]
+    if mc is not None:
+        sentences.append(
+            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
+            "about the series' mean with the correlations of an epoch's adjustment (the "
+            f"reference's procedure) cause errors of {mc.overall_mean / 10:.2f} cm on average and "
+            f"up to {mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
+            f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
+        )
+        sentences += _trajectory(camera, mc.clusters_mm[0])
+    return sentences
+
+
+def detail_sentences(camera: CameraStudy) -> list[str]:
+    """Return sentences on the dependence on temperature, and on noise other than the stated."""
+    sentences = [s for study in camera.series if (s := _dependence(study))]
+    return sentences + [s for study in camera.series if (s := _noise(study))]
+
+
+def rates(study: SeriesStudy, distance_mm: float) -> str:
+    """State the significant rates of c, x0 and y0 with the reference temperature; "" if none is.
+
+    The rates are in px/K and µm/K with their standard deviations, and in mm/K on a plane at a
+    distance: for x0 and y0 everywhere, for c at the image's left and right edge.
+    """
+    channel = next((c for c in study.channels if c.dependences), None)
+    if channel is None:
+        return ""
+    found = [
+        (name, rate_in_px_and_mm(study, name, d.slope, distance_mm), d)
+        for name, d in channel.dependences.items()
+        if name in ("c", "x0", "y0") and d.p_holm < _SIGNIFICANT
+    ]
+    if not found:
+        return ""
+    found.sort(key=lambda one: -abs(one[1][0]))
+    parts = []
+    for name, (px, _), d in found:
+        sd_px = abs(px * d.sd_slope / d.slope)
+        parts.append(f"{parameter_label(name)} by {signed(px, sd_px, 'px/K')}")
+    name, (_, mm), d = found[0]
+    edge = " at the image's edge" if name == "c" else ""
+    parts[0] = parts[0].replace(" by ", " moves by ", 1) + (
+        f" ({signed(1000 * d.slope, 1000 * d.sd_slope, 'µm/K')}; at {distance_mm / 1000:g} m "
+        f"{plain(abs(mm), 'mm/K', 3)}{edge})"
+    )
+    T = channel.thermometer.values
+    low, high = float(np.nanmin(T)), float(np.nanmax(T))
+    rough = " (standard deviations are rough, because the series is short)"
+    where = parameter_label(channel.thermometer.name)
+    return (
+        f"{study.series.name}: between {low:.0f} and {high:.0f} °C "
+        f"{'' if where == 'temperature' else f'({where}) '}{enumerated(parts)}"
+        f"{rough if any(d.too_short for *_, d in found) else ''}."
+    )
+
+
+def rate_in_px_and_mm(
+    study: SeriesStudy, name: str, rate: float, distance_mm: float
+) -> tuple[float, float]:
+    """Convert a rate of c, x0 or y0 from mm/K to px/K, and to mm/K on a plane at a distance."""
+    s = study.series
+    c = float(np.mean(s.values[:, 0]))
+    lever = 0.5 * s.sensor.width * s.sensor.pixel_pitch / c if name == "c" else 1.0
+    return rate / s.sensor.pixel_pitch, rate * lever / c * distance_mm
+
+
+def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
+    """Compare the camera's own path with the draws, and state the correlations these ignore."""
+    if not camera.trajectories:
+        return []
+    parts = [
+        f"{percent(float(one.fractions[0]))} with {_FIXED[one.reference]}"
+        for one in camera.trajectories
+    ]
+    parts[0] = parts[0].replace(" with", " of the points with") + " held fixed"
+    text = (
+        f"The camera, along its own path, stays within {limit_mm / 10:g} cm at {enumerated(parts)}."
+    )
+    strong = []
+    known = sum(len(study.series) for study in camera.series) >= FEWEST_FOR_R
+    for i, j in ((1, 2), (0, 1), (0, 2)) if known else ():
+        over_time = float(camera.over_time[i, j])
+        if not abs(over_time) >= _TOGETHER:
+            continue
+        words = f"{parameter_label(IOP_NAMES[i])} and {parameter_label(IOP_NAMES[j])}"
+        strong.append(f"{words} {coefficient(over_time)}")
+    if strong and camera.correlations is not None:
+        drawn = coefficient(float(camera.correlations.median[1, 2]))
+        text += (
+            f" Over time its parameters change together (r of {', '.join(strong)}), which the "
+            f"draws ignore (r of x₀ and y₀ in the draws: {drawn})."
+        )
+    return [text]
+
+
+def _change(study: SeriesStudy) -> str:
+    s, d = study.series, study.deviations
+    if not d or len(s) < 2:
+        return ""
+    words = []
+    if "x0" in d and "y0" in d:
+        way = np.hypot(*s.path_px.T)
+        moved, farthest = float(way[-1]), float(way.max())
+        sd = float(np.hypot(d["x0"].sd_change, d["y0"].sd_change)) / s.sensor.pixel_pitch
+        if farthest > max(1.5 * moved, 6 * sd):
+            words.append(
+                f"the principal point moved by up to {plain(farthest, 'px', 3)} and ended "
+                f"{plain(moved, 'px', 3)} from where it started"
+            )
+        elif moved > 3 * sd:
+            words.append(f"the principal point moved by {with_sd(moved, sd, 'px')}")
+        else:
+            words.append(f"the principal point stayed within {plain(3 * sd, 'px', 2)}")
+    if "c" in d:
+        words.append(_distance(d["c"]))
+    if not words:
+        return ""
+    time = duration(float(s.time_s[-1] - s.time_s[0]))
+    return f"{s.name}: in {time} {', and '.join(words)}{_warmed(study)}."
+
+
+def _distance(c: Deviation) -> str:
+    """Describe the change of the principal distance."""
+    if c.returned:
+        grew = "grew" if c.largest > 0 else "shrank"
+        ended = f"{plain(1000 * abs(c.change), 'µm', 2)} {'longer' if c.change > 0 else 'shorter'}"
+        if abs(c.change) < 3 * c.sd_change:
+            ended = f"within {plain(3000 * c.sd_change, 'µm', 2)} of where it started"
+        return (
+            f"the principal distance {grew} by up to {plain(1000 * abs(c.largest), 'µm', 2)} and "
+            f"ended {ended}"
+        )
+    if abs(c.change) > 3 * c.sd_change:
+        grew = "grew" if c.change > 0 else "shrank"
+        return (
+            f"the principal distance {grew} by "
+            f"{with_sd(1000 * abs(c.change), 1000 * c.sd_change, 'µm')}"
+        )
+    return "the principal distance did not change beyond its uncertainty"
+
+
+def _warmed(study: SeriesStudy) -> str:
+    """Describe the change of the reference temperature during the series."""
+    reference = study.series.reference
+    if reference is None or reference.name not in study.deviations:
+        return ""
+    d = study.deviations[reference.name]
+    name = parameter_label(reference.name)
+    if d.returned:
+        rose, largest = "rose" if d.largest > 0 else "fell", plain(abs(d.largest), "K", 3)
+        within = plain(d.range, "K", 3)
+        over = "" if within == largest else f" (range {within})"
+        back = abs(d.change) < 3 * d.sd_change
+        end = "" if back else f"{plain(abs(d.change), 'K', 3)} from "
+        return f", while {name} {rose} by up to {largest}{over} and ended {end}where it started"
+    return f", while {name} changed by {plain(d.change, 'K', 3)}"
+
+
+def _noise(study: SeriesStudy) -> str:
+    """State the noise if it differs from the stated standard deviations, else ""."""
+    ratio = study.noise_ratio
+    if not np.isfinite(ratio) or 1 / _NOISE_AGREES <= ratio <= _NOISE_AGREES:
+        return ""
+    sigma0 = float(np.sqrt(np.mean(np.square(study.series.sigma0))))
+    return (
+        f"{study.series.name}: neighbouring epochs scatter {ratio:.2f} times as much as the "
+        f"standard deviations state (σ₀ {sigma0:.2f})."
+    )
+
+
+def _dependence(study: SeriesStudy) -> str:
+    channel = next((c for c in study.channels if c.dependences), None)
+    if channel is None:
+        return ""
+    close = [parameter_label(n) for n, d in channel.dependences.items() if abs(d.r) >= _CLOSE]
+    found = channel.dependences.items()
+    significant = [parameter_label(n) for n, d in found if d.p_holm < _SIGNIFICANT]
+    name = parameter_label(channel.thermometer.name)
+    if not significant:
+        return f"{study.series.name}: no parameter depends significantly on {name}."
+    depends = "depends" if len(significant) == 1 else "depend"
+    text = f"{study.series.name}: {', '.join(significant)} {depends} significantly on {name}"
+    if close == significant:
+        return f"{text}, and closely (|r| ≥ {_CLOSE})."
+    return text + (f", {', '.join(close)} closely (|r| ≥ {_CLOSE})." if close else ".")
+
+
+def study_document(study: Study) -> dict[str, Any]:
+    """Return all results; those that could not be computed are null, and `notes` states why."""
+    s = study.settings
+    document: dict[str, Any] = jsonable(
+        {
+            "format": "thermocald-study/1",
+            "settings": {k: v for k, v in jsonable(s).items() if k != "jobs"},
+            "cameras": [_camera(camera, s.distance_mm) for camera in study.cameras],
+            "doubts": [
+                f"{one.series.name}: {text}"
+                for camera in study.cameras
+                for one in camera.series
+                for text in one.series.doubts
+            ],
+        }
+    )
+    return document
+
+
+def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
+    correlations = None
+    if camera.correlations is not None:
+        correlations = {"parameters": IOP_NAMES, **jsonable(camera.correlations)}
+    return {
+        "label": camera.label,
+        "series": [_series(one, distance_mm) for one in camera.series],
+        "interior_orientation": dict(zip(IOP_NAMES, camera.iop.tolist(), strict=True)),
+        "sd_over_time": dict(zip(IOP_NAMES, camera.sds.tolist(), strict=True)),
+        "iop_correlations": correlations,
+        "correlations_over_time": {"parameters": IOP_NAMES, "r": camera.over_time},
+        "object_space": _object_space(camera),
+        "trajectory": camera.trajectories,
+        "notes": list(camera.notes),
+    }
+
+
+def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
+    s = study.series
+    covariance = study.displacement_covariance
+    sd = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    moved = {"points": study.grid, "displacement": study.displacement, "sd_displacement": sd}
+    return {name: getattr(s, name) for name in _OF_SERIES} | {
+        **{name: getattr(study, name) for name in _OF_STUDY},
+        "epochs": len(s),
+        "sigma0": float(np.sqrt(np.mean(np.square(s.sigma0)))),
+        "exterior_choice": s.choice or None,
+        "depth_of_field": study.focus,
+        "image_displacement_px": None if study.displacement is None else moved,
+        "temperature_dependence": {
+            channel.thermometer.name: _channel(study, channel, distance_mm)
+            for channel in study.channels
+        },
+        "correlation_matrix": {"columns": study.columns, "r": study.matrix},
+    }
+
+
+def _channel(study: SeriesStudy, channel: ChannelStudy, distance_mm: float) -> dict[str, Any]:
+    parameters = {}
+    for name, d in channel.dependences.items():
+        parameters[name] = document_of(d)
+        if name in ("c", "x0", "y0"):
+            px, mm = rate_in_px_and_mm(study, name, d.slope, distance_mm)
+            sd_px, sd_mm = rate_in_px_and_mm(study, name, d.sd_slope, distance_mm)
+            parameters[name] |= {
+                "slope_px": px, "sd_slope_px": sd_px,
+                "slope_on_plane_mm": mm, "sd_slope_on_plane_mm": sd_mm,
+            }  # fmt: skip
+    return {
+        "sd_thermometer": channel.thermometer.sd,
+        "reason": channel.reason or None,
+        "parameters": parameters,
+    }
+
+
+def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
+    mc, first = camera.montecarlo, camera.first_order
+    if mc is None or first is None:
+        return None
+    points = [
+        {
+            "image_point_px": mc.image_points[k], "expected_mm": mc.expected[k],
+            "counts": mc.counts[k], "mean_mm": mc.mean[k], "largest_mm": mc.largest[k],
+            "bias_mm": mc.mean_error[k], "covariance_mm2": mc.covariance[k],
+            "first_order": {
+                "mean_mm": first.mean[k], "expected_largest_mm": first.expected_largest[k],
+                "covariance_mm2": first.covariance[k],
+            },
+        }
+        for k in range(len(mc.image_points))
+    ]  # fmt: skip
+    return {
+        "sets": mc.sets,
+        "seed": mc.seed,
+        "distance_mm": mc.distance_mm,
+        "clusters_mm": mc.clusters_mm,
+        "fractions": mc.fractions,
+        "mean_mm": mc.overall_mean,
+        "mean_of_maxima_mm": mc.mean_largest,
+        "folded_sets": mc.folded,
+        "points": points,
+        "first_order": {
+            "fractions": first.fractions,
+            "mean_mm": first.mean.mean(),
+            "mean_of_maxima_mm": first.expected_largest.mean(),
+        },
+    }

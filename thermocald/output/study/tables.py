@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -18,21 +18,21 @@ from thermocald.numbers import (
     with_sd,
 )
 from thermocald.output.study.figures import cluster_names
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.report import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
-    from thermocald.analysis.study.series_study import (
+    from thermocald.analysis.study.measured import StudySettings
+    from thermocald.analysis.study.study import (
+        CameraStudy,
         ChannelStudy,
         Deviation,
         SeriesStudy,
-        StudySettings,
     )
-    from thermocald.analysis.study.study import CameraStudy
     from thermocald.arrays import Array
 
+_Found = TypeVar("_Found")
 _FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
 
 
@@ -72,15 +72,17 @@ def overview_table(camera: CameraStudy) -> Table:
     )
 
 
+def _by_parameter(
+    found: Iterable[tuple[SeriesStudy, Mapping[str, _Found]]],
+) -> list[tuple[str, SeriesStudy, _Found]]:
+    """Return rows (parameter, series, result), the series of a parameter together."""
+    rows = [(name, study, result) for study, results in found for name, result in results.items()]
+    order = list(dict.fromkeys(name for name, *_ in rows))
+    return sorted(rows, key=lambda row: order.index(row[0]))
+
+
 def deviation_table(camera: CameraStudy) -> Table:
     """Return the table of last minus first epoch (Table 2)."""
-    names = dict.fromkeys(n for study in camera.series for n in study.deviations)
-    rows = [
-        (name, study, study.deviations[name])
-        for name in names
-        for study in camera.series
-        if name in study.deviations
-    ]
 
     def level(name: str, d: Deviation, value: float) -> str:
         return rounded(value, d.sd_change, UNITS.get(name, "°C"))
@@ -94,7 +96,7 @@ def deviation_table(camera: CameraStudy) -> Table:
 
     return Table.of(
         "Deviations, last minus first epoch",
-        rows,
+        _by_parameter([(study, study.deviations) for study in camera.series]),
         {
             "parameter": lambda r: parameter_label(r[0]),
             "series": lambda r: r[1].series.name,
@@ -126,27 +128,21 @@ def _in_pixels(study: SeriesStudy, name: str, value: float, sd: float) -> str:
 
 def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
     """Return the success ratios of the F-test and the p-values of the series (Tables 4 and 5)."""
-    rows = [
-        (name, study.series.name, study.significance[name], study.significance[name].drift)
-        for name in IOP_NAMES
-        for study in camera.series
-        if name in study.significance
-    ]
     return Table.of(
         "Is the variation greater than the uncertainty?",
-        rows,
+        _by_parameter([(study, study.significance) for study in camera.series]),
         {
             "parameter": lambda r: parameter_label(r[0]),
-            "series": lambda r: r[1],
+            "series": lambda r: r[1].series.name,
             "success ratio": lambda r: percent(r[2].success_ratio),
             "median variance ratio": lambda r: plain(r[2].median_ratio, digits=3),
             "limit": lambda r: f"{r[2].critical:.3f}",
             "degrees of freedom": lambda r: f"{r[2].degrees_variance}; {r[2].degrees_sd:.0f}",
             "epochs tested (left out)": lambda r: f"{r[2].tests} ({r[2].left_out})",
-            "p, no drift": lambda r: p_text(r[3].p_holm) if r[3] else "–",
-            "p, within sds": lambda r: p_text(r[3].p_excess_holm) if r[3] else "–",
+            "p, no drift": lambda r: p_text(r[2].drift.p_holm) if r[2].drift else "–",
+            "p, within sds": lambda r: p_text(r[2].drift.p_excess_holm) if r[2].drift else "–",
             "noise / stated": lambda r: (
-                with_sd(r[3].noise_ratio, r[3].sd_noise_ratio) if r[3] else "–"
+                with_sd(r[2].drift.noise_ratio, r[2].drift.sd_noise_ratio) if r[2].drift else "–"
             ),
         },
         f"F-test at each epoch: variance of {settings.window} consecutive epochs against the "
@@ -179,27 +175,20 @@ def _dependence_table(
         factor, unit = _small_unit(UNITS[name])
         return with_sd(factor * value, factor * sd, f"{unit or 1}/K")
 
-    names = dict.fromkeys(name for _, channel in channels for name in channel.dependences)
-    rows = [
-        (study, name, channel.dependences[name])
-        for name in names
-        for study, channel in channels
-        if name in channel.dependences
-    ]
     noise = ", ".join(f"{plain(c.thermometer.sd, 'K', 2)} in {s.series.name}" for s, c in channels)
     return Table.of(
         f"Dependence on {parameter_label(thermometer)}",
-        rows,
+        _by_parameter([(study, channel.dependences) for study, channel in channels]),
         {
-            "parameter": lambda r: parameter_label(r[1]),
-            "series": lambda r: r[0].series.name,
+            "parameter": lambda r: parameter_label(r[0]),
+            "series": lambda r: r[1].series.name,
             "r": lambda r: coefficient(r[2].r),
             "n": lambda r: f"{r[2].n}",
             "n effective": lambda r: f"{r[2].n_effective:.0f}",
             "p naive": lambda r: p_text(r[2].p_naive_holm),
             "p": lambda r: p_text(r[2].p_holm),
-            "slope ± sd": lambda r: slope(r[1], r[2].slope, r[2].sd_slope),
-            "px/K": lambda r: _in_pixels(r[0], r[1], r[2].slope, r[2].sd_slope),
+            "slope ± sd": lambda r: slope(r[0], r[2].slope, r[2].sd_slope),
+            "px/K": lambda r: _in_pixels(r[1], r[0], r[2].slope, r[2].sd_slope),
             "scatter / noise": lambda r: f"{r[2].misfit:.1f}",
         },
         "r: Pearson's correlation. p naive treats every epoch as independent; p is valid for noise "

@@ -212,11 +212,6 @@ class Recording:
                 found.append(f"the last {none} epochs have no observations: is the file cut off?")
         return found
 
-    def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:
-        """Return the first and last epoch (from 0) of `ok` (E,) with a frame, and their frames."""
-        rows = [i for i, frame in enumerate(self.columns.frames) if frame and ok[i]]
-        return [(i, self.path / self.columns.frames[i]) for i in rows[:1] + rows[1:][-1:]]
-
     @cached_property
     def _observation_file(self) -> ObservationFile:
         parquet = self.path / "observations.parquet"

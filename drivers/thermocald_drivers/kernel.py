@@ -48,16 +48,12 @@ from thermocald_drivers import chips, support
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from thermocald.hal import Clock, Reading
+    from thermocald.hal import Reading
 
 NOT_FITTED_C = -40.0
 LARGEST_OF_TENTHS = 1250  # 125 °C; a larger number can only be thousandths
 LARGEST_OF_DEGREES = 125
-UNITS = {"degC": 1.0, "tenths": 0.1, "thousandths": 0.001}
-"""Factors that convert a zone's number to °C, by the words of the option."""
-
 LOWEST_C, HIGHEST_C = -30.0, 125.0
-SWITCH_K, SWITCH_S = 5.0, 600.0
 COOLER_K = 10.0
 """No zone of a phone is colder than the coldest of the others by more than this."""
 
@@ -304,7 +300,6 @@ class ThermalZoneThermometer(_KernelThermometer):
         super().__init__(**options)
         self.unit = self.options.unit or "thousandths"
         self._certain = False
-        self._watch = UnitWatch(self.clock)
         if self.options.unit is None and not is_temperature(self.chip):
             raise ConfigurationError(
                 f"zone: {self.chip!r} holds percent, mA or mV on known machines; if it is a "
@@ -332,7 +327,7 @@ class ThermalZoneThermometer(_KernelThermometer):
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
             raise
-        scale = UNITS[self.unit]
+        scale = support.UNITS[self.unit]
         value = round(number * scale, 6)
         larger = abs(number) > LARGEST_OF_TENTHS
         self._certain |= larger and abs(value) <= LARGEST_OF_TENTHS / 10
@@ -344,7 +339,7 @@ class ThermalZoneThermometer(_KernelThermometer):
             )
         if value == NOT_FITTED_C:
             raise BadReading(f"{folder.name}: {value:g} °C is what an absent sensor reports")
-        if self._watch.switched(key, number, scale):
+        if self.checked.switched(key, number, scale):
             raise BadReading(
                 f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and agrees with the "
                 "last reading only in another unit; the kernel has switched the unit"
@@ -371,28 +366,6 @@ _FAMILIES: tuple[tuple[str, float, float, int], ...] = (
     (r".*_therm(?:\d|_.*)?", 105.0, -math.inf, 1251),
     (r"(?s:.*)", 105.0, HIGHEST_C, 500),
 )
-
-
-class UnitWatch:
-    """The last temperature of each source, for detecting a unit that switches.
-
-    Kernels report 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._last: dict[str, tuple[float, float]] = {}
-
-    def switched(self, source: str, number: float, scale: float) -> bool:
-        """Return whether a number agrees with the last temperature only in another unit."""
-        value, now = number * scale, self._clock.monotonic()
-        at, last = self._last.get(source, (now, value))
-        other = None
-        if now - at <= SWITCH_S and abs(value - last) > SWITCH_K:
-            rest = [number * unit for unit in UNITS.values() if unit != scale]
-            other = next((c for c in rest if abs(c - last) <= SWITCH_K), None)
-        self._last[source] = (now, value if other is None else other)
-        return other is not None
 
 
 def is_temperature(zone: str) -> bool:

@@ -116,44 +116,44 @@ def _one_end(received: bytes) -> bytes:
     return received.replace(b"\r", b"\n")
 
 
-class SerialOptions(DriverOptions):
-    """The options of `serial`; INSTRUMENTS has those of each instrument."""
-
-    port: support.Text
-    instrument: Literal["papouch-tm", "vaisala-hmp", "lakeshore-218", "fluke-1522"] | None = None
-    pattern: support.Text
-    command: Annotated[str, Field(pattern=r"^[\x00-\x7f]*$")] = ""
-    baud: Annotated[int, Field(ge=50, le=4_000_000)] = 9600
-    framing: Annotated[str, Field(pattern="^[5-8][NEO][12]$")] = "8N1"
-    unit: Literal["C", "F", "K", "mA"] = "C"
-    scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
-    offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
-    checksum: Literal["none", "xor", "sum8", "nmea"] = "none"
-    timeout_s: support.Seconds = 2.0
-    minimum_c: support.Celsius = -60.0
-    maximum_c: support.Celsius = 125.0
-    chip: support.Text | None = None
-    refuse_c: list[support.Celsius] = Field(default=list(chips.FIRMWARE_C))
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_the_instrument(cls, data: dict[str, Any]) -> dict[str, Any]:
-        name = data.get("instrument")
-        if (name is None) == (data.get("pattern") is None):
-            raise ConfigurationError(
-                f"set either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
-            )
-        own = {}
-        if isinstance(name, str) and name in INSTRUMENTS:
-            own = {**OF_AN_INSTRUMENT, **INSTRUMENTS[name]}
-        return {**own, **{key: value for key, value in data.items() if value is not None}}
-
-
 class SerialThermometer(support.CheckedThermometer):
     """A thermometer with a line protocol, given by a pattern or an instrument's name."""
 
     device_classes = ("char-ttyUSB", "char-ttyACM", "char-ttyAMA", "char-ttyS")
-    Options = SerialOptions
+
+    class Options(DriverOptions):
+        """The options of `serial`; INSTRUMENTS has those of each instrument."""
+
+        port: support.Text
+        instrument: Literal["papouch-tm", "vaisala-hmp", "lakeshore-218", "fluke-1522"] | None = (
+            None
+        )
+        pattern: support.Text
+        command: Annotated[str, Field(pattern=r"^[\x00-\x7f]*$")] = ""
+        baud: Annotated[int, Field(ge=50, le=4_000_000)] = 9600
+        framing: Annotated[str, Field(pattern="^[5-8][NEO][12]$")] = "8N1"
+        unit: Literal["C", "F", "K", "mA"] = "C"
+        scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
+        offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+        checksum: Literal["none", "xor", "sum8", "nmea"] = "none"
+        timeout_s: support.Seconds = 2.0
+        minimum_c: support.Celsius = -60.0
+        maximum_c: support.Celsius = 125.0
+        chip: support.Text | None = None
+        refuse_c: list[support.Celsius] = Field(default=list(chips.FIRMWARE_C))
+
+        @model_validator(mode="before")
+        @classmethod
+        def _of_the_instrument(cls, data: dict[str, Any]) -> dict[str, Any]:
+            name = data.get("instrument")
+            if (name is None) == (data.get("pattern") is None):
+                raise ConfigurationError(
+                    f"set either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
+                )
+            own = {}
+            if isinstance(name, str) and name in INSTRUMENTS:
+                own = {**OF_AN_INSTRUMENT, **INSTRUMENTS[name]}
+            return {**own, **{key: value for key, value in data.items() if value is not None}}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -158,24 +158,3 @@ def test_the_unit_of_a_zone(server, text, celsius):
     name = text.split()[0]
     found = read(server, "zone", [name], zones=text + "\n").get(name)
     assert found == (celsius and pytest.approx(celsius))
-
-
-PHONE_ZONES = """cpu-0-0-usr 38200
-gpuss-0-usr 36100
-battery 31000
-lmh-dcvs-00 75000
-pm6150-vbat-lvl0 4012
-pm6150l-bcl-lvl1 0
-bcl-cycle 12
-soc 87
-quiet-therm-adc 32100
-dock_therm -40960
-ibat-high 2000
-"""
-
-
-def test_zones_of_a_phone(server):
-    wanted = {line.split()[0]: f"zone:{line.split()[0]}" for line in PHONE_ZONES.splitlines()}
-    assert phone_reads(server, wanted, zones=PHONE_ZONES) == {
-        "cpu-0-0-usr": 38.2, "gpuss-0-usr": 36.1, "battery": 31.0, "quiet-therm-adc": 32.1,
-    }  # fmt: skip

@@ -11,7 +11,6 @@ import time
 import pytest
 
 from tests.drivers.fakes.certificate import own_certificate
-from thermocald.errors import DeviceDenied, DeviceGone
 from thermocald.hal import SystemClock, open_device
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin")
@@ -120,34 +119,3 @@ def test_an_alert_is_retained_whatever_the_channel_is_called(broker):
     alerts = [json.loads(p) for topic, p in broker.retained().items() if "/alert/" in topic]
     told = sorted((alert["condition"], alert["state"]) for alert in alerts)
     assert told == sorted((channel, "out") for channel in channels)
-
-
-def _emit_for(device, seconds):
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        device.emit({"device": "cam", "status": "ok"})
-
-
-# paho leaves the socket of a refused handshake to the garbage collector, which warns
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_who_is_let_in_and_what_an_outage_does(broker, tmp_path):
-    (tmp_path / "wrong").write_text("SECRET")
-    with pytest.raises(DeviceDenied, match="check username") as error:
-        mqtt(broker, password_file=str(tmp_path / "wrong")).open()
-    assert "SECRET" not in str(error.value)
-    untrusted = broker.options(tls=True)
-    del untrusted["ca"]
-    with pytest.raises(DeviceDenied, match="not trusted"):
-        open_device("output", "mqtt", untrusted, SystemClock()).open()
-    device = mqtt(broker, timeout_s=2)
-    device.open()
-    device.emit({"device": "cam", "status": "ok"})
-    broker.stop()
-    with pytest.raises(DeviceGone):
-        _emit_for(device, 10.0)
-    device.close()
-    broker.start()
-    device.open()
-    device.emit({"device": "cam", "status": "ok"})
-    device.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 
@@ -13,10 +12,6 @@ import pytest
 from tests.commands import call as run
 from tests.commands import finish
 from tests.golden.workshop import walls
-from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 @pytest.mark.slow
@@ -69,46 +64,6 @@ def test_without_a_camera_tags_on_walls_give_nothing(shared, tmp_path):
     done = run("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv")
     assert done.returncode == 1
     assert "error: no photograph has a result" in done.stderr
-
-
-def test_a_hand_held_board_is_called_weak(shared):
-    """Residuals are sub-pixel, all views within some degrees of frontal."""
-    folder = shared / "data" / "charuco"
-    board = cv2.aruco.CharucoBoard(
-        (12, 8), 15.5864, 12.1227, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
-    )
-    detector = cv2.aruco.CharucoDetector(board)
-    with (folder / "targets.csv").open() as source:
-        rows = list(csv.DictReader(source))
-    field = TestField.build(
-        [r["charuco_corner_id"] for r in rows],
-        [[float(r[k]) for k in ("X_mm", "Y_mm", "Z_mm")] for r in rows],
-    )
-    video = cv2.VideoCapture(str(folder / "testcalibration.mp4"))
-    measured = []
-    for frame in range(36):
-        ok, image = video.read()
-        if not ok:
-            break
-        if frame % 6:
-            continue
-        corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-        n = len(ids)
-        measured.append(
-            Observations(
-                ids.ravel().astype(np.int64), corners.reshape(n, 2).astype(float),
-                np.full((n, 2), 0.1),
-            )
-        )  # fmt: skip
-    video.release()
-    result = calibrate_observations(
-        [str(i) for i in range(len(measured))], measured, {}, field,
-        CameraSpec("", Sensor(1920, 1080, 0.001)), AdjustmentSettings(),
-    )  # fmt: skip
-    assert len(measured) == 6
-    assert result.status == "weak_geometry"
-    assert result.reason
-    assert not result.estimated
 
 
 @pytest.mark.slow

@@ -70,15 +70,6 @@ def test_a_channel_that_is_not_there(sysfs):
         thermometer("hwmon", sysfs, chip="it87", channels={"lens": "temp1"}).open()
 
 
-def test_an_open_diode_is_not_a_temperature(sysfs):
-    # it87 issue 59: a disconnected diode reads +127.0
-    sysfs.hwmon(0, "it87", temp1_input="51000", temp2_input="127000")
-    with thermometer("hwmon", sysfs, chip="it87") as device:
-        reading = device.read()
-    assert reading.values == {"temp1": 51.0}
-    assert "127 °C is outside" in reading.missing["temp2"]
-
-
 def test_a_number_handed_on_to_another_chip_is_noticed(sysfs):
     folder = sysfs.hwmon(3, "lm75", temp1_input="21000")
     with thermometer("hwmon", sysfs, chip="lm75") as device:

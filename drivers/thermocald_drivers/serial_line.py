@@ -111,11 +111,6 @@ UNITS: Mapping[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
-def _one_end(received: bytes) -> bytes:
-    """Replace CR by LF: CR, LF and CR LF all end a line, and empty lines are skipped."""
-    return received.replace(b"\r", b"\n")
-
-
 class SerialThermometer(support.CheckedThermometer):
     """A thermometer with a line protocol, given by a pattern or an instrument's name."""
 
@@ -258,15 +253,19 @@ class SerialThermometer(support.CheckedThermometer):
         monotonic, utc = support.on_clock(self.clock, ended)
         return replace(reading, monotonic=monotonic, utc=utc)
 
+    def _received(self, least: int = 1) -> bytes:
+        """Read what has come; CR, LF and CR LF all end a line, and empty lines are skipped."""
+        return bytes(self.handle.read(max(least, self.handle.in_waiting))).replace(b"\r", b"\n")
+
     def _ask(self) -> None:
         """Wait for a quiet line, note whether its last line is unfinished, and send the command."""
         late, deadline = self._line, time.monotonic() + self.options.timeout_s
         while (self._owed or late or self.handle.in_waiting) and time.monotonic() < deadline:
             # the answer to an earlier command, or the rest of it, may still arrive
-            if not (more := self.handle.read(max(1, self.handle.in_waiting))):
+            if not (more := self._received()):
                 break
             late += more
-        rest = _one_end(late).rpartition(b"\n")[2].strip(b" \0")
+        rest = late.rpartition(b"\n")[2].strip(b" \0")
         # the rest of a late line would look like a whole line; a prompt does not
         self._synchronous = not rest or rest[-1:] in PROMPTS
         self._line, self._owed = b"", True
@@ -274,11 +273,11 @@ class SerialThermometer(support.CheckedThermometer):
 
     def _skip_queue(self) -> None:
         """Discard the complete lines received so far, but not the start of the current one."""
-        waiting = self.handle.read(self.handle.in_waiting)
+        waiting = self._received(0)
         if len(waiting) >= QUEUE:
             self._line, self._synchronous = b"", False  # bytes may be missing
             return
-        head, mark, tail = (self._line + _one_end(waiting)).rpartition(b"\n")
+        head, mark, tail = (self._line + waiting).rpartition(b"\n")
         if mark:
             self._synchronous = True
         self._line = tail if mark else head + tail
@@ -310,7 +309,7 @@ class SerialThermometer(support.CheckedThermometer):
                 self._line, self._synchronous = b"", False
             if time.monotonic() >= deadline:
                 raise self._nothing(skipped, problem)
-            self._line += _one_end(self.handle.read(max(1, self.handle.in_waiting)))
+            self._line += self._received()
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
         """Return the error for a time-out, which names the fault of the lines received."""

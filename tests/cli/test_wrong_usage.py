@@ -53,6 +53,7 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("measure", "--model", "/dev/null/m"), r"error: missing argument 'POINTS\.csv'"),
         (("study", "M1", "--seed", "x"), "error: .*--seed"),
         (("predict", "--temperature", "20"), "error: missing option '--model'"),
+        (("export", "M1", "--format", "xlsx"), "one of csv, json, parquet"),
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),
@@ -121,7 +122,8 @@ def occupied(tmp_path):
 
 TAKEN = {
     "file": {"a folder", "a store", "a link to a store", "a store's other name", "its -wal",
-             "a recording", "its head", "its Parquet", "within a file", "the kernel's", "a socket", "a disk"},
+             "a recording", "its head", "its Parquet", "within a file", "the kernel's", "a socket",
+             "a disk"},
     "folder": {"a file", "within a file", "the kernel's", "a store", "a socket"},
 }  # fmt: skip
 TAKEN["recording"] = TAKEN["folder"] | {"a recording"}

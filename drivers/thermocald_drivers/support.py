@@ -48,9 +48,11 @@ if TYPE_CHECKING:
 AUTO = "auto"
 """The value that leaves a setting to the camera."""
 Text = Annotated[
-    str, BeforeValidator(lambda v: str(v) if type(v) is int else v), Field(min_length=1)
+    str,
+    BeforeValidator(lambda v: str(v) if type(v) is int else v),
+    Field(min_length=1, pattern=r"^[^\x00]*$"),
 ]
-"""A text option; a whole number is accepted as the text that was written."""
+"""A text option, without NUL; a whole number is accepted as the text that was written."""
 Seconds = Annotated[float, Field(ge=0.01, le=600.0)]
 """A time-out."""
 Celsius = Annotated[float, Field(ge=-273.15, le=3000.0)]

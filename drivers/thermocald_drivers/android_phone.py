@@ -419,13 +419,12 @@ def battery(text: str, scale: float | None = None) -> tuple[float, float] | None
 def thermalservice(text: str) -> dict[str, float]:
     """Return {sensor: °C} of the live section; empty if the phone prints none."""
     text = text.replace("\r", "")
-    _, found, rest = text.partition(LIVE_SECTION)
-    if not found or "HAL Ready: false" in text:
+    _, section, rest = text.partition(LIVE_SECTION)
+    if not section or "HAL Ready: false" in text:
         return {}
     heading = _HEADING.search(rest)
     section = rest[: heading.start()] if heading else rest
-    values: dict[str, float] = {}
-    ambiguous = set()
+    found: list[tuple[str, float]] = []
     for record in _RECORD.finditer(section):
         if int(record["type"]) not in TEMPERATURES:
             continue
@@ -435,8 +434,6 @@ def thermalservice(text: str) -> dict[str, float]:
             continue  # NaN
         name = " ".join(record["name"].split())
         # 0.0 is the HAL's value for a sensor that is not fitted
-        if value == 0.0 or kernel.is_limit(name):
-            continue
-        if values.setdefault(name, value) != value:
-            ambiguous.add(name)
-    return {name: value for name, value in values.items() if name not in ambiguous}
+        if value != 0.0 and not kernel.is_limit(name):
+            found.append((name, value))
+    return kernel.unambiguous(found)

@@ -378,21 +378,20 @@ def is_limit(name: str) -> bool:
     return _LIMIT.fullmatch(name) is not None
 
 
-def raw_zones(text: str) -> dict[str, int]:
+def raw_zones(text: str) -> dict[str, float]:
     """Parse lines "type number" to {zone: number}; omit a name that has several numbers."""
-    values: dict[str, int] = {}
-    ambiguous = set()
-    for line in text.replace("\r", "").split("\n"):
-        name, _, number = line.strip().rpartition(" ")
-        name = name.strip()
-        if not name or not re.fullmatch(r"-?[0-9]{1,9}", number):
-            continue
-        if values.setdefault(name, int(number)) != int(number):
-            ambiguous.add(name)
-    return {name: value for name, value in values.items() if name not in ambiguous}
+    lines = re.findall(r"^[ \t]*(\S.*?)[ \t]+(-?[0-9]{1,9})[ \t\r]*$", text, re.MULTILINE)
+    return unambiguous((name, int(number)) for name, number in lines)
 
 
-def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str, float]:
+def unambiguous(pairs: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """Return {name: number}; omit a name that has several numbers."""
+    values: dict[str, float] = {}
+    several = {name for name, number in pairs if values.setdefault(name, number) != number}
+    return {name: value for name, value in values.items() if name not in several}
+
+
+def zone_scales(raw: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:
     """Return {zone: factor to °C} for the zones whose unit is certain.
 
     raw: all zones of the phone at one time; known: factors that were stated or determined before.
@@ -410,7 +409,7 @@ def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str,
     return found
 
 
-def _candidates(name: str, value: int) -> list[float]:
+def _candidates(name: str, value: float) -> list[float]:
     """Return the factors with which a zone's number is a possible temperature, by its name."""
     family = next(row for row in _FAMILIES if re.fullmatch(row[0], name, re.IGNORECASE))
     _, whole_c, tenths_c, thousandths_from = family
@@ -419,7 +418,7 @@ def _candidates(name: str, value: int) -> list[float]:
     return [scale for scale, high_c in highest.items() if LOWEST_C <= value * scale <= high_c]
 
 
-def _among(value: int, fits: list[float], others: Iterable[float], whole: bool) -> float | None:
+def _among(value: float, fits: list[float], others: Iterable[float], whole: bool) -> float | None:
     """Return the factor that agrees with the phone's other zones; None if they do not decide."""
     coldest = min(others, default=None)
     if coldest is None:

@@ -390,6 +390,17 @@ def test_rows_of_standard_input_are_corrected_as_they_come(folder):
     assert "4 of 6 rows were not corrected: lines 3, 4, 5, 6" in told
 
 
+def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
+    times = times_of(folder)
+    points = "time,x,y\n" + "".join(f"{t:.2f},{500 + i},400\n" for i, t in enumerate(times))
+    (tmp_path / "p.csv").write_text(points)
+    told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]
+    of_file = run("correct", tmp_path / "p.csv", *told)
+    piped = succeed("correct", "-", *told, given=points)
+    assert piped.stdout == of_file.stdout
+    assert len(piped.stdout.splitlines()) == len(times) + 1
+
+
 # --- cameras of other programs as initial values -----------------------------------------------
 
 

@@ -111,6 +111,11 @@ def test_a_pipe_whose_reader_sleeps(tmp_path):
     os.close(reader)
 
 
+def test_no_folder(tmp_path):
+    with pytest.raises(OSError, match="No such file"):
+        output(tmp_path / "none" / "results.jsonl").open()
+
+
 @pytest.mark.parametrize("umask", [0o000, 0o077, 0o777])
 def test_a_file_can_be_written_by_us_and_not_by_others(umask, tmp_path):
     path = tmp_path / "results.jsonl"

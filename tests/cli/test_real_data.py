@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 
@@ -12,6 +13,10 @@ import pytest
 from tests.commands import call as run
 from tests.commands import finish
 from tests.golden.workshop import walls
+from thermocald.analysis.camera.photographs import calibrate_observations
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 @pytest.mark.slow
@@ -64,6 +69,36 @@ def test_without_a_camera_tags_on_walls_give_nothing(shared, tmp_path):
     done = run("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv")
     assert done.returncode == 1
     assert "error: no photograph has a result" in done.stderr
+
+
+def test_a_hand_held_board_is_called_weak(shared):
+    """Residuals are sub-pixel, all views within some degrees of frontal."""
+    folder = shared / "data" / "charuco"
+    board = cv2.aruco.CharucoBoard(
+        (12, 8), 15.5864, 12.1227, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
+    )
+    detector = cv2.aruco.CharucoDetector(board)
+    with (folder / "targets.csv").open() as source:
+        rows = list(csv.DictReader(source))
+    field = TestField.build(
+        [r["charuco_corner_id"] for r in rows],
+        [[float(r[k]) for k in ("X_mm", "Y_mm", "Z_mm")] for r in rows],
+    )
+    video = cv2.VideoCapture(str(folder / "testcalibration.mp4"))
+    measured = []
+    for _ in range(3):
+        images = [video.read()[1] for _ in range(6)]
+        corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY))
+        seen = corners.reshape(-1, 2).astype(float)
+        measured.append(Observations(ids.ravel().astype(np.int64), seen, np.full(seen.shape, 0.1)))
+    video.release()
+    result = calibrate_observations(
+        [str(i) for i in range(len(measured))], measured, {}, field,
+        CameraSpec("", Sensor(1920, 1080, 0.001)), AdjustmentSettings(),
+    )  # fmt: skip
+    assert result.status == "weak_geometry"
+    assert result.reason
+    assert not result.estimated
 
 
 @pytest.mark.slow

@@ -16,17 +16,15 @@ from thermocald.errors import BadReading, DeviceGone, DeviceNotFound
 from thermocald.hal import DriverOptions, Reading, Thermometer
 
 
-class Tc74Options(DriverOptions):  # one field per key of the stanza, except name and driver
-    bus: Annotated[int, Field(ge=0, le=255)] = 1
-    address: Annotated[int, Field(ge=0x48, le=0x4F)] = 0x4D
-
-
 class Tc74Thermometer(Thermometer):
     """A TC74 chip."""
 
     device_classes = ("char-i2c",)
-    Options = Tc74Options
     where = "TC74"
+
+    class Options(DriverOptions):  # one field per key of the stanza, except name and driver
+        bus: Annotated[int, Field(ge=0, le=255)] = 1
+        address: Annotated[int, Field(ge=0x48, le=0x4F)] = 0x4D
 
     def open(self) -> None:
         import smbus2  # a device's library is imported when the device is opened

@@ -429,6 +429,5 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock)
     except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no text
         raise ConfigurationError(f"{where}: {error}") from error
     if kind == "thermometer":
-        for channel in device.named_channels():
-            require_channels([channel], where, ConfigurationError)
+        require_channels(device.named_channels(), where, ConfigurationError)
     return device

@@ -86,38 +86,12 @@ Address = Annotated[str, Field(pattern=r"^[^@\s,;<>]+@[^@\s,;<>]+$")]
 log = logging.getLogger(__name__)
 
 
-class ExecOptions(AlertOptions):
-    """The options of `alert_exec`."""
-
-    command: Annotated[list[support.Text], Field(min_length=1)]
-    timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 10.0
-
-
-class WebhookOptions(AlertOptions):
-    """The options of `alert_webhook`."""
-
-    url: support.Text
-    token_file: support.Text | None = None
-
-
-class MailOptions(AlertOptions):
-    """The options of `alert_mail`."""
-
-    host: support.Text
-    port: support.Port = 587
-    security: Literal["starttls", "tls", "none"] = "starttls"
-    username: support.Text | None = None
-    password_file: support.Text | None = None
-    ca: support.Text | None = None
-    sender: Address
-    recipients: Annotated[list[Address], Field(min_length=1)]
-    timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 10.0
-
-
 class ExecAlert(AlertOutput):
     """An output that runs a program for each alert."""
 
-    Options = ExecOptions
+    class Options(AlertOptions):
+        command: Annotated[list[support.Text], Field(min_length=1)]
+        timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 10.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -183,7 +157,9 @@ class _NoRedirection(urllib.request.HTTPRedirectHandler):
 class WebhookAlert(AlertOutput):
     """An output that sends one POST for each alert."""
 
-    Options = WebhookOptions
+    class Options(AlertOptions):
+        url: support.Text
+        token_file: support.Text | None = None
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -243,7 +219,16 @@ class WebhookAlert(AlertOutput):
 class MailAlert(AlertOutput):
     """An output that sends one e-mail for each alert."""
 
-    Options = MailOptions
+    class Options(AlertOptions):
+        host: support.Text
+        port: support.Port = 587
+        security: Literal["starttls", "tls", "none"] = "starttls"
+        username: support.Text | None = None
+        password_file: support.Text | None = None
+        ca: support.Text | None = None
+        sender: Address
+        recipients: Annotated[list[Address], Field(min_length=1)]
+        timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 10.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -88,27 +88,26 @@ SETTINGS = (*EXPOSURE, *LENS, *FOCUS)
 """The camera settings that a photograph reports; they are stored with its epoch."""
 
 
-class CameraOptions(PhoneOptions):
-    """The options of the camera `android`."""
-
-    width: Annotated[int, Field(ge=64, le=20_000)]
-    height: Annotated[int, Field(ge=64, le=20_000)]
-    trigger: Literal["camera", "volume", "tap"] = "camera"
-    tap: (
-        Annotated[list[Annotated[int, Field(ge=0, le=20_000)]], Field(min_length=2, max_length=2)]
-        | None
-    ) = None
-    folder: support.Text = "/sdcard/DCIM/Camera"
-    delete: bool = False
-    refuse_unlocked: bool | None = None
-    minimum_free_mb: Annotated[float, Field(ge=0.0, le=1e6)] = 200.0
-    timeout_s: Annotated[float, Field(ge=0.1, le=600.0)] = 15.0
-
-
 class AndroidCamera(AdbPhone, Camera):
     """A phone's camera app, triggered through adb."""
 
-    Options = CameraOptions
+    class Options(PhoneOptions):
+        """The options of the camera `android`."""
+
+        width: Annotated[int, Field(ge=64, le=20_000)]
+        height: Annotated[int, Field(ge=64, le=20_000)]
+        trigger: Literal["camera", "volume", "tap"] = "camera"
+        tap: (
+            Annotated[
+                list[Annotated[int, Field(ge=0, le=20_000)]], Field(min_length=2, max_length=2)
+            ]
+            | None
+        ) = None
+        folder: support.Text = "/sdcard/DCIM/Camera"
+        delete: bool = False
+        refuse_unlocked: bool | None = None
+        minimum_free_mb: Annotated[float, Field(ge=0.0, le=1e6)] = 200.0
+        timeout_s: Annotated[float, Field(ge=0.1, le=600.0)] = 15.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

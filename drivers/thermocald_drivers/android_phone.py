@@ -280,21 +280,18 @@ _RECORD = re.compile(
 _HEADING = re.compile(r"^[^\s,}][^{}\n]*:[ \t]*$", re.MULTILINE)
 
 
-class ThermometerOptions(PhoneOptions):
-    """The options of the thermometer `android`.
-
-    sensors: {channel: battery, thermal:NAME or zone:TYPE}; units: {channel: unit}.
-    """
-
-    sensors: dict[str, str] = {"temperature": "battery"}  # noqa: RUF012 - pydantic copies it
-    units: dict[str, Literal["degC", "tenths", "thousandths"]] = {}  # noqa: RUF012
-    timeout_s: support.Seconds = 5.0
-
-
 class AndroidThermometer(AdbPhone, support.CheckedThermometer):
     """A phone's battery, thermal service and thermal zones, read in one shell call each."""
 
-    Options = ThermometerOptions
+    class Options(PhoneOptions):
+        """The options of the thermometer `android`.
+
+        sensors: {channel: battery, thermal:NAME or zone:TYPE}; units: {channel: unit}.
+        """
+
+        sensors: dict[str, str] = {"temperature": "battery"}  # noqa: RUF012 - pydantic copies it
+        units: dict[str, Literal["degC", "tenths", "thousandths"]] = {}  # noqa: RUF012
+        timeout_s: support.Seconds = 5.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -310,7 +307,6 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
                 raise ConfigurationError(
                     f"units.{channel}: sensors has no battery or zone of that name"
                 )
-        self._watch = kernel.UnitWatch(self.clock)
         self.checked = support.Channels(self.clock, *PHONE_RANGE_C)
         self._scales = self._stated()
 
@@ -354,13 +350,13 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
     def _stated(self) -> dict[str, float]:
         """Return {source: factor to °C} for the units in the stanza."""
         return {
-            self.sensors[channel]: kernel.UNITS[unit]
+            self.sensors[channel]: support.UNITS[unit]
             for channel, unit in self.options.units.items()
         }
 
     def _in_unit(self, source: str, number: float, scale: float) -> float | str:
         """Return °C, or why the unit is doubtful, in words."""
-        if self._watch.switched(source, number, scale):
+        if self.checked.switched(source, number, scale):
             return f"{number:g} agrees with the last reading only in another unit: it has switched"
         return round(number * scale, 6)
 
@@ -423,13 +419,12 @@ def battery(text: str, scale: float | None = None) -> tuple[float, float] | None
 def thermalservice(text: str) -> dict[str, float]:
     """Return {sensor: °C} of the live section; empty if the phone prints none."""
     text = text.replace("\r", "")
-    _, found, rest = text.partition(LIVE_SECTION)
-    if not found or "HAL Ready: false" in text:
+    _, section, rest = text.partition(LIVE_SECTION)
+    if not section or "HAL Ready: false" in text:
         return {}
     heading = _HEADING.search(rest)
     section = rest[: heading.start()] if heading else rest
-    values: dict[str, float] = {}
-    ambiguous = set()
+    found: list[tuple[str, float]] = []
     for record in _RECORD.finditer(section):
         if int(record["type"]) not in TEMPERATURES:
             continue
@@ -439,8 +434,6 @@ def thermalservice(text: str) -> dict[str, float]:
             continue  # NaN
         name = " ".join(record["name"].split())
         # 0.0 is the HAL's value for a sensor that is not fitted
-        if value == 0.0 or kernel.is_limit(name):
-            continue
-        if values.setdefault(name, value) != value:
-            ambiguous.add(name)
-    return {name: value for name, value in values.items() if name not in ambiguous}
+        if value != 0.0 and not kernel.is_limit(name):
+            found.append((name, value))
+    return kernel.unambiguous(found)

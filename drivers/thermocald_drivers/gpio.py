@@ -51,19 +51,6 @@ class PinOptions(DriverOptions):
     active_high: bool = True
 
 
-class LedOptions(PinOptions):
-    """The options of `led`."""
-
-    blink_s: Annotated[float, Field(ge=0.05, le=10.0)] = 0.25
-
-
-class RelayOptions(HeatingOptions, PinOptions):
-    """The options of `relay`."""
-
-    watchdog_s: Annotated[float, Field(ge=0.05, le=3600.0)] = 30.0
-    channel: support.Text = "temperature"
-
-
 def _pin(kind: str, options: PinOptions) -> Any:
     """Return a gpiozero device; raises its errors as DeviceErrors."""
     pin = options.pin
@@ -85,7 +72,9 @@ class LedOutput(Output):
     """An LED: steady while epochs have results, blinking while they have none, off while closed."""
 
     device_classes = GPIO_CLASSES
-    Options = LedOptions
+
+    class Options(PinOptions):
+        blink_s: Annotated[float, Field(ge=0.05, le=10.0)] = 0.25
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -117,7 +106,10 @@ class RelayOutput(HeatingOutput):
     """A relay that heats by a programme; the module's docstring lists when it is off."""
 
     device_classes = GPIO_CLASSES
-    Options = RelayOptions
+
+    class Options(HeatingOptions, PinOptions):
+        watchdog_s: Annotated[float, Field(ge=0.05, le=3600.0)] = 30.0
+        channel: support.Text = "temperature"
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

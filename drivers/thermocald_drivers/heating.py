@@ -133,19 +133,17 @@ class HeatingOutput(Output):
 MARK = "thermocald_load"
 
 
-class LoadOptions(HeatingOptions, PhoneOptions):
-    """The options of `android_load`; a battery above 50 °C is in danger."""
-
-    limit_c: Annotated[float, Field(ge=0.0, le=50.0)]
-    processes: Annotated[int, Field(ge=1, le=16)] = 4
-    lease_s: Annotated[float, Field(ge=2.0, le=120.0)] = 30.0
-    timeout_s: Annotated[float, Field(ge=0.1, le=60.0)] = 5.0
-
-
 class AndroidLoadOutput(AdbPhone, HeatingOutput):
     """Busy loops on a phone while its programme calls for heat."""
 
-    Options = LoadOptions
+    class Options(HeatingOptions, PhoneOptions):
+        """The options of `android_load`; a battery above 50 °C is in danger."""
+
+        limit_c: Annotated[float, Field(ge=0.0, le=50.0)]
+        processes: Annotated[int, Field(ge=1, le=16)] = 4
+        lease_s: Annotated[float, Field(ge=2.0, le=120.0)] = 30.0
+        timeout_s: Annotated[float, Field(ge=0.1, le=60.0)] = 5.0
+
     channel = "battery"
     _renewed = float("-inf")
 

@@ -45,19 +45,18 @@ if TYPE_CHECKING:
     from thermocald.hal import Reading
 
 
-class I2cOptions(DriverOptions):
-    """A chip's place and its channel's name; address None: the chip's first address."""
-
-    bus: Annotated[int, Field(ge=0, le=255)] = 1
-    address: int | None = None
-    channel: support.Text = "temperature"
-
-
 class I2cThermometer(support.CheckedThermometer):
     """A thermometer at one address of a bus; a chip's class implements `_identify`, `_measure`."""
 
     device_classes = ("char-i2c",)
-    Options = I2cOptions
+
+    class Options(DriverOptions):
+        """A chip's place and its channel's name; address None: the chip's first address."""
+
+        bus: Annotated[int, Field(ge=0, le=255)] = 1
+        address: int | None = None
+        channel: support.Text = "temperature"
+
     chip: ClassVar[str]
     addresses: ClassVar[range | tuple[int, ...]]
     range_c: ClassVar[tuple[float, float]]
@@ -243,16 +242,14 @@ class Mcp9808Thermometer(_ConvertingThermometer):
         return signed(word, 13) / 16.0
 
 
-class Lm75Options(I2cOptions):
-    """The options of `lm75`, of which chip is the member of the family."""
-
-    chip: Literal["lm75", "lm75b", "tmp75", "tmp102"] = "lm75"
-
-
 class Lm75Thermometer(_ConvertingThermometer):
     """A chip of the LM75 family in continuous conversion."""
 
-    Options = Lm75Options
+    class Options(I2cThermometer.Options):
+        """The options of `lm75`, of which chip is the member of the family."""
+
+        chip: Literal["lm75", "lm75b", "tmp75", "tmp102"] = "lm75"
+
     chip = "LM75"
     addresses = range(0x48, 0x50)
     range_c = (-55.0, 127.9375)

@@ -42,17 +42,12 @@ def encode(result: Mapping[str, Any]) -> bytes:
     return json.dumps(jsonable(dict(result)), default=str).encode()
 
 
-class JsonLinesOptions(DriverOptions):
-    """The options of `jsonl`."""
-
-    path: support.Text
-    timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
-
-
 class JsonLinesOutput(Output):
     """An output that appends to a file or writes to a pipe."""
 
-    Options = JsonLinesOptions
+    class Options(DriverOptions):
+        path: support.Text
+        timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -48,16 +48,12 @@ from thermocald_drivers import chips, support
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from thermocald.hal import Clock, Reading
+    from thermocald.hal import Reading
 
 NOT_FITTED_C = -40.0
 LARGEST_OF_TENTHS = 1250  # 125 °C; a larger number can only be thousandths
 LARGEST_OF_DEGREES = 125
-UNITS = {"degC": 1.0, "tenths": 0.1, "thousandths": 0.001}
-"""Factors that convert a zone's number to °C, by the words of the option."""
-
 LOWEST_C, HIGHEST_C = -30.0, 125.0
-SWITCH_K, SWITCH_S = 5.0, 600.0
 COOLER_K = 10.0
 """No zone of a phone is colder than the coldest of the others by more than this."""
 
@@ -304,7 +300,6 @@ class ThermalZoneThermometer(_KernelThermometer):
         super().__init__(**options)
         self.unit = self.options.unit or "thousandths"
         self._certain = False
-        self._watch = UnitWatch(self.clock)
         if self.options.unit is None and not is_temperature(self.chip):
             raise ConfigurationError(
                 f"zone: {self.chip!r} holds percent, mA or mV on known machines; if it is a "
@@ -332,7 +327,7 @@ class ThermalZoneThermometer(_KernelThermometer):
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
             raise
-        scale = UNITS[self.unit]
+        scale = support.UNITS[self.unit]
         value = round(number * scale, 6)
         larger = abs(number) > LARGEST_OF_TENTHS
         self._certain |= larger and abs(value) <= LARGEST_OF_TENTHS / 10
@@ -344,7 +339,7 @@ class ThermalZoneThermometer(_KernelThermometer):
             )
         if value == NOT_FITTED_C:
             raise BadReading(f"{folder.name}: {value:g} °C is what an absent sensor reports")
-        if self._watch.switched(key, number, scale):
+        if self.checked.switched(key, number, scale):
             raise BadReading(
                 f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and agrees with the "
                 "last reading only in another unit; the kernel has switched the unit"
@@ -373,28 +368,6 @@ _FAMILIES: tuple[tuple[str, float, float, int], ...] = (
 )
 
 
-class UnitWatch:
-    """The last temperature of each source, for detecting a unit that switches.
-
-    Kernels report 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._last: dict[str, tuple[float, float]] = {}
-
-    def switched(self, source: str, number: float, scale: float) -> bool:
-        """Return whether a number agrees with the last temperature only in another unit."""
-        value, now = number * scale, self._clock.monotonic()
-        at, last = self._last.get(source, (now, value))
-        other = None
-        if now - at <= SWITCH_S and abs(value - last) > SWITCH_K:
-            rest = [number * unit for unit in UNITS.values() if unit != scale]
-            other = next((c for c in rest if abs(c - last) <= SWITCH_K), None)
-        self._last[source] = (now, value if other is None else other)
-        return other is not None
-
-
 def is_temperature(zone: str) -> bool:
     """Return whether a zone, by its name, holds a temperature: not percent, mA, mV or a limit."""
     return _OTHER_QUANTITIES.fullmatch(zone) is None and not is_limit(zone)
@@ -405,21 +378,20 @@ def is_limit(name: str) -> bool:
     return _LIMIT.fullmatch(name) is not None
 
 
-def raw_zones(text: str) -> dict[str, int]:
+def raw_zones(text: str) -> dict[str, float]:
     """Parse lines "type number" to {zone: number}; omit a name that has several numbers."""
-    values: dict[str, int] = {}
-    ambiguous = set()
-    for line in text.replace("\r", "").split("\n"):
-        name, _, number = line.strip().rpartition(" ")
-        name = name.strip()
-        if not name or not re.fullmatch(r"-?[0-9]{1,9}", number):
-            continue
-        if values.setdefault(name, int(number)) != int(number):
-            ambiguous.add(name)
-    return {name: value for name, value in values.items() if name not in ambiguous}
+    lines = re.findall(r"^[ \t]*(\S.*?)[ \t]+(-?[0-9]{1,9})[ \t\r]*$", text, re.MULTILINE)
+    return unambiguous((name, int(number)) for name, number in lines)
 
 
-def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str, float]:
+def unambiguous(pairs: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """Return {name: number}; omit a name that has several numbers."""
+    values: dict[str, float] = {}
+    several = {name for name, number in pairs if values.setdefault(name, number) != number}
+    return {name: value for name, value in values.items() if name not in several}
+
+
+def zone_scales(raw: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:
     """Return {zone: factor to °C} for the zones whose unit is certain.
 
     raw: all zones of the phone at one time; known: factors that were stated or determined before.
@@ -437,7 +409,7 @@ def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str,
     return found
 
 
-def _candidates(name: str, value: int) -> list[float]:
+def _candidates(name: str, value: float) -> list[float]:
     """Return the factors with which a zone's number is a possible temperature, by its name."""
     family = next(row for row in _FAMILIES if re.fullmatch(row[0], name, re.IGNORECASE))
     _, whole_c, tenths_c, thousandths_from = family
@@ -446,7 +418,7 @@ def _candidates(name: str, value: int) -> list[float]:
     return [scale for scale, high_c in highest.items() if LOWEST_C <= value * scale <= high_c]
 
 
-def _among(value: int, fits: list[float], others: Iterable[float], whole: bool) -> float | None:
+def _among(value: float, fits: list[float], others: Iterable[float], whole: bool) -> float | None:
     """Return the factor that agrees with the phone's other zones; None if they do not decide."""
     coldest = min(others, default=None)
     if coldest is None:

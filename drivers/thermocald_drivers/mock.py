@@ -111,17 +111,6 @@ class MockOptions(DriverOptions):
     timeout_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 1.0
 
 
-class CameraOptions(MockOptions):
-    """The options of the mock camera."""
-
-    testfield: support.Text = "markers"
-    model: support.Text | None = None
-    programme: Programme = DEFAULT_PROGRAMME
-    seed: Seed = 0
-    exposure_s: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.02
-    latency_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.3
-
-
 class Channel(DriverOptions):
     """A channel's deviations from the programme."""
 
@@ -130,24 +119,6 @@ class Channel(DriverOptions):
     gain: Annotated[float, Field(ge=-100.0, le=100.0)] = 1.0
     noise_k: Annotated[float, Field(ge=0.0, le=10.0)] = 0.02
     resolution_k: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0625
-
-
-class ThermometerOptions(MockOptions):
-    """The options of the mock thermometer."""
-
-    programme: Programme = DEFAULT_PROGRAMME
-    channels: Annotated[
-        dict[support.Text, Channel],
-        Field(min_length=1, default_factory=lambda: {"temperature": Channel()}),
-    ]
-    seed: Seed = 0
-    conversion_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.1
-
-
-class OutputOptions(MockOptions):
-    """The options of the mock output."""
-
-    keep: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
 
 
 class MockDevice(Device):
@@ -208,7 +179,14 @@ class MockCamera(MockDevice, Camera):
     """A camera that renders the view of a warming camera; equal times give equal frames."""
 
     where = "mock camera"
-    Options = CameraOptions
+
+    class Options(MockOptions):
+        testfield: support.Text = "markers"
+        model: support.Text | None = None
+        programme: Programme = DEFAULT_PROGRAMME
+        seed: Seed = 0
+        exposure_s: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.02
+        latency_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.3
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -284,7 +262,15 @@ class MockThermometer(MockDevice, Thermometer):
     """A thermometer that follows a programme; equal times give equal readings."""
 
     where = "mock thermometer"
-    Options = ThermometerOptions
+
+    class Options(MockOptions):
+        programme: Programme = DEFAULT_PROGRAMME
+        channels: Annotated[
+            dict[support.Text, Channel],
+            Field(min_length=1, default_factory=lambda: {"temperature": Channel()}),
+        ]
+        seed: Seed = 0
+        conversion_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.1
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -331,7 +317,9 @@ class MockOutput(MockDevice, Output):
     """An output that retains the last results in `results`, oldest first."""
 
     where = "mock output"
-    Options = OutputOptions
+
+    class Options(MockOptions):
+        keep: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

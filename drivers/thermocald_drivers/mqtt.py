@@ -141,10 +141,6 @@ class BrokerOptions(DriverOptions):
     timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 5.0
 
 
-class MqttAlertOptions(BrokerOptions, AlertOptions):
-    """The options of `alert_mqtt`."""
-
-
 class _Broker(Output):
     """A connection to a broker, kept alive by the library's thread."""
 
@@ -286,7 +282,8 @@ class MqttOutput(_Broker):
 class MqttAlert(_Broker, AlertOutput):
     """An output that publishes a retained message for each alert."""
 
-    Options = MqttAlertOptions
+    class Options(BrokerOptions, AlertOptions):
+        """The options of a broker and of an alert."""
 
     def open(self) -> None:
         self.connect(None)

@@ -104,19 +104,17 @@ def _kernel_millidegrees(pad: bytes, family: str) -> int:
     return int(raw * 1000 / 16)
 
 
-class OneWireOptions(DriverOptions):
-    """The options of `ds18b20`; sensors: {channel: ROM id}."""
-
-    sensors: Annotated[dict[str, support.Text], Field(min_length=1)]
-    timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 3.0
-    attempts: Annotated[int, Field(ge=1, le=10)] = 2
-    sysfs: support.Text = "/sys"
-
-
 class Ds18b20Thermometer(support.CheckedThermometer):
     """One or several 1-wire thermometers, read at the same time."""
 
-    Options = OneWireOptions
+    class Options(DriverOptions):
+        """The options of `ds18b20`; sensors: {channel: ROM id}."""
+
+        sensors: Annotated[dict[str, support.Text], Field(min_length=1)]
+        timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 3.0
+        attempts: Annotated[int, Field(ge=1, le=10)] = 2
+        sysfs: support.Text = "/sys"
+
     where = "1-wire"
 
     def __init__(self, **options: Any) -> None:

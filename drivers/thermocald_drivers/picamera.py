@@ -76,21 +76,6 @@ def _gains(value: list[float] | str | None) -> tuple[float, float] | str | None:
     return value[0], value[1]
 
 
-class PicameraOptions(DriverOptions):
-    """The options of `picamera2`; focus_dioptres, colour_gains None: locked as they are."""
-
-    camera: Annotated[int, Field(ge=0, le=9)] = 0
-    model: support.Text | None = None
-    width: support.Pixels = 3280
-    height: support.Pixels = 2464
-    exposure_s: Annotated[float | str, support.or_auto(1e-5, 200)] = 0.02
-    gain: Annotated[float | str, support.or_auto(1, 64)] = 1.0
-    focus_dioptres: Annotated[float | str | None, support.or_auto(0, 32)] = None
-    colour_gains: Annotated[list[float] | str | None, AfterValidator(_gains)] = None
-    tolerance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.05
-    timeout_s: Annotated[float, Field(ge=0.05, le=600.0)] = 10.0
-
-
 def _current_settings(library: Any, number: int) -> dict[str, Any]:
     """Return a camera's size and lens position; {} if another program uses it."""
     try:
@@ -113,7 +98,19 @@ class Picamera2Camera(Camera):
 
     device_classes = ("char-video4linux", "char-media", "char-dma_heap")
 
-    Options = PicameraOptions
+    class Options(DriverOptions):
+        """The options of `picamera2`; focus_dioptres, colour_gains None: locked as they are."""
+
+        camera: Annotated[int, Field(ge=0, le=9)] = 0
+        model: support.Text | None = None
+        width: support.Pixels = 3280
+        height: support.Pixels = 2464
+        exposure_s: Annotated[float | str, support.or_auto(1e-5, 200)] = 0.02
+        gain: Annotated[float | str, support.or_auto(1, 64)] = 1.0
+        focus_dioptres: Annotated[float | str | None, support.or_auto(0, 32)] = None
+        colour_gains: Annotated[list[float] | str | None, AfterValidator(_gains)] = None
+        tolerance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.05
+        timeout_s: Annotated[float, Field(ge=0.05, le=600.0)] = 10.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -39,14 +39,6 @@ if TYPE_CHECKING:
     from thermocald.store.recording.reader import Recording
 
 
-class ReplayOptions(DriverOptions):
-    """The options of `replay`."""
-
-    recording: support.Text | Path
-    loop: bool = False
-    after: float | None = None
-
-
 @contextmanager
 def _permanent_errors() -> Iterator[None]:
     """Raise a DataError as a PermanentDeviceError: reading the file again does not help."""
@@ -59,7 +51,10 @@ def _permanent_errors() -> Iterator[None]:
 class _Replay(Device):
     """The epochs of a recording, in order; re-opening continues with the next epoch."""
 
-    Options = ReplayOptions
+    class Options(DriverOptions):
+        recording: support.Text | Path
+        loop: bool = False
+        after: float | None = None
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -111,49 +111,44 @@ UNITS: Mapping[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
-def _one_end(received: bytes) -> bytes:
-    """Replace CR by LF: CR, LF and CR LF all end a line, and empty lines are skipped."""
-    return received.replace(b"\r", b"\n")
-
-
-class SerialOptions(DriverOptions):
-    """The options of `serial`; INSTRUMENTS has those of each instrument."""
-
-    port: support.Text
-    instrument: Literal["papouch-tm", "vaisala-hmp", "lakeshore-218", "fluke-1522"] | None = None
-    pattern: support.Text
-    command: Annotated[str, Field(pattern=r"^[\x00-\x7f]*$")] = ""
-    baud: Annotated[int, Field(ge=50, le=4_000_000)] = 9600
-    framing: Annotated[str, Field(pattern="^[5-8][NEO][12]$")] = "8N1"
-    unit: Literal["C", "F", "K", "mA"] = "C"
-    scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
-    offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
-    checksum: Literal["none", "xor", "sum8", "nmea"] = "none"
-    timeout_s: support.Seconds = 2.0
-    minimum_c: support.Celsius = -60.0
-    maximum_c: support.Celsius = 125.0
-    chip: support.Text | None = None
-    refuse_c: list[support.Celsius] = Field(default=list(chips.FIRMWARE_C))
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_the_instrument(cls, data: dict[str, Any]) -> dict[str, Any]:
-        name = data.get("instrument")
-        if (name is None) == (data.get("pattern") is None):
-            raise ConfigurationError(
-                f"set either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
-            )
-        own = {}
-        if isinstance(name, str) and name in INSTRUMENTS:
-            own = {**OF_AN_INSTRUMENT, **INSTRUMENTS[name]}
-        return {**own, **{key: value for key, value in data.items() if value is not None}}
-
-
 class SerialThermometer(support.CheckedThermometer):
     """A thermometer with a line protocol, given by a pattern or an instrument's name."""
 
     device_classes = ("char-ttyUSB", "char-ttyACM", "char-ttyAMA", "char-ttyS")
-    Options = SerialOptions
+
+    class Options(DriverOptions):
+        """The options of `serial`; INSTRUMENTS has those of each instrument."""
+
+        port: support.Text
+        instrument: Literal["papouch-tm", "vaisala-hmp", "lakeshore-218", "fluke-1522"] | None = (
+            None
+        )
+        pattern: support.Text
+        command: Annotated[str, Field(pattern=r"^[\x00-\x7f]*$")] = ""
+        baud: Annotated[int, Field(ge=50, le=4_000_000)] = 9600
+        framing: Annotated[str, Field(pattern="^[5-8][NEO][12]$")] = "8N1"
+        unit: Literal["C", "F", "K", "mA"] = "C"
+        scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
+        offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+        checksum: Literal["none", "xor", "sum8", "nmea"] = "none"
+        timeout_s: support.Seconds = 2.0
+        minimum_c: support.Celsius = -60.0
+        maximum_c: support.Celsius = 125.0
+        chip: support.Text | None = None
+        refuse_c: list[support.Celsius] = Field(default=list(chips.FIRMWARE_C))
+
+        @model_validator(mode="before")
+        @classmethod
+        def _of_the_instrument(cls, data: dict[str, Any]) -> dict[str, Any]:
+            name = data.get("instrument")
+            if (name is None) == (data.get("pattern") is None):
+                raise ConfigurationError(
+                    f"set either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
+                )
+            own = {}
+            if isinstance(name, str) and name in INSTRUMENTS:
+                own = {**OF_AN_INSTRUMENT, **INSTRUMENTS[name]}
+            return {**own, **{key: value for key, value in data.items() if value is not None}}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -258,15 +253,19 @@ class SerialThermometer(support.CheckedThermometer):
         monotonic, utc = support.on_clock(self.clock, ended)
         return replace(reading, monotonic=monotonic, utc=utc)
 
+    def _received(self, least: int = 1) -> bytes:
+        """Read what has come; CR, LF and CR LF all end a line, and empty lines are skipped."""
+        return bytes(self.handle.read(max(least, self.handle.in_waiting))).replace(b"\r", b"\n")
+
     def _ask(self) -> None:
         """Wait for a quiet line, note whether its last line is unfinished, and send the command."""
         late, deadline = self._line, time.monotonic() + self.options.timeout_s
         while (self._owed or late or self.handle.in_waiting) and time.monotonic() < deadline:
             # the answer to an earlier command, or the rest of it, may still arrive
-            if not (more := self.handle.read(max(1, self.handle.in_waiting))):
+            if not (more := self._received()):
                 break
             late += more
-        rest = _one_end(late).rpartition(b"\n")[2].strip(b" \0")
+        rest = late.rpartition(b"\n")[2].strip(b" \0")
         # the rest of a late line would look like a whole line; a prompt does not
         self._synchronous = not rest or rest[-1:] in PROMPTS
         self._line, self._owed = b"", True
@@ -274,11 +273,11 @@ class SerialThermometer(support.CheckedThermometer):
 
     def _skip_queue(self) -> None:
         """Discard the complete lines received so far, but not the start of the current one."""
-        waiting = self.handle.read(self.handle.in_waiting)
+        waiting = self._received(0)
         if len(waiting) >= QUEUE:
             self._line, self._synchronous = b"", False  # bytes may be missing
             return
-        head, mark, tail = (self._line + _one_end(waiting)).rpartition(b"\n")
+        head, mark, tail = (self._line + waiting).rpartition(b"\n")
         if mark:
             self._synchronous = True
         self._line = tail if mark else head + tail
@@ -310,7 +309,7 @@ class SerialThermometer(support.CheckedThermometer):
                 self._line, self._synchronous = b"", False
             if time.monotonic() >= deadline:
                 raise self._nothing(skipped, problem)
-            self._line += _one_end(self.handle.read(max(1, self.handle.in_waiting)))
+            self._line += self._received()
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
         """Return the error for a time-out, which names the fault of the lines received."""

@@ -48,9 +48,11 @@ if TYPE_CHECKING:
 AUTO = "auto"
 """The value that leaves a setting to the camera."""
 Text = Annotated[
-    str, BeforeValidator(lambda v: str(v) if type(v) is int else v), Field(min_length=1)
+    str,
+    BeforeValidator(lambda v: str(v) if type(v) is int else v),
+    Field(min_length=1, pattern=r"^[^\x00]*$"),
 ]
-"""A text option; a whole number is accepted as the text that was written."""
+"""A text option, without NUL; a whole number is accepted as the text that was written."""
 Seconds = Annotated[float, Field(ge=0.01, le=600.0)]
 """A time-out."""
 Celsius = Annotated[float, Field(ge=-273.15, le=3000.0)]
@@ -58,6 +60,9 @@ Pixels = Annotated[int, Field(ge=16, le=20_000)]
 Port = Annotated[int, Field(ge=1, le=65_535)]
 NEIGHBOUR_AGE_S = 60.0
 NEIGHBOUR_STEP_K = 5.0
+SWITCH_S = 600.0
+UNITS = {"degC": 1.0, "tenths": 0.1, "thousandths": 0.001}
+"""Factors that convert a number of the kernel or a phone to °C, by the words of the options."""
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][-+]?[0-9]{1,2})?")
 _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EREMOTEIO, errno.ENOTCONN, errno.ESHUTDOWN}
 
@@ -215,6 +220,7 @@ class Channels:
         self._clock = clock
         self._low_c, self._high_c = low_c, high_c
         self._last: dict[str, tuple[float, float]] = {}
+        self._numbers: dict[str, tuple[float, float]] = {}
 
     def clear(self) -> None:
         """Forget the last readings, when the device is closed."""
@@ -248,6 +254,21 @@ class Channels:
                 f"{where}: {value_c:g} °C is {idle}, and no recent reading was near it"
             )
         return value_c
+
+    def switched(self, source: str, number: float, scale: float) -> bool:
+        """Return whether a number agrees with the source's last one only in another unit.
+
+        Kernels report 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45. The
+        last numbers are retained while the device is closed.
+        """
+        value, now = number * scale, self._clock.monotonic()
+        at, last = self._numbers.get(source, (now, value))
+        other = None
+        if now - at <= SWITCH_S and abs(value - last) > NEIGHBOUR_STEP_K:
+            rest = [number * unit for unit in UNITS.values() if unit != scale]
+            other = next((c for c in rest if abs(c - last) <= NEIGHBOUR_STEP_K), None)
+        self._numbers[source] = (now, value if other is None else other)
+        return other is not None
 
     def reading(
         self, measures: Mapping[str, tuple[str, Callable[[], float]]], start: float | None = None

@@ -94,32 +94,29 @@ MODES = {lock.automatic: lock for lock in LOCKS}
 Whole = Annotated[int | str | None, support.or_auto(0, 1e6)]
 
 
-class V4l2Options(DriverOptions):
-    """The options of `v4l2`; a setting that is None is locked as it is."""
-
-    width: support.Pixels
-    height: support.Pixels
-    device: support.Text | None = None
-    serial: support.Text | None = None
-    card: support.Text | None = None
-    pixel_format: support.Text = "YUYV"
-    exposure_s: Annotated[float | str | None, support.or_auto(1e-5, 60)] = None
-    gain: Whole = None
-    focus: Whole = None
-    white_balance_k: Whole = None
-    controls: dict[str, Annotated[int, Field(ge=-(2**31), lt=2**31)]] = {}  # noqa: RUF012
-    strict: bool = True
-    timeout_s: Annotated[float, Field(ge=0.05, le=600.0)] = 5.0
-    backend: Literal["auto", "linuxpy", "opencv"] = "auto"
-    dev: support.Text = "/dev"
-
-
 class V4l2Camera(Camera):
     """A capture device, streaming while it is open."""
 
     device_classes = ("char-video4linux",)
 
-    Options = V4l2Options
+    class Options(DriverOptions):
+        """The options of `v4l2`; a setting that is None is locked as it is."""
+
+        width: support.Pixels
+        height: support.Pixels
+        device: support.Text | None = None
+        serial: support.Text | None = None
+        card: support.Text | None = None
+        pixel_format: support.Text = "YUYV"
+        exposure_s: Annotated[float | str | None, support.or_auto(1e-5, 60)] = None
+        gain: Whole = None
+        focus: Whole = None
+        white_balance_k: Whole = None
+        controls: dict[str, Annotated[int, Field(ge=-(2**31), lt=2**31)]] = {}  # noqa: RUF012
+        strict: bool = True
+        timeout_s: Annotated[float, Field(ge=0.05, le=600.0)] = 5.0
+        backend: Literal["auto", "linuxpy", "opencv"] = "auto"
+        dev: support.Text = "/dev"
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

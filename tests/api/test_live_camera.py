@@ -138,9 +138,8 @@ def test_frames_as_the_steady_camera_had_seen_them():
 
 
 def test_maps_are_kept_while_no_point_moves():
-    live = tc.ThermalCamera(thermal_model()).live()
-    sensor = thermal_model().sensor
-    frame = np.zeros((sensor.height, sensor.width), np.uint8)
+    live = tc.ThermalCamera(thermal_model()).live((820, 616))
+    frame = np.zeros((616, 820), np.uint8)
     live.update(0.0, 30.0)
     live.correct(frame)
     before = live.maps()

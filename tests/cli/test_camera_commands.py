@@ -138,7 +138,13 @@ def test_two_cameras_differ_by_what_was_put_in(tmp_path):
     assert "<svg" in (tmp_path / "d.html").read_text()
 
 
-def test_the_image_s_standard_deviations_are_those_of_drawn_cameras():
+@pytest.fixture
+def coarse(monkeypatch):
+    """Image points on a coarse grid, for many comparisons."""
+    monkeypatch.setattr("thermocald.analysis.camera.camera._GRID", 9)
+
+
+def test_the_image_s_standard_deviations_are_those_of_drawn_cameras(coarse):
     """RMS and largest difference of 200 drawn pairs, also after the rotation, scatter as stated."""
     rng = np.random.default_rng(3)
     warm, C, D = interior(45.0), covariance(1), covariance(2)
@@ -250,7 +256,7 @@ def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):
     assert not (tmp_path / "cam.yaml").exists()
 
 
-def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen():
+def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen(coarse):
     """400 drawn calibrations at 20, 32, 50 °C, with temperature errors of 0.1 K (sd)."""
     rng = np.random.default_rng(8)
     errors, alarms = [], 0

@@ -95,29 +95,6 @@ def test_export_of_several_series_names_the_option(recording, tmp_path):
     finish("export", tmp_path / "t.db", "--series", "M2")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "words"),
-    [
-        (("export", "{recording}", "--format", "xlsx"), 2, "one of csv, json, parquet"),
-        (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no parameter"),
-        (("calibrate", "{image}", "--testfield", "{field}"), 1, "is not an image"),
-        (("calibrate", "{empty}", "--testfield", "{field}"), 1, "0 bytes"),
-    ],
-)  # fmt: skip
-def test_wrong_use_is_one_line(recording, tmp_path, arguments, status, words):
-    (tmp_path / "image.jpg").write_bytes(b"this is no picture")
-    (tmp_path / "empty.jpg").write_bytes(b"")
-    places = {
-        "recording": recording,
-        "field": recording / "testfield.csv",
-        "image": tmp_path / "image.jpg",
-        "empty": tmp_path / "empty.jpg",
-    }
-    done = run(*(a.format(**places) for a in arguments))
-    assert done.returncode == status
-    assert words in " ".join((done.stderr + done.stdout).split())
-
-
 def test_photographs_of_markers_give_the_camera(tmp_path):
     """Three rendered photographs of a corner field: c, x0, y0 within 4 sd of the truth."""
     sensor = Sensor(1640, 1232, 0.00224)
@@ -147,7 +124,8 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     smaller = tmp_path / "smaller.jpg"
     cv2.imwrite(str(smaller), cv2.imread(str(images[1]), 0), [cv2.IMWRITE_JPEG_QUALITY, 95])
     (tmp_path / "broken.jpg").write_bytes(b"no image")
-    added = (copy, smaller, tmp_path / "broken.jpg")
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    added = (copy, smaller, tmp_path / "broken.jpg", tmp_path / "empty.jpg")
     done = finish("calibrate", *images, *added, "--testfield", tmp_path / "field.csv",
                "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
     document = json.loads(done.stdout)
@@ -160,8 +138,9 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
         assert sd == written["interior"][f"sd_{name}"]
     assert len(document["correlations"]["matrix"]) == 8
     assert document["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
-    again, broken = document["photographs"][4:]
-    assert again["status"] == broken["status"] == "bad_image"
+    again, broken, empty = document["photographs"][4:]
+    assert again["status"] == broken["status"] == empty["status"] == "bad_image"
+    assert "0 bytes" in empty["reason"]
     assert again["reason"].startswith(f"shows the view of {images[1].name}, with the same errors")
     assert broken["reason"].startswith("is not an image")
 

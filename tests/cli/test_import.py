@@ -100,17 +100,6 @@ def test_every_reading_of_the_log_is_kept(place):
         read_recording(place / "M1")
 
 
-def test_the_photographs_settle_day_and_month_and_footers_are_passed_over(place):
-    rows = "".join(f"{14}/06/2026 12:0{i}:00,2{i}.5\n" for i in range(2))
-    rows = rows.replace("14/06", "06/07") + "Average,21.0\n"
-    (place / "log.csv").write_text("Time,Celsius\n" + rows)
-    for i in range(6):
-        photograph(place / "photos" / f"{i}.jpg", f"2026:07:06 12:00:{10 * i:02d}")
-    result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert "'06/07/2026 12:00:00' is day/month: this puts the log near" in result.stderr
-    assert "1 row without a time: left out (line 4: 'Average')" in result.stderr
-
-
 def test_a_dry_run_shows_all_and_writes_nothing(place):
     before = sorted(place.iterdir())
     result = run(place / "photos", "--log", place / "log.csv", "--timezone", "Europe/Berlin",
@@ -173,33 +162,16 @@ def test_times_from_names(place, name):
     assert recording.columns.frame_time.tolist() == [START + i for i in range(6)]
 
 
-@pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
-def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path, zone):
-    """Tested with the readers that both commands use for --log and the points."""
+def test_points_take_no_time_for_utc_that_does_not_say_so(tmp_path):
     from thermocald.analysis.thermal.correction import row_blocks
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.dialect import LogOptions
-    from thermocald.store.logger.temperatures import read_log
 
-    ours, foreign = tmp_path / "ours.csv", tmp_path / "foreign.csv"
-    ours.write_text("time,housing\n2026-06-14 12:00:00,21.5\n2026-06-14 12:01:00,21.6\n")
-    foreign.write_text("Datum;Temp\n14.06.2026 12:00;21,5\n14.06.2026 12:01;21,6\n")
     (tmp_path / "points.csv").write_text("time,x,y\n2026-06-14T12:00:30,5,6\n")
-    clock = device_clock(zone)
-    if zone is None:
-        for path in (ours, foreign):
-            with pytest.raises(ThermocaldError, match=r"has no time zone.*--timezone"):
-                read_log(path, LogOptions(clock=clock))
-        with pytest.raises(ThermocaldError, match=r"points\.csv, line 2.*--timezone"):
-            next(row_blocks(tmp_path / "points.csv", ("x", "y"), clock))
-        return
-    first = START + (7200 if zone == "UTC" else 0)
-    for path in (ours, foreign):
-        log = read_log(path, LogOptions(clock=clock))
-        assert log.times.tolist() == [first, first + 60]
-    block = next(row_blocks(tmp_path / "points.csv", ("x", "y"), clock))
-    assert block.times.tolist() == [first + 30]
-    assert block.values.tolist() == [[5, 6]]
+    for zone, first in (("UTC", START + 7200), ("Europe/Berlin", START)):
+        block = next(row_blocks(tmp_path / "points.csv", ("x", "y"), device_clock(zone)))
+        assert (block.times.tolist(), block.values.tolist()) == ([first + 30], [[5, 6]])
+    with pytest.raises(ThermocaldError, match=r"points\.csv, line 2.*--timezone"):
+        next(row_blocks(tmp_path / "points.csv", ("x", "y"), device_clock(None)))
 
 
 def test_the_readme_leads_to_a_plot_in_ten_commands():

@@ -24,8 +24,8 @@ import pytest
 
 import thermocald as tc
 from tests.commands import call, every_command, finish
+from tests.golden.workshop import photographs
 from tests.photogrammetry.network_cases import convergent_stations
-from tests.pictures import TAKEN, save_photograph
 from thermocald.errors import OutputError
 from thermocald.files import new_file, write_text
 from thermocald.photogrammetry import camera_files
@@ -34,7 +34,6 @@ from thermocald.physics.scene import Scene
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.testfield_file import read_testfield
-from thermocald.store.series import Event
 
 _OVERRIDE_PERMISSIONS = 1 << 1  # CAP_DAC_OVERRIDE
 
@@ -148,17 +147,13 @@ class World:
 
     @cached_property
     def snapshots(self) -> Path:
-        folder = self.folder / "snapshots"
-        folder.mkdir()
-        for i in range(3):
-            save_photograph(folder / f"{i}.jpg", {TAKEN: f"2026:06:14 12:00:{10 * i:02d}"})
-        return folder
+        (self.folder / "snapshots").mkdir()
+        photographs(self.folder / "snapshots")
+        return self.folder / "snapshots/photos"
 
     @cached_property
     def log(self) -> Path:
-        rows = [f"2026-06-14 12:00:{10 * i:02d},{20 + i}" for i in range(3)]
-        (self.folder / "log.csv").write_text("\n".join(["time,temperature", *rows, ""]))
-        return self.folder / "log.csv"
+        return self["snapshots"].parent / "log.csv"
 
     def words(self, name: str, **places: Path) -> list[str]:
         """Return a command's words, with inputs from this world and outputs in `places`."""
@@ -395,43 +390,6 @@ def test_standard_output_on_a_full_disk_is_one_sentence(world):
     assert done.returncode == 3
     assert "Traceback" not in done.stderr
     assert "No space left" in done.stderr
-
-
-MEASURED = {
-    "a store": "t.db",
-    "a store through a link": "link",
-    "a store under another name": "hard.csv",
-    "a store's -wal": "t.db-wal",
-    "observations of a recording": "M/observations.csv",
-    "epochs of a recording": "M/epochs.csv",
-    "epochs through a link": "epochs-link",
-}
-
-
-def test_what_was_measured_is_never_written_over(world, tmp_path):
-    """`-o thermocald.db` by mistake for `--store` would replace a month of epochs by a table.
-
-    Under every name of the file; test_wrong_usage checks that every command refuses it.
-    """
-    with Store.open(tmp_path / "t.db", "append") as store:
-        store.add_event(Event(1.0, "started", "kept"))
-        for part in ("", "-wal"):
-            shutil.copy(tmp_path / f"t.db{part}", tmp_path / f"kept.db{part}")
-    for part in ("", "-wal"):  # as a writer leaves them that is killed
-        shutil.move(tmp_path / f"kept.db{part}", tmp_path / f"t.db{part}")
-    os.link(tmp_path / "t.db", tmp_path / "hard.csv")
-    (tmp_path / "link").symlink_to("t.db")
-    shutil.copytree(world["M1"], tmp_path / "M")
-    (tmp_path / "epochs-link").symlink_to("M/epochs.csv")
-    for what, place in MEASURED.items():
-        before = (tmp_path / place).read_bytes()
-        code, said = written_to(world, "check", tmp_path / place)
-        assert code == 2, what
-        assert "cannot be written: it is" in said
-        assert "choose another name" in said
-        assert (tmp_path / place).read_bytes() == before, what
-    with Store.open(tmp_path / "t.db") as store:
-        assert [event.text for event in store.events()] == ["kept"]
 
 
 @pytest.mark.parametrize(("closed", "status"), [(">&-", 2), ("2>&-", 0), ("<&- >&- 2>&-", 0)])

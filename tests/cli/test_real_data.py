@@ -84,26 +84,16 @@ def test_a_hand_held_board_is_called_weak(shared):
     )
     video = cv2.VideoCapture(str(folder / "testcalibration.mp4"))
     measured = []
-    for frame in range(36):
-        ok, image = video.read()
-        if not ok:
-            break
-        if frame % 6:
-            continue
-        corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-        n = len(ids)
-        measured.append(
-            Observations(
-                ids.ravel().astype(np.int64), corners.reshape(n, 2).astype(float),
-                np.full((n, 2), 0.1),
-            )
-        )  # fmt: skip
+    for _ in range(3):
+        images = [video.read()[1] for _ in range(6)]
+        corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY))
+        seen = corners.reshape(-1, 2).astype(float)
+        measured.append(Observations(ids.ravel().astype(np.int64), seen, np.full(seen.shape, 0.1)))
     video.release()
     result = calibrate_observations(
         [str(i) for i in range(len(measured))], measured, {}, field,
         CameraSpec("", Sensor(1920, 1080, 0.001)), AdjustmentSettings(),
     )  # fmt: skip
-    assert len(measured) == 6
     assert result.status == "weak_geometry"
     assert result.reason
     assert not result.estimated

@@ -12,14 +12,14 @@ from thermocald.errors import DataError, UsageError
 
 
 def written(path, seed):
-    """A recording of 60 epochs of the warm phone."""
-    tc.simulate("nexus5-warm", seed=seed, epochs=60, out=path)
+    """A recording of 40 epochs of the warm phone."""
+    tc.simulate("nexus5-warm", seed=seed, epochs=40, out=path)
     return path
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A quarter of an hour of a warm phone."""
+    """Some minutes of a warm phone."""
     path = tmp_path_factory.mktemp("recordings") / "nexus"
     return written(path, 5)
 
@@ -38,7 +38,7 @@ def test_json_on_standard_output_is_one_document_and_nothing_else(run, recording
     (series,) = camera["series"]
     assert series["exterior"] in ("series", "mount")  # as the data choose
     assert series["exterior_choice"]
-    assert series["epochs"] == 60
+    assert series["epochs"] == 40
     dependence = series["temperature_dependence"]["temperature"]["parameters"]
     assert min(abs(dependence[n]["r"]) for n in ("c", "x0", "y0")) > 0.98
     # the preset has 8 px and 3 µm over 8 K

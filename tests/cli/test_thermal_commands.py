@@ -15,10 +15,8 @@ import yaml
 
 from tests.commands import answer as run
 from tests.commands import succeed
-from tests.pictures import MODEL, TAKEN, save_photograph, write_markers
+from tests.pictures import MODEL, TAKEN, save_photograph
 from thermocald.errors import ThermocaldError
-from thermocald.photogrammetry import camera_files
-from thermocald.photogrammetry.camera.camera_model import CameraModel
 from thermocald.physics.device import CameraDevice, Programme
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
@@ -403,64 +401,15 @@ def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
     assert len(piped.stdout.splitlines()) == len(times) + 1
 
 
-@pytest.mark.parametrize("head", ["temperature [degF]", "Temp (°F)", "T [F]", "tempF", "Temp_f"])
-def test_a_log_in_fahrenheit_is_converted_wherever_it_is_read(folder, tmp_path, head):
-    """`predict` and `correct` give the same camera as with the log in °C."""
-    for name, title, values in (("c", "temperature", (25.0, 30.0)), ("f", head, (77.0, 86.0))):
-        rows = "".join(f"2026-06-14 12:0{i}:00Z,{v}\n" for i, v in enumerate(values))
-        (tmp_path / f"{name}.csv").write_text(f"time,{title}\n{rows}")
-    found = [
-        json.loads(run("predict", "--model", folder / "cam.yaml", "--log", tmp_path / f"{n}.csv",
-                       "--json", "-").stdout)["rows"] for n in "cf"
-    ]  # fmt: skip
-    assert np.array(found[1]) == pytest.approx(np.array(found[0]), abs=1e-9)
-
-
-@pytest.mark.slow
-def test_fit_measures_frames_first(tmp_path):
-    """A recording of frames alone: the rates of the camera that made them, within 4 sd."""
-    simulation = simulated(5, epochs=16, interval=90.0, kind="markers")
-    simulation.write(tmp_path / "M1", with_frames=True)
-    assert not (tmp_path / "M1" / "observations.csv").exists()
-    result = succeed("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--json", "-")
-    document = json.loads(result.stdout)
-    assert document["series"][0]["epochs"] == 16
-    for name in ("c", "x0", "y0"):
-        rate = document["rates"][name]
-        assert abs(rate["value"] - simulation.model.rates[name]) < 4 * rate["sd"], name
-
-
 # --- cameras of other programs as initial values -----------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def camera():
-    """The demonstration's camera without parameters that a format lacks, so that all are exact."""
-    field = demonstration_field("markers")
-    model = demonstration_model(field)
-    return CameraModel(model.sensor, model.interior.with_values(A3=0.0, C1=0.0, C2=0.0))
-
-
-@pytest.mark.slow
-def test_calibrate_starts_from_the_camera_of_another_program(tmp_path, camera):
-    write_markers(tmp_path, interior=camera.interior)
-    path = tmp_path / "camera.xml"
-    near = CameraModel(camera.sensor, camera.interior.with_values(c=camera.interior.c * 1.01))
-    camera_files.write(near, path, "opencv")
-    images = sorted(tmp_path.glob("*.png"))
-    result = succeed("calibrate", *images, "--testfield", tmp_path / "field.csv", "--camera", path,
-                 "--json", "-")  # fmt: skip
-    interior = json.loads(result.stdout)["interior"]
-    for key in ("c", "x0", "y0"):
-        assert abs(interior[key] - getattr(camera.interior, key)) < 4 * interior[f"sd_{key}"], key
-
-
-def test_a_file_without_pixel_pitch_asks_for_it(tmp_path, camera):
+def test_a_file_without_pixel_pitch_asks_for_it(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 3280 2464 2700 2700 1640 1232\n")
     (tmp_path / "a.png").write_bytes(b"")
     arguments = ("calibrate", tmp_path / "a.png", "--testfield", tmp_path / "f.csv", "--camera",
                  tmp_path / "cameras.txt")  # fmt: skip
     write_testfield(tmp_path / "f.csv", demonstration_field("markers"))
     assert "--pixel-pitch" in str(run(*arguments).exception)
-    given = run(*arguments, "--pixel-pitch", camera.sensor.pixel_pitch)
+    given = run(*arguments, "--pixel-pitch", 0.00112)
     assert "no photograph" in str(given.exception)  # the camera was taken

@@ -53,6 +53,7 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("measure", "--model", "/dev/null/m"), r"error: missing argument 'POINTS\.csv'"),
         (("study", "M1", "--seed", "x"), "error: .*--seed"),
         (("predict", "--temperature", "20"), "error: missing option '--model'"),
+        (("export", "M1", "--format", "xlsx"), "one of csv, json, parquet"),
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),
@@ -97,6 +98,7 @@ def occupied(tmp_path):
     """Places that must not be replaced, by their kind."""
     places = {
         "a folder": "folder", "a store": "k.db", "its -wal": "k.db-wal", "a recording": "M1",
+        "a link to a store": "link", "a store's other name": "hard.csv",
         "its head": "M1/recording.yaml", "its Parquet": "M1/observations.parquet",
         "within a file": "file/a", "a file": "file", "the kernel's": "/proc/x", "a socket": "s",
         "a disk": "disk",
@@ -104,6 +106,8 @@ def occupied(tmp_path):
     (tmp_path / "folder").mkdir()
     with closing(sqlite3.connect(tmp_path / "k.db")) as database:
         database.execute("CREATE TABLE x (y)")
+    (tmp_path / "link").symlink_to("k.db")
+    os.link(tmp_path / "k.db", tmp_path / "hard.csv")
     (tmp_path / "k.db-wal").write_bytes(b"\x37\x7f\x06\x82 and more")
     (tmp_path / "M1").mkdir()
     for name in ("recording.yaml", "observations.parquet"):
@@ -117,8 +121,9 @@ def occupied(tmp_path):
 
 
 TAKEN = {
-    "file": {"a folder", "a store", "its -wal", "a recording", "its head", "its Parquet",
-             "within a file", "the kernel's", "a socket", "a disk"},
+    "file": {"a folder", "a store", "a link to a store", "a store's other name", "its -wal",
+             "a recording", "its head", "its Parquet", "within a file", "the kernel's", "a socket",
+             "a disk"},
     "folder": {"a file", "within a file", "the kernel's", "a store", "a socket"},
 }  # fmt: skip
 TAKEN["recording"] = TAKEN["folder"] | {"a recording"}

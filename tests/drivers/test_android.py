@@ -291,17 +291,6 @@ def test_what_the_server_lists(server, listing, error, message):
             device.open()
 
 
-@pytest.mark.parametrize(
-    ("state", "error"),
-    [("offline", errors.DeviceGone), ("unauthorized", errors.TransientDeviceError)],
-)
-def test_states_that_come_later(server, phone, state, error):
-    with camera(server) as device:
-        phone.state = state
-        with pytest.raises(error):
-            device.capture()
-
-
 def test_a_phone_that_hangs(server, phone):
     with camera(server, timeout_s=0.3) as device:
         phone.hang = threading.Event()
@@ -361,13 +350,6 @@ def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
         device.read()
     with thermometer(server, sensors=sensors, units={"soc": "tenths"}) as device:
         assert device.read().values == {"soc": 4.5}
-
-
-def test_two_phones_by_their_serials(server, phone):
-    server.phones["SECOND"] = FakePhone(battery="  voltage: 4000\n  temperature: 301\n")
-    with thermometer(server) as one, thermometer(server, serial="SECOND") as two:
-        assert one.read().values == {"temperature": 28.7}
-        assert two.read().values == {"temperature": 30.1}
 
 
 def load(server, clock, **more):

@@ -63,19 +63,11 @@ def test_thermal_service_of_real_phones(server, shared, number, part, some, coun
 @pytest.mark.parametrize(
     ("text", "celsius"),
     [
-        ("voltage: 13\n temperature: 26", 26.0),  # a TV board: whole volts, whole degrees
-        ("voltage: 4\n temperature: 268", 26.8),
         ("voltage: 4\n temperature: 85", None),  # 85 °C or 8.5 °C
-        ("voltage: 4312\n temperature: 26", None),  # 2.6 °C, or 26 °C of boards with mV
-        ("voltage: 3812\n temperature: 70", None),
-        ("voltage: 3812\n temperature: 71", 7.1),
-        ("voltage: 3812\n temperature: -30", None),
-        ("voltage: 3812\n temperature: -43", -4.3),
         ("present: false\n temperature: 25", None),
         ("present: true\n temperature: 25", None),
         ("(UPDATES STOPPED -- use 'reset' to restart)\n temperature: 250", None),
         ("  voltage: 4352\r\n  temperature: 274\r\n", 27.4),
-        ("temperature: 25000", None),
         ("temperature: 2_5", None),
         ("temperature: ٢٥٠", None),
         ("status: 2 temperature: 268", None),
@@ -158,24 +150,3 @@ def test_the_unit_of_a_zone(server, text, celsius):
     name = text.split()[0]
     found = read(server, "zone", [name], zones=text + "\n").get(name)
     assert found == (celsius and pytest.approx(celsius))
-
-
-PHONE_ZONES = """cpu-0-0-usr 38200
-gpuss-0-usr 36100
-battery 31000
-lmh-dcvs-00 75000
-pm6150-vbat-lvl0 4012
-pm6150l-bcl-lvl1 0
-bcl-cycle 12
-soc 87
-quiet-therm-adc 32100
-dock_therm -40960
-ibat-high 2000
-"""
-
-
-def test_zones_of_a_phone(server):
-    wanted = {line.split()[0]: f"zone:{line.split()[0]}" for line in PHONE_ZONES.splitlines()}
-    assert phone_reads(server, wanted, zones=PHONE_ZONES) == {
-        "cpu-0-0-usr": 38.2, "gpuss-0-usr": 36.1, "battery": 31.0, "quiet-therm-adc": 32.1,
-    }  # fmt: skip

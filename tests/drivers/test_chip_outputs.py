@@ -58,13 +58,14 @@ def reading(row, server, folder):
 
 
 DRIVERS = sorted({row["driver"] for row in ROWS})
+PARTS = {"serial": 8, "hwmon": 3, "iio": 3}
 
 
 @pytest.mark.parametrize(
     ("driver", "every"),
     [
-        *((driver, 8 if driver == "serial" else 1) for driver in DRIVERS),
-        pytest.param("serial", 1, marks=pytest.mark.slow),
+        *((driver, PARTS.get(driver, 1)) for driver in DRIVERS),
+        *(pytest.param(driver, 1, marks=pytest.mark.slow) for driver in PARTS),
     ],
 )
 def test_a_chip_is_read_rightly_or_refused(driver, every, server, tmp_path):

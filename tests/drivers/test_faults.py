@@ -7,7 +7,6 @@ from typing import get_args
 import pytest
 from thermocald_drivers.mock import Kind
 
-from tests.drivers.small_camera import write_small_camera
 from thermocald import hal
 from thermocald.errors import BadReading, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, open_device
@@ -18,17 +17,9 @@ def clock() -> VirtualClock:
     return VirtualClock()
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory) -> dict[str, str]:
-    """Options of a camera that is quick to render."""
-    return {"model": str(write_small_camera(tmp_path_factory.mktemp("small") / "m.thermal.yaml"))}
-
-
 def use(device) -> None:
-    """Take one frame or reading, or emit one result."""
-    if isinstance(device, hal.Camera):
-        device.capture()
-    elif isinstance(device, hal.Thermometer):
+    """Take one reading, or emit one result."""
+    if isinstance(device, hal.Thermometer):
         device.read()
     else:
         device.emit({"epoch": 1})
@@ -61,10 +52,9 @@ def test_every_kind_is_tested():
 
 
 @pytest.mark.parametrize(("kind", "error"), KINDS.items())
-@pytest.mark.parametrize("device", ["camera", "thermometer", "output"])
-def test_by_call(clock, small, device, kind, error):
+@pytest.mark.parametrize("device", ["thermometer", "output"])
+def test_by_call(clock, device, kind, error):
     options = {"faults": [{"kind": kind, "at": 2, "count": 3}]}
-    options |= small if device == "camera" else {}
     with open_device(device, "mock", options, clock) as mock:
         assert outcomes(mock, 6) == ["ok", error, error, error, "ok", "ok"]
 

@@ -129,13 +129,6 @@ def test_what_a_chip_holds_is_read_rightly_or_refused(bus, name, options, chip, 
             device.read()
 
 
-def test_mcp9808_in_shut_down_is_woken_and_a_conversion_awaited(bus):
-    bus.chips[0x18] = chip = mcp9808(configuration=0x0100)
-    with thermometer("mcp9808") as device:
-        assert chip.registers[1] == b"\x00\x00"
-        assert device.clock.monotonic() >= 0.25
-
-
 def test_lm75_in_shut_down_is_woken(bus):
     bus.chips[0x48] = chip = lm75(configuration=0x19)
     with thermometer("lm75") as device:

@@ -9,7 +9,7 @@ import os
 import numpy as np
 import pytest
 
-from thermocald.errors import DeviceDenied, DeviceGone, DeviceTimeout, TransientDeviceError
+from thermocald.errors import DeviceGone, DeviceTimeout, TransientDeviceError
 from thermocald.hal import VirtualClock, open_device
 
 RESULT = {"device": "rpi", "epoch": 3, "c": np.float64(3.04), "x0": float("nan"), "status": "ok"}
@@ -109,15 +109,6 @@ def test_a_pipe_whose_reader_sleeps(tmp_path):
         with pytest.raises(DeviceTimeout, match="too slow"):
             fill()
     os.close(reader)
-
-
-def test_no_permission(tmp_path, monkeypatch):
-    def denied(*_args, **_kwargs):
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(os, "open", denied)
-    with pytest.raises(DeviceDenied):
-        output(tmp_path / "results.jsonl").open()
 
 
 def test_no_folder(tmp_path):

@@ -70,15 +70,17 @@ def test_username_and_password_file(broker, tmp_path):
     assert broker.credentials == ("me", "swordfish")
 
 
-def test_a_wrong_password(broker):
-    broker.refuse = 5
-    with pytest.raises(DeviceDenied, match="check username"):
-        output(broker).open()
-
-
-def test_a_broker_that_only_starts_is_asked_again(broker):
-    broker.refuse = 3
-    with pytest.raises(DeviceGone, match="Server unavailable"):
+@pytest.mark.parametrize(
+    ("knobs", "error", "message"),
+    [
+        ({"refuse": 5}, DeviceDenied, "check username"),
+        ({"refuse": 3}, DeviceGone, "Server unavailable"),  # it only starts: asked again
+        ({"answer_connect": False}, DeviceTimeout, "no answer"),
+    ],
+)
+def test_a_broker_that_lets_nobody_in(broker, knobs, error, message):
+    vars(broker).update(knobs)
+    with pytest.raises(error, match=message):
         output(broker).open()
 
 
@@ -96,12 +98,6 @@ def test_a_certificate_is_not_yet_valid_until_the_clock_is_set(broker, monkeypat
     error.verify_code = 10
     with pytest.raises(DeviceDenied, match="check ca"):
         output(broker, tls=True).open()
-
-
-def test_a_broker_that_hangs_at_the_beginning(broker):
-    broker.answer_connect = False
-    with pytest.raises(DeviceTimeout):
-        output(broker).open()
 
 
 def test_a_broker_that_stops_to_acknowledge(broker):

@@ -9,7 +9,7 @@ import threading
 import time
 
 import pytest
-from thermocald_drivers.onewire import crc8, decode
+from thermocald_drivers.onewire import decode
 
 from tests.drivers.fakes.sysfs import Sysfs, w1_crc, w1_slave
 from thermocald.errors import BadReading, DeviceNotFound, DeviceTimeout
@@ -52,10 +52,6 @@ def test_every_real_block_is_judged_rightly(shared):
     assert sum("CRC error" in text for text in refused) == 4  # three NO, one forged
     assert sum("all zeros" in text for text in refused) == 1
     assert len(refused) == 5
-
-
-def test_crc_of_the_application_note():
-    assert crc8(bytes.fromhex("02 1c b8 01 00 00 00")) == 0xA2  # Maxim AN27, the ROM example
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from thermocald.epoch import Epoch
 from thermocald.errors import (
     BadReading,
     DeviceFinished,
-    DeviceNotFound,
     PermanentDeviceError,
     TestFieldError,
 )
@@ -78,13 +77,7 @@ def test_measurements_come_without_a_picture(write):
     "changed", [{"target": None}, {"x": [1.0]}, {"sxy": [0.0]}, {"sy": ["a"] * 2}]
 )
 def test_measurements_that_do_not_match_have_a_clear_error(changed):
-    lists = {
-        "target": ["a", "b"],
-        "x": [1.0, 2.0],
-        "y": [1.0, 2.0],
-        "sx": [1.0] * 2,
-        "sy": [1.0] * 2,
-    }
+    lists = {"target": ["a", "b"], **{key: [1.0, 2.0] for key in ("x", "y", "sx", "sy")}}
     field = TestField.build(["a", "b"], np.eye(3)[:2])
     assert len(observations_from_lists(lists, field)) == 2
     with pytest.raises(TestFieldError, match="with an entry for each target"):
@@ -134,12 +127,6 @@ def test_what_is_broken_comes_as_recorded_and_what_is_missing_is_a_bad_reading(w
         for message in ("000003.png: cannot be read: No such file", "epoch 4 has no frame"):
             with pytest.raises(BadReading, match=message):
                 camera.capture()
-
-
-def test_no_recording(tmp_path):
-    options = {"recording": str(tmp_path / "none")}
-    with pytest.raises(DeviceNotFound, match="no such recording"):
-        open_device("camera", "replay", options, VirtualClock()).open()
 
 
 def test_a_real_recording(shared):

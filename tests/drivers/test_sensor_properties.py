@@ -78,25 +78,10 @@ def no_sensor(chip, k, how):
     assert line_read(text, unit=unit, scale=scale, offset=offset, chip=chip) is None, text
 
 
-def measured(celsius, how):
-    unit, decimals, scale, offset, comma = how
-    factor, zero = UNITS[unit]
-    text = printed(celsius, unit, max(decimals, 1), comma)
-    number = float(text.replace(",", "."))
-    found = line_read(text, unit=unit, scale=scale, offset=offset)
-    if found is not None:
-        assert found == pytest.approx(factor * (number * scale + offset - zero), abs=1e-9)
-
-
 @AMOUNTS
 @pytest.mark.parametrize("names", [chips.names(), [None]], ids=["a chip", "any firmware"])
 def test_what_is_given_without_measuring_is_refused(amount, names):
     settings(**amount)(given(st.sampled_from(names), st.integers(0, 10), CORRECTED)(no_sensor))()
-
-
-@AMOUNTS
-def test_what_is_measured_is_right_or_refused(amount):
-    settings(**amount)(given(st.floats(-38.0, 83.0), CORRECTED)(measured))()
 
 
 # --- files of the kernel ------------------------------------------------------------------
@@ -134,20 +119,6 @@ def test_any_content_of_sysfs_is_right_or_refused(amount, folder):
             assert not chips.is_idle(name, found)
 
     check()
-
-
-def test_a_recent_reading_supports_what_a_chip_also_gives_unmeasured(folder):
-    sysfs, clock, read = Sysfs(folder), VirtualClock(), []
-    sysfs.hwmon(0, "lm75", temp1_input="2000")
-    with HwmonThermometer(clock=clock, chip="lm75", sysfs=str(folder)) as device:
-        for milli, wait in (("2000", 10), ("0", 10), ("-500", 10), ("-500", 50), ("-1000", 1)):
-            sysfs.hwmon(0, "lm75", temp1_input=milli)
-            clock.advance(wait)
-            try:
-                read.append(device.read().values["temperature"])
-            except BadReading:
-                read.append(None)
-    assert read == [2.0, 0.0, -0.5, None, None]
 
 
 # --- units that switch --------------------------------------------------------------------

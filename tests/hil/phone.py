@@ -37,7 +37,10 @@ class Phone:
             folder.mkdir(parents=True)
         (self.state / "photographs").mkdir()
         self.say("dumpsys.battery", "  voltage: 4100\n  temperature: 287\n")
-        self.focus(0.25)
+        self.say(
+            "dumpsys.media.camera",
+            "  android.lens.focusDistance (80007): float[1]\n        [0.25 ]\n",
+        )
         self.plug()
 
     def plug(self) -> None:
@@ -89,12 +92,6 @@ class Phone:
     def unsay(self, name: str) -> None:
         with contextlib.suppress(FileNotFoundError):
             (self.state / name).unlink()
-
-    def focus(self, dioptres: float) -> None:
-        self.say(
-            "dumpsys.media.camera",
-            f"  android.lens.focusDistance (80007): float[1]\n        [{dioptres} ]\n",
-        )
 
     def load(self, images: np.ndarray, first: int = 1) -> None:
         """Load numbered photographs for the camera's next exposures."""

@@ -11,8 +11,6 @@ import pytest
 from tests.hil.bars import number_of
 from tests.hil.frames import heating
 from thermocald.errors import (
-    BadReading,
-    DeviceDenied,
     DeviceGone,
     DeviceTimeout,
     PermanentDeviceError,
@@ -69,44 +67,6 @@ def test_a_heating_series(phone, subject, report):
         f"{1e3 * uncertainty:.1f} ms); read to value median "
         f"{1e3 * statistics.median(read):.0f} ms"
     )
-
-
-def test_a_file_that_never_ends(phone, subject):
-    phone.load(subject[0][:1])
-    phone.say("never_ends", "")
-    with camera(phone, timeout_s=3.0) as device, pytest.raises(BadReading, match="partial"):
-        device.capture()
-
-
-def test_no_camera_app(phone):
-    phone.say("no_camera", "")
-    with camera(phone, timeout_s=2.0) as device, pytest.raises(DeviceTimeout, match="trigger"):
-        device.capture()
-
-
-def test_a_changed_focus(phone, subject):
-    phone.load(subject[0][:4])
-    with camera(phone) as device:
-        device.capture()
-        phone.focus(0.31)
-        with pytest.raises(BadReading, match=r"focus_distance_dioptres was 0\.25 and is 0\.31"):
-            device.capture()
-    with camera(phone, refuse_unlocked=False) as device:
-        phone.focus(0.25)
-        device.capture()
-        phone.focus(0.31)
-        assert device.capture().settings["focus_distance_dioptres"] == pytest.approx(0.31)
-
-
-def test_a_locked_screen(phone):
-    phone.say("locked", "")
-    with pytest.raises(DeviceDenied, match="screen is locked"):
-        camera(phone).open()
-
-
-def test_a_full_phone(phone):
-    with pytest.raises(PermanentDeviceError, match="storage is full"):
-        camera(phone, minimum_free_mb=1e6).open()
 
 
 def test_a_pulled_cable_is_plugged_in_again(phone, subject):

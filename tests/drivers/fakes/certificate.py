@@ -9,8 +9,8 @@ import subprocess
 import pytest
 
 
-def own_certificate(folder):
-    """Return the files (certificate, key); skips if openssl is not installed."""
+def own_context(folder):
+    """Return (certificate, a server's TLS context with it); skips if openssl is not installed."""
     if shutil.which("openssl") is None:
         pytest.skip("no openssl: apt-get install openssl")
     certificate, key = folder / "own.pem", folder / "own.key"
@@ -21,12 +21,6 @@ def own_certificate(folder):
          "-out", certificate, "-keyout", key],
         check=True, capture_output=True,
     )  # fmt: skip
-    return certificate, key
-
-
-def own_context(folder):
-    """Return (certificate, a server's TLS context with it)."""
-    certificate, key = own_certificate(folder)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     return certificate, context

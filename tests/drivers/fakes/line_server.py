@@ -32,18 +32,14 @@ class LineServer:
             self._threads.append(thread)
             thread.start()
 
-    def drop(self) -> None:
-        """Break all connections, as when the network fails."""
-        for line in self._lines:
-            with contextlib.suppress(OSError):
-                line.shutdown(socket.SHUT_RDWR)
-
     def close(self) -> None:
         """End all connections and threads; may be called twice."""
         if self._server.fileno() < 0:
             return
         self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
-        self.drop()
+        for line in self._lines:
+            with contextlib.suppress(OSError):
+                line.shutdown(socket.SHUT_RDWR)
         for thread in self._threads:
             thread.join(2.0)

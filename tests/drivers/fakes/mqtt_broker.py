@@ -1,6 +1,6 @@
 """A broker with the part of MQTT 3.1.1 that one publisher needs, which fails on demand.
 
-`test_mosquitto` uses a real broker; this one can withhold an acknowledgement or break a connection.
+`make hil` uses a real broker; this one can withhold an acknowledgement or break a connection.
 """
 
 from __future__ import annotations

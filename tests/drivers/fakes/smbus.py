@@ -24,7 +24,6 @@ class Chip:
     on_read: Callable[[Chip, int], None] | None = None
     reply: bytes = b""
     error: int = 0
-    written: list[tuple[int, bytes]] = field(default_factory=list)
 
     def word(self, register: int, value: int) -> None:
         self.registers[register] = value.to_bytes(2, "big")
@@ -68,7 +67,6 @@ class Bus:
 
     def _write(self, address: int, register: int, data: bytes) -> None:
         chip = self._chip(address)
-        chip.written.append((register, data))
         if chip.on_write:
             chip.on_write(chip, register, data)
         else:

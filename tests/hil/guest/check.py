@@ -294,43 +294,10 @@ def kernel(bus):
             result["iio"] = repeated(device)
             write(f"{folder}/delete_device", "0x76")
             result["iio unbound"] = outcome(device.read)
-    with thermometer("thermal_zone", zone="acpitz") as device:
-        result["thermal_zone"] = repeated(device)
-    return result
-
-
-TMP117, CONFIGURATION, ONE_SHOT, READY = 0x4B, 1, 0x0C00, 0x2000
-
-
-def registers(bus):
-    """Read BME280 and TMP117 by their registers; a thread makes the TMP117's conversions."""
-    import threading
-
-    import smbus2
-
-    bus, result, end = int(bus), {}, threading.Event()
-    with smbus2.SMBus(bus, force=True) as wire:
-
-        def convert():
-            while not end.wait(0.002):
-                word = swapped(wire.read_word_data(TMP117, CONFIGURATION))
-                if word & ONE_SHOT == ONE_SHOT and not word & READY:
-                    time.sleep(0.1245)  # eight averages
-                    wire.write_word_data(TMP117, 0, swapped(0x0C88))
-                    wire.write_word_data(TMP117, CONFIGURATION, swapped(word | READY))
-
-        for register, value in BME280.items():
-            wire.write_byte_data(0x76, register, value)
         with thermometer("bme280", bus=bus, address=0x76) as device:
             result["bme280"] = repeated(device)
-        wire.write_word_data(TMP117, 0, swapped(0x8000))
-        wire.write_word_data(TMP117, 0x0F, swapped(0x0117))
-        converter = threading.Thread(target=convert)
-        converter.start()
-        with thermometer("tmp117", bus=bus, address=TMP117) as device:
-            result["tmp117"] = repeated(device)
-        end.set()
-        converter.join()
+    with thermometer("thermal_zone", zone="acpitz") as device:
+        result["thermal_zone"] = repeated(device)
     return result
 
 
@@ -388,70 +355,6 @@ def unplug(device):
         write("/run/cable", "plug")
     device.close()
     return result
-
-
-def mqtt():
-    """Publish to a real broker: delivery, discovery messages, the last will of a killed process."""
-    import paho.mqtt.client as client_module
-
-    subprocess.run(["systemctl", "start", "mosquitto"], check=True)
-    received = []
-    client = client_module.Client(client_module.CallbackAPIVersion.VERSION2)
-    client.on_message = lambda _c, _d, m: received.append((m.topic, m.payload.decode(), m.retain))
-    deadline = time.monotonic() + 20
-    while True:
-        try:
-            client.connect("127.0.0.1")
-            break
-        except OSError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.1)
-    client.subscribe("#", qos=1)
-    client.loop_start()
-    process = subprocess.Popen(
-        [sys.executable, __file__, "mqtt_publisher"], stdout=subprocess.PIPE, text=True
-    )
-    took = json.loads(process.stdout.readline())
-    process.kill()
-    process.wait()
-    while time.monotonic() < deadline + 40 and not any(p == "offline" for _, p, _ in received):
-        time.sleep(0.05)
-    client.disconnect()
-    client.loop_stop()
-    return {"received": received, "took_s": took}
-
-
-def mqtt_publisher():
-    device = open_device("output", "mqtt", {"host": "127.0.0.1"}, SystemClock())
-    device.open()
-    took = []
-    for epoch in range(5):
-        begin = time.monotonic()
-        device.emit({"device": "thermocald", "epoch": epoch, "c": 3.04, "status": "ok"})
-        took.append(time.monotonic() - begin)
-    print(json.dumps(took), flush=True)
-    time.sleep(600)
-
-
-def jsonl_full():
-    """Fill a small file system in the middle of a line."""
-    subprocess.run("mkdir -p /run/small && mount -t tmpfs -o size=64k none /run/small", shell=True,
-                   check=True)  # fmt: skip
-    device = open_device("output", "jsonl", {"path": "/run/small/r.jsonl"}, SystemClock())
-    device.open()
-    last, took = {}, []
-    for epoch in range(2000):
-        last = outcome(lambda epoch=epoch: device.emit({"epoch": epoch, "text": "x" * 97}))
-        took.append(last["took_s"])
-        if last["error"]:
-            break
-    device.close()
-    with open("/run/small/r.jsonl") as file:
-        whole = [json.loads(line)["epoch"] for line in file.read().splitlines()]
-    subprocess.run("umount /run/small", shell=True, check=True)
-    consecutive = whole == list(range(len(whole)))
-    return {"last": last, "whole": len(whole), "consecutive": consecutive, "took_s": took[:100]}
 
 
 if __name__ == "__main__":

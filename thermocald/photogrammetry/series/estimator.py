@@ -344,54 +344,37 @@ class SeriesEstimator:
 
     def _snoop_apart(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Snoop epochs that share no unknowns, solving only changed ones again."""
-        values, residuals = estimate.values, estimate.residuals
-        converged = estimate.converged.copy()
-        system = whole = replace(estimate.system, use=estimate.system.use.copy())
-        use, rows = whole.use, np.arange(len(whole.use))
-        history = np.zeros(use.shape, dtype=np.int8)
+        system = replace(estimate.system, use=estimate.system.use.copy())
+        whole = replace(estimate, system=system, converged=estimate.converged.copy())
+        rows, history = np.arange(len(system.use)), np.zeros(system.use.shape, dtype=np.int8)
         part: slice | Index = slice(None)  # all epochs, without a copy
-        typical = self.typical
+        typical, last = self.typical, estimate
         for _ in range(_ROUNDS):
-            tests = point_tests(system, residuals[part])
+            use = last.system.use
+            tests = point_tests(last.system, last.residuals)
             if typical is None:  # in the first round, which has all epochs
                 typical = typical_variance(tests, use)
             keep = snoop_series(
-                tests, offered[part], use[part], self.s.carried, self.s.snooping_alpha, typical,
+                tests, offered[part], use, self.s.carried, self.s.snooping_alpha, typical,
                 self._noise_freedom,
             )  # fmt: skip
             seen = history[part]
-            keep = settle(seen, use[part], keep)
+            keep = settle(seen, use, keep)
             history[part] = seen
-            changed = (keep != use[part]).any(axis=1)
+            changed = (keep != use).any(axis=1)
             part = rows = rows[changed]
             if len(rows) == 0:
                 break
-            system = SeriesSystem.formed(whole.design, self.grid.weights[rows], keep[changed])
-            some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
-            values[rows], residuals[rows], converged[rows] = some._solve_again(
-                system, values[rows], residuals[rows], estimate
-            )
-            use[rows], whole.Q[rows], whole.good[rows] = system.use, system.Q, system.good
-            whole.alike = None
-        return replace(
-            estimate, values=values, residuals=residuals, system=whole, converged=converged
-        )
-
-    def _solve_again(
-        self, system: SeriesSystem, values: Array, left: Array, known: State
-    ) -> tuple[Array, Array, Mask]:
-        """Solve epochs whose points in use have changed, in place.
-
-        values (E, 16); left (E, T, 2) px: residuals. Returns both and a mask (E,) of convergence.
-        """
-        for _ in range(_ITERATIONS):
-            step = system.step(left, replace(known, values=values))
-            values[:, system.design.own] += step.d_own
-            if step.size < (_NEAR if self.held is None else _SMALLER):
-                system.move(left, step)
-                break
-            left = self._residuals(State(values, known.offsets, known.pose), left)
-        return values, left, step.sizes < _NEAR
+            grid = ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
+            some = replace(self, grid=grid, held=system.design.at)
+            state = State(whole.values[rows], estimate.offsets, estimate.pose)
+            last = some._iterate(state, keep[changed], self.unit)
+            for name in ("values", "residuals", "converged"):
+                getattr(whole, name)[rows] = getattr(last, name)
+            for name in ("use", "Q", "good"):
+                getattr(system, name)[rows] = getattr(last.system, name)
+            system.alike = None
+        return whole
 
     def _linearised(self, values: Array, use: Mask, variance: float) -> SeriesSystem:
         at = self.held

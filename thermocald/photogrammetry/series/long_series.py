@@ -215,10 +215,9 @@ class KnownSeries:
     estimator: for further epochs, with the common unknowns held; design: the unknowns of the
     series; offsets (T, 2) px, pose (6,): the common ones; cofactors (q + 2T, q + 2T): theirs; mean
     (p, q + 2T): mean G by which own parameters depend on the common ones; used: number of
-    observations that these use up; excess (16,): variance of the epochs' excess scatter; ratios
-    (T, 3): of estimated to stated variances; middle (16,): start values of epochs; pairs:
-    correlated errors of targets; movement: of the mount; slow (16, 16): covariance of a straight
-    line over the series from slow errors.
+    observations that these use up; excess (16,): variance of the epochs' excess scatter; middle
+    (16,): start values of epochs; pairs: correlated errors of targets; movement: of the mount; slow
+    (16, 16): covariance of a straight line over the series from slow errors.
     """
 
     estimator: SeriesEstimator
@@ -229,7 +228,6 @@ class KnownSeries:
     mean: Array
     used: float
     excess: Array
-    ratios: Array | float
     middle: Array
     pairs: CorrelatedPairs | None
     movement: Movement
@@ -256,8 +254,7 @@ class KnownSeries:
         )
         known = cls(
             held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
-            system.common_share, sample.excess_sd**2, series.ratios, middle,
-            sample.pairs, sample.movement, slow,
+            system.common_share, sample.excess_sd**2, middle, sample.pairs, sample.movement, slow,
         )  # fmt: skip
         sums = CommonSums(design)
         right = np.zeros((len(sample.values), len(design.own)))
@@ -274,7 +271,7 @@ class KnownSeries:
         level and the series' own figures.
         """
         s, pooled = self.estimator.s, self.estimator.unit
-        weighted = ObservationGrid(grid.points, grid.weights / self.ratios)
+        weighted = ObservationGrid(grid.points, grid.weights / self.estimator.ratios)
         values = np.tile(self.middle, (len(grid), 1))
         if len(self.design.common):
             values[:, EOP] = self.pose

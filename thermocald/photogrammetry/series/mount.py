@@ -286,12 +286,10 @@ class Movement:
         white: Array = self.white * float(weights @ weights)
         if not self.slow.any():
             return white
-        # w'Rw for R = φ^|i-j| in one pass
-        phi, carried, total = float(np.exp(-1.0 / self.memory)), 0.0, 0.0
-        for first in range(0, len(weights), 1 << 16):
-            for w in weights[first : first + (1 << 16)].tolist():
-                total += w * (w + 2.0 * carried)
-                carried = phi * (carried + w)
+        # w'Rw for R = φ^|i-j|, by the autocorrelation of w
+        n, phi = len(weights), float(np.exp(-1.0 / self.memory))
+        products = np.fft.irfft(np.abs(np.fft.rfft(weights, 2 * n)) ** 2, 2 * n)[:n]
+        total = 2.0 * float(phi ** np.arange(n) @ products) - float(products[0])
         about_mean = 1.0 - mean_variance(phi, int(np.count_nonzero(weights)))
         return white + self.slow * (total / max(about_mean, 1e-6))
 

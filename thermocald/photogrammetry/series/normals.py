@@ -90,16 +90,9 @@ class ObservationGrid:
         points, weights = planes(2, *shape), planes(3, *shape)
         points[...] = np.nan
         weights[...] = 0.0
-        variance = sigmas**2
-        inverse = np.zeros((len(epochs), 3))
-        if covariances is None:
-            np.divide(1.0, variance, out=inverse[:, :2])
-        else:
-            determinant = variance[:, 0] * variance[:, 1] - covariances**2
-            inverse[:, :2] = variance[:, ::-1] / determinant[:, None]
-            inverse[:, 2] = -covariances / determinant
+        xy = np.zeros(len(epochs)) if covariances is None else covariances
         points[epochs, targets] = measured
-        weights[epochs, targets] = inverse
+        weights[epochs, targets] = inverses_of(*(sigmas**2).T, xy)
         grid = cls(points, weights)
         weights[grid.repeated] = 0.0
         return grid
@@ -150,6 +143,12 @@ class ObservationGrid:
         weights = self.weights.copy(order="K")
         weights[mask] = 0.0
         return ObservationGrid(self.points, weights)
+
+
+def inverses_of(xx: Array, yy: Array, xy: Array) -> Array:
+    """Invert covariances of image points (n,); return the weights (n, 3) xx, yy, xy."""
+    weights: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+    return weights
 
 
 def _of_planes(points: Array, weights: Array) -> ObservationGrid:

@@ -23,6 +23,7 @@ from thermocald.photogrammetry.series.normals import (
     Partials,
     chunks,
     cofactors,
+    inverses_of,
     normal_matrices,
     right_hand_sides,
     same_rows,
@@ -127,9 +128,7 @@ def offset_weights(field: TestField, at: Partials) -> Array:
     tiny = 1e-12  # px²: a target without sigma has no offset
     xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
     yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
-    xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
-    weights: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
-    return weights
+    return inverses_of(xx, yy, (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1))
 
 
 _FARTHEST_PX = 200.0  # largest movement of an image point by one step

@@ -55,6 +55,7 @@ _SEPARATE_NOTHING = (
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _LEAST_DECREASE = 0.5  # of what the step predicts
+_DAMPING = 1e-6  # of the unit diagonal, so that a weak free network does not run away
 _OF_CAMERA = ("c", "x0", "y0", "C1", "C2")
 # of `_OF_CAMERA`, of the squares of a bent field, and of squares in the image
 _KINDS = (0, 1, 1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4)
@@ -204,14 +205,12 @@ class BundleAdjustment:
     def solve(self, bundle: Bundle, *, robust: bool = False, iterations: int = 30) -> Bundle:
         """Adjust a bundle to the image points.
 
-        A free network takes damped steps (Levenberg-Marquardt); one with known targets whole or
-        shorter ones (Gauss-Newton), which follow the narrow valley of a weak geometry. robust:
-        renew weights in each iteration (Cauchy, scaled by the median residual); then, as in a free
-        network, the last iteration is good enough. Raises GeometryError if it does not converge.
+        Steps are whole or shorter ones (Gauss-Newton, hardly damped in a free network), which
+        follow the narrow valley of a weak geometry. robust: renew weights in each iteration
+        (Cauchy, scaled by the median residual); then, as in a free network, the last iteration is
+        good enough. Raises GeometryError if it does not converge.
         """
-        gauge = self.known is None
         w = np.ones(len(self.rays))
-        damping = 1e-6 if gauge else 0.0
         v = self.residuals(bundle)
         for _ in range(iterations):
             if robust:  # weights fall from 1 with the square of the residual
@@ -219,39 +218,28 @@ class BundleAdjustment:
                 w = 1.0 / (1.0 + size2 / (9.0 * median_variance(size2)))
             cost = self.cost(bundle, v, w)
             normals = self._normal_equations(bundle, w)
-            fraction = 1.0
-            for _attempt in range(12):
-                step = self._step(bundle, normals, damping)
-                if step is not None:
-                    trial = bundle.apply(fraction * step[0], fraction * step[1], self.free)
-                    if trial.interior[0] > 0:
-                        v_new = self.residuals(trial)
-                        new = self.cost(trial, v_new, w)
-                        # a whole step overshoots where residuals are large
-                        least = 0.0 if gauge else _LEAST_DECREASE * fraction * step[2]
-                        if new + least <= cost * (1 + 1e-12):
-                            break
-                elif not gauge:
-                    raise GeometryError(_SEPARATE_NOTHING)
-                if gauge:
-                    damping = max(damping * 10, 1e-9)
-                else:
-                    fraction /= 2
+            cameras, targets, size = self._step(bundle, normals)
+            for fraction in 0.5 ** np.arange(12):
+                trial = bundle.apply(fraction * cameras, fraction * targets, self.free)
+                if trial.interior[0] > 0:
+                    v_new = self.residuals(trial)
+                    new = self.cost(trial, v_new, w)
+                    # a whole step overshoots where residuals are large
+                    if new + _LEAST_DECREASE * fraction * size <= cost * (1 + 1e-12):
+                        break
             else:
                 # no step lowers the sum: a minimum to within rounding, or no convergence
-                if step is not None and step[2] < 1e-4:
+                if size < 1e-4:
                     return bundle
                 raise GeometryError(
                     "the bundle adjustment does not converge: take more photographs, from more "
                     "sides, or give approximate camera data"
                 )
             bundle, v = trial, v_new
-            if gauge:
-                damping = max(damping / 10, 1e-12)
-            if step[2] < 1e-8 or (robust and cost - new < 1e-6 * cost):
+            if size < 1e-8 or (robust and cost - new < 1e-6 * cost):
                 break
         else:
-            if not gauge and not robust:
+            if self.known is not None and not robust:
                 size = np.sqrt(np.mean(v * v))
                 raise GeometryError(
                     f"the adjustment did not converge in {iterations} iterations; residuals are "
@@ -465,23 +453,22 @@ class BundleAdjustment:
             d += self.known.weights * (self.known.places - bundle.points)
         return A, B, D, a, d
 
-    def _step(
-        self, bundle: Bundle, normals: _Normals, damping: float
-    ) -> tuple[Array, Array, float] | None:
-        """Return the damped step of cameras (u,) and targets (m, 3), and its size stepᵀ N step;
-        None if the matrix is not positive definite.
+    def _step(self, bundle: Bundle, normals: _Normals) -> tuple[Array, Array, float]:
+        """Return the step of cameras (u,) and targets (m, 3), and its size stepᵀ N step.
+
+        Raises GeometryError if the matrix is not positive definite.
         """
-        S, s, inverses = _reduce(normals, damping)
+        S, s, inverses = _reduce(normals)
         if self.known is None:
             null, _ = null_space(bundle.centres, bundle.points, len(self.free))
             scaled, scales, _ = _regularise(S, null)
+            scaled += _DAMPING * np.eye(len(scaled))
         else:
             scaled, scales = unit_diagonal(S)
-        scaled = scaled + damping * np.eye(len(scaled))
         try:
             np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
-            return None
+            raise GeometryError(_SEPARATE_NOTHING) from None
         dc = scales * np.linalg.solve(scaled, scales * s)
         _, B, _, a, d = normals
         dp = np.einsum("mij,mj->mi", inverses, d - (dc @ B).reshape(-1, 3))
@@ -489,13 +476,11 @@ class BundleAdjustment:
         return dc, dp, float(dc @ a + dp.ravel() @ d.ravel())
 
 
-def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Array]:
+def _reduce(normals: _Normals) -> tuple[Array, Array, Array]:
     """Return the matrix and right-hand side with targets eliminated, and the inverse blocks."""
     A, B, D, a, d = normals
-    trace = np.trace(D, axis1=1, axis2=2)[:, None, None]
-    # a target without any weight is held
-    regular = D + (damping * trace + np.where(trace == 0, 1.0, 0.0)) * np.eye(3)
-    inverses = np.linalg.inv(regular)
+    held = np.trace(D, axis1=1, axis2=2) == 0  # a target without any weight
+    inverses = np.linalg.inv(D + held[:, None, None] * np.eye(3))
     B3 = B.reshape(len(B), len(inverses), 3)
     BD = np.einsum("umi,mij->umj", B3, inverses).reshape(B.shape)
     return A - BD @ B.T, a - BD @ d.ravel(), inverses

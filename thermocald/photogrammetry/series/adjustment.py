@@ -30,7 +30,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
     free_columns,
 )
-from thermocald.photogrammetry.epoch.geometry import weaknesses
+from thermocald.photogrammetry.epoch.adjustment import weaknesses
 from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
@@ -65,8 +65,7 @@ from thermocald.photogrammetry.series.result import (
     SeriesSettings,
     enough_targets,
 )
-from thermocald.photogrammetry.series.snooping import point_tests
-from thermocald.photogrammetry.series.system import State
+from thermocald.photogrammetry.series.system import State, point_tests
 from thermocald.photogrammetry.series.target_noise import (
     FEW_EPOCHS,
     excess_scatter,

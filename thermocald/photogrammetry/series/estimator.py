@@ -23,17 +23,15 @@ from thermocald.photogrammetry.series.normals import (
     planes,
     sums_of_squares,
 )
-from thermocald.photogrammetry.series.snooping import (
-    point_tests,
-    snoop_series,
-    typical_variance,
-)
 from thermocald.photogrammetry.series.system import (
     Design,
     SeriesSystem,
     State,
     Step,
     offset_weights,
+    point_tests,
+    snoop_series,
+    typical_variance,
 )
 from thermocald.photogrammetry.series.target_noise import (
     FEW_EPOCHS,
@@ -365,8 +363,7 @@ class SeriesEstimator:
             part = rows = rows[changed]
             if len(rows) == 0:
                 break
-            grid = ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
-            some = replace(self, grid=grid, held=system.design.at)
+            some = replace(self, grid=self.grid[rows], held=system.design.at)
             state = State(whole.values[rows], estimate.offsets, estimate.pose)
             last = some._iterate(state, keep[changed], self.unit)
             for name in ("values", "residuals", "converged"):

@@ -46,7 +46,6 @@ from thermocald.photogrammetry.series.normals import (
     among_all,
     gathered,
     normal_matrices,
-    planes,
     spread_windows,
 )
 from thermocald.photogrammetry.series.result import (
@@ -60,7 +59,7 @@ from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -90,12 +89,9 @@ class CommonSums:
     """
 
     design: Design
-    gradient: Array = field(init=False)
+    gradient: Array | float = 0.0
     ends: tuple[int, int] | None = None
     patterns: dict[bytes, Array] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.gradient = np.zeros(self.design.width)
 
     def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
         """Add a block that begins at epoch `first`.
@@ -110,12 +106,10 @@ class CommonSums:
         self.ends = int(t[0]), int(t[-1])
         w = system.used(good)
         self.gradient += self.design.gradient(w, left[good])
-        seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
-        for k, bits in enumerate(seen):
-            at = np.flatnonzero(of.ravel() == k)
+        for bits, at in _patterns(system.use[good]):
             counts = [len(at), t[at].sum(), t[at] @ t[at]]
             pull, weights = right[good[at]].sum(axis=0), w[at].sum(axis=0)
-            self._count(bits.tobytes(), np.concatenate([counts, pull, weights.ravel()]))
+            self._count(bits, np.concatenate([counts, pull, weights.ravel()]))
 
     def merge(self, later: CommonSums) -> None:
         """Add the sums over later blocks."""
@@ -179,25 +173,23 @@ class CommonSums:
         return later, -mean @ change, line, rest
 
 
+def _patterns(use: Mask) -> list[tuple[bytes, Index]]:
+    """Return the patterns of targets in use (E, T), each with the rows of its epochs."""
+    seen, of = np.unique(np.packbits(use, axis=1), axis=0, return_inverse=True)
+    return [(bits.tobytes(), np.flatnonzero(of.ravel() == k)) for k, bits in enumerate(seen)]
+
+
 def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
     """Group the epochs of a block by the targets that they see, with rare patterns in one group.
 
     design: of the series; system: of the block, with the common unknowns held.
     """
     good = np.flatnonzero(system.good)
-    if not len(good):
-        return []
-    seen = np.packbits(system.use[good], axis=1)
-    _, of, count = np.unique(seen, axis=0, return_inverse=True, return_counts=True)
-    of = of.ravel()
-    often = np.argsort(-count, kind="stable")[:_MOST]
-    often = often[count[often] >= max(_FEW * len(good), 2)]
-    groups = [good[of == label] for label in often]
-    rest = good[~np.isin(of, often)]
-    if len(rest):
-        groups.append(rest)
+    groups = sorted((good[at] for _, at in _patterns(system.use[good])), key=len, reverse=True)
+    often = [rows for rows in groups[:_MOST] if len(rows) >= max(_FEW * len(good), 2)]
+    rare = groups[len(often) :]
     out = []
-    for rows in groups:
+    for rows in [*often, np.sort(np.concatenate(rare))] if rare else often:
         weights = system.used(rows).mean(axis=0, keepdims=True)
         one = SeriesSystem.formed(design, weights, weights[..., 0] > 0)
         if one.good[0]:
@@ -247,8 +239,7 @@ class KnownSeries:
         )
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
-        T = series.grid.points.shape[1]
-        none = ObservationGrid(planes(2, 0, T), planes(3, 0, T))
+        none = series.grid[:0]
         held = replace(
             series, grid=none, stated=none.weights, held=at, unit=unit, windows=(), typical=unit
         )
@@ -262,7 +253,7 @@ class KnownSeries:
         return replace(known, mean=sums.solved(known)[0].mean)
 
     def adjusted(
-        self, grid: ObservationGrid, epochs: int, line: Array | None = None
+        self, grid: ObservationGrid, epochs: int, line: Array
     ) -> tuple[Estimate, SeriesAdjustment]:
         """Adjust epochs with the common unknowns held.
 
@@ -283,10 +274,10 @@ class KnownSeries:
         unit, sigma0, redundancy = held.noise(estimate, self.used / epochs)
         covariance = self._covariance(system, epoch_variance(unit, redundancy, pooled))
         still = np.full(len(grid), np.nan)
-        if line is not None and self.slow.any():
+        if self.slow.any():
             # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
             covariance += (line * system.good)[:, None, None] ** 2 * self.slow
-        if line is not None and s.exterior == "series":
+        if s.exterior == "series":
             N = normal_matrices(system.used(), system.design.at.A)
             score = stillness(replace(system, N=N), estimate.residuals)
             still = score / np.where(redundancy > 0, unit, 1.0)
@@ -328,8 +319,7 @@ class LongAdjustment:
     """An adjusted long series; parameters in the order of `PARAMETER_NAMES`.
 
     rows: the epochs; level_sd, trend_sd (16,): as in `SeriesAdjustment`; sample: the adjustment of
-    the epochs `sampled` (P,) together, with covariances, residuals and offsets; passes: number of
-    times that the observations were read.
+    the epochs `sampled` (P,) together, with covariances, residuals and offsets.
     """
 
     rows: EpochRows
@@ -337,7 +327,6 @@ class LongAdjustment:
     trend_sd: Array
     sample: SeriesAdjustment
     sampled: Index
-    passes: int
 
 
 _TOGETHER_POINTS = 1_300_000  # a day of 150 targets: 200 MB
@@ -392,7 +381,7 @@ def adjust_long_series(
         known = later
     level, trend = _carry(known, later, own, line, rows)
     sampled = np.concatenate([np.arange(w.start, w.stop) for w in windows])
-    return LongAdjustment(rows, level, trend, sample, sampled, passes)
+    return LongAdjustment(rows, level, trend, sample, sampled)
 
 
 def _adjust_block(

@@ -92,13 +92,16 @@ class ObservationGrid:
         weights[...] = 0.0
         xy = np.zeros(len(epochs)) if covariances is None else covariances
         points[epochs, targets] = measured
-        weights[epochs, targets] = inverses_of(*(sigmas**2).T, xy)
+        weights[epochs, targets] = inverses_of(sigmas[:, 0] ** 2, sigmas[:, 1] ** 2, xy)
         grid = cls(points, weights)
         weights[grid.repeated] = 0.0
         return grid
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __getitem__(self, rows: slice | Index) -> ObservationGrid:
+        return ObservationGrid(self.points[rows], self.weights[rows])
 
     def blocks(
         self, windows: Sequence[slice] | None = None, size: int = 1000
@@ -108,7 +111,7 @@ class ObservationGrid:
         windows: only the epochs of these slices, ascending.
         """
         for rows in runs(len(self), size, windows):
-            yield rows.start, ObservationGrid(self.points[rows], self.weights[rows])
+            yield rows.start, self[rows]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle with one component after the other, so that the copy has the same order."""
@@ -392,38 +395,32 @@ def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> Observation
     """Read the epochs of some windows into one grid."""
     if isinstance(source, ObservationGrid) and list(windows) == [slice(0, len(source))]:
         return source
-    whole = ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
-    done = 0
-    for _, grid in source.blocks(windows):
-        if not done:
-            size = sum(w.stop - w.start for w in windows), grid.points.shape[1]
-            whole = ObservationGrid(planes(2, *size), planes(3, *size))
-        rows = slice(done, done + len(grid))
-        whole.points[rows], whole.weights[rows] = grid.points, grid.weights
-        done += len(grid)
-    return whole
+    return joined([grid for _, grid in source.blocks(windows)])
+
+
+def joined(grids: Sequence[ObservationGrid]) -> ObservationGrid:
+    """Return the grid of the epochs of several grids, one after the other."""
+    if not grids:
+        return ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
+    points, weights = ([getattr(g, name) for g in grids] for name in ("points", "weights"))
+    return ObservationGrid(np.concatenate(points), np.concatenate(weights))
 
 
 def recut(
     blocks: Iterable[tuple[int, ObservationGrid]], length: int
 ) -> Iterator[tuple[int, ObservationGrid]]:
     """Yield the epochs of blocks `length` at a time, so that blocks do not depend on the reader."""
-    points: list[Array] = []
-    weights: list[Array] = []
-    begin = held = 0
+    begin, parts = 0, list[ObservationGrid]()
     for first, grid in blocks:
-        if not held:
+        if not parts:
             begin = first
-        points.append(grid.points)
-        weights.append(grid.weights)
-        held += len(grid)
-        if held < length:
+        parts.append(grid)
+        if sum(map(len, parts)) < length:
             continue
-        p, w = np.concatenate(points), np.concatenate(weights)
-        whole = held // length * length
-        for k in range(0, whole, length):
-            yield begin + k, ObservationGrid(p[k : k + length], w[k : k + length])
-        begin, held = begin + whole, held - whole
-        points, weights = [p[whole:]], [w[whole:]]
-    if held:
-        yield begin, ObservationGrid(np.concatenate(points), np.concatenate(weights))
+        whole = joined(parts)
+        end = len(whole) // length * length
+        for rows in runs(end, length):
+            yield begin + rows.start, whole[rows]
+        begin, parts = begin + end, [whole[end:]] if end < len(whole) else []
+    if parts:
+        yield begin, joined(parts)

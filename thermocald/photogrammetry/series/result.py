@@ -107,10 +107,8 @@ class EpochRows:
     def empty(cls, epochs: int) -> EpochRows:
         """Return rows without content, for `put`."""
         values, sd = np.empty((2, epochs, 16))
-        sigma0, redundancy, stillness = np.empty((3, epochs))
-        observed, rejected = np.empty((2, epochs), dtype=np.int64)
-        words, sentences = [""] * epochs, [""] * epochs
-        return cls(values, sd, sigma0, redundancy, stillness, observed, rejected, words, sentences)
+        real, counts = np.empty((3, epochs)), np.empty((2, epochs), dtype=np.int64)
+        return cls(values, sd, *real, *counts, [""] * epochs, [""] * epochs)
 
     def put(self, first: int, part: EpochRows) -> None:
         """Store consecutive epochs, from epoch `first` on."""

@@ -9,19 +9,13 @@ import pytest
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
-from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.field.testfield import Distance, TestField
 from thermocald.photogrammetry.survey import survey
 from thermocald.physics.scene import Scene
 
 # The binned mode of a Raspberry Pi camera v2.1.
-CAMERA = CameraModel(
-    Sensor(1640, 1232, 0.00224),
-    InteriorOrientation(
-        c=3.05, x0=0.021, y0=-0.013, A1=-2.1e-3, A2=4.0e-4, A3=-2.0e-5, B1=4e-5, B2=-3e-5,
-        C1=3e-4, C2=-2e-4,
-    ),
-)  # fmt: skip
+CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), cases.INTERIOR)
 
 
 def bent(field, size, sag=5.0):

@@ -418,13 +418,10 @@ def _board(s: FieldSeries, rows: Index) -> FieldMovement | None:
 def _rigid(s: FieldSeries, rows: Index) -> Array:
     """Return ∂ image points / ∂ shifts, rotations (2k, 6), px/mm; rotations at the board's size."""
     X = s.points[rows] - s.points[rows].mean(axis=0)
-    size = max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
-    x, y, z = X.T / size
-    o = np.zeros_like(x)
-    turns = np.stack([np.stack([o, -z, y]), np.stack([z, o, -x]), np.stack([-y, x, o])], axis=-1)
-    motion = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(X), 3, 3)), np.swapaxes(turns, 0, 1)], axis=2
-    )
+    X /= max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
+    shifts = np.broadcast_to(np.eye(3), (len(X), 3, 3))
+    turns = np.swapaxes(np.cross(np.eye(3), X[:, None]), 1, 2)
+    motion = np.concatenate([shifts, turns], axis=2)
     out: Array = (s.B[rows] @ motion).reshape(-1, 6)
     return out
 

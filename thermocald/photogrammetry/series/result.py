@@ -107,8 +107,9 @@ class EpochRows:
     def empty(cls, epochs: int) -> EpochRows:
         """Return rows without content, for `put`."""
         values, sd = np.empty((2, epochs, 16))
-        real, counts = np.empty((3, epochs)), np.empty((2, epochs), dtype=np.int64)
-        return cls(values, sd, *real, *counts, [""] * epochs, [""] * epochs)
+        a, b, c = np.empty((3, epochs))
+        m, n = np.empty((2, epochs), dtype=np.int64)
+        return cls(values, sd, a, b, c, m, n, [""] * epochs, [""] * epochs)
 
     def put(self, first: int, part: EpochRows) -> None:
         """Store consecutive epochs, from epoch `first` on."""

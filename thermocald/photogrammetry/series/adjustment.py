@@ -181,7 +181,7 @@ def adjusted(
     use = grid.observed & enough_targets(grid, s)[:, None]
     first = State(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
     series = SeriesEstimator(
-        sensor, testfield, grid, grid.weights, s, windows=windows, field_variance=field_variance
+        sensor, testfield, grid, s, windows=windows, field_variance=field_variance
     )
     if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
         series = choose_exterior(series, "auto", len(use))
@@ -305,11 +305,7 @@ def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, fl
     half = 0.5 * np.array([sensor.width - 1, sensor.height - 1])
     radius = np.linalg.norm(system.design.at.predicted - half, axis=1)
     tests = point_tests(system, estimate.residuals)
-    if series.stated is not system.weights:
-        weights = system.weights[..., 0]
-        tests *= np.divide(
-            series.stated[..., 0], weights, out=np.zeros_like(weights), where=weights > 0
-        )
+    tests *= np.broadcast_to(series.ratios, (len(radius), 3))[:, 0]
     # with rejected points, as the noise would be too small without its largest values
     offered = series.grid.observed & system.good[:, None]
     return noise_by_radius(tests, offered, radius)

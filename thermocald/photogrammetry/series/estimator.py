@@ -92,21 +92,19 @@ class Estimate(State):
 class SeriesEstimator:
     """A series with the settings of its adjustment.
 
-    grid: the observations with the weights in use; stated (E, T, 3): their stated weights; bound
-    (6, 6): inverse covariance of the mount's movements; movement: its variance components; choice:
-    why the exterior orientation is estimated as it is; held: the linearisation of held common
-    unknowns, None if they are estimated; unit: initial variance of unit weight for the priors;
-    windows: runs of consecutive epochs, if the series is a sample of a longer one; typical:
-    variance of unit weight for epochs too poor to estimate theirs, None for that of these epochs;
-    field_variance: factor of the field's stated covariance; freedom (T,), ratios (T, 3): degrees of
-    freedom of each target's estimated noise and its variances over the stated ones, None and 1 if
-    the noise is as stated.
+    grid: the observations with the weights in use; bound (6, 6): inverse covariance of the mount's
+    movements; movement: its variance components; choice: why the exterior orientation is estimated
+    as it is; held: the linearisation of held common unknowns, None if they are estimated; unit:
+    initial variance of unit weight for the priors, and with held unknowns that of epochs too poor
+    to estimate theirs; windows: runs of consecutive epochs, if the series is a sample of a longer
+    one; field_variance: factor of the field's stated covariance; freedom (T,), ratios (T, 3):
+    degrees of freedom of each target's estimated noise and its variances over the stated ones, None
+    and 1 if the noise is as stated.
     """
 
     sensor: Sensor
     testfield: TestField
     grid: ObservationGrid
-    stated: Array
     s: SeriesSettings
     bound: Array | None = None
     movement: Movement = STILL
@@ -114,7 +112,6 @@ class SeriesEstimator:
     held: Partials | None = None
     unit: float = 1.0
     windows: tuple[slice, ...] = ()
-    typical: float | None = None
     field_variance: float = 1.0
     freedom: Array | None = None
     ratios: Array | float = 1.0
@@ -140,7 +137,7 @@ class SeriesEstimator:
             estimate = series.solve(start, use, self.unit)
         if s.snooping_alpha > 0:
             estimate = series.snoop(estimate, offered)
-            as_stated = self.grid.weights is self.stated
+            as_stated = self.freedom is None and self.held is None
             if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and as_stated:
                 known = series._with_target_noise(estimate)
                 again = known.solve(estimate, estimate.system.use, 1.0)
@@ -346,7 +343,7 @@ class SeriesEstimator:
         whole = replace(estimate, system=system, converged=estimate.converged.copy())
         rows, history = np.arange(len(system.use)), np.zeros(system.use.shape, dtype=np.int8)
         part: slice | Index = slice(None)  # all epochs, without a copy
-        typical, last = self.typical, estimate
+        typical, last = None if self.held is None else self.unit, estimate
         for _ in range(_ROUNDS):
             use = last.system.use
             tests = point_tests(last.system, last.residuals)
@@ -443,7 +440,9 @@ class SeriesEstimator:
         vPv, redundancy = self.sums(estimate)
         redundancy = redundancy - used
         positive = redundancy > 0
-        stated = sums_of_squares(self.stated, estimate.residuals, estimate.system.use)
+        stated = sums_of_squares(
+            self.grid.weights * self.ratios, estimate.residuals, estimate.system.use
+        )
         return (
             vPv / np.where(positive, redundancy, 1.0),
             np.sqrt(stated / np.where(positive, redundancy, np.nan)),

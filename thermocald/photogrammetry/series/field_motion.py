@@ -303,12 +303,10 @@ def _wanderer(s: FieldSeries, free: FieldSeries, row: int) -> FieldMovement:
     w = s.w[:, row]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     sd = sigma * float(np.sqrt(np.mean(np.sum(inverse**2, axis=0)))) / np.sqrt(len(s.times))
-    slow = np.einsum(
-        "je,ek->jk", cosines(s.times), np.nan_to_num(free.residuals[:, row]) * np.sqrt(w)
-    )
+    power = _slow_power(replace(free, weights=s.weights))[row]
     return FieldMovement(
         "wander", np.array([row]), (s.names[row],), 0, 0.0, 0.0, np.zeros(len(s.times)),
-        np.zeros((1, 2)), size, float(sd), _size_px(smooth), float(np.sum(slow**2)),
+        np.zeros((1, 2)), size, float(sd), _size_px(smooth), float(power),
     )  # fmt: skip
 
 

@@ -239,10 +239,7 @@ class KnownSeries:
         )
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
-        none = series.grid[:0]
-        held = replace(
-            series, grid=none, stated=none.weights, held=at, unit=unit, windows=(), typical=unit
-        )
+        held = replace(series, grid=series.grid[:0], held=at, unit=unit, windows=())
         known = cls(
             held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
             system.common_share, sample.excess_sd**2, middle, sample.pairs, sample.movement, slow,
@@ -266,7 +263,7 @@ class KnownSeries:
         values = np.tile(self.middle, (len(grid), 1))
         if len(self.design.common):
             values[:, EOP] = self.pose
-        held, estimate = replace(self.estimator, grid=weighted, stated=grid.weights).adjusted(
+        held, estimate = replace(self.estimator, grid=weighted).adjusted(
             State(values, self.offsets, self.pose),
             grid.observed & enough_targets(grid, s)[:, None],
         )

@@ -210,19 +210,17 @@ class SeriesAdjustment:
         if len(targets) == n:
             return self
 
-        def wide(array: NDArray[Any], axis: int, fill: Any) -> NDArray[Any]:
-            shape = list(array.shape)
-            shape[axis] = n
-            out = np.full(shape, fill, dtype=array.dtype)
-            out[(slice(None),) * axis + (targets,)] = array
+        def wide(array: NDArray[Any], fill: Any) -> NDArray[Any]:
+            out = np.full((len(array), n, *array.shape[2:]), fill, dtype=array.dtype)
+            out[:, targets] = array
             return out
 
         return replace(
             self,
-            observed=wide(self.observed, 1, False),
-            rejected=wide(self.rejected, 1, False),
-            residuals=wide(self.residuals, 1, np.nan),
-            offsets=wide(self.offsets, 0, np.nan),
+            observed=wide(self.observed, False),
+            rejected=wide(self.rejected, False),
+            residuals=wide(self.residuals, np.nan),
+            offsets=wide(self.offsets[None], np.nan)[0],
         )
 
 

@@ -30,6 +30,7 @@ from thermocald.photogrammetry.series.normals import (
     products,
     right_hand_sides,
     same_rows,
+    sums_of_targets,
 )
 
 if TYPE_CHECKING:
@@ -93,11 +94,8 @@ class Design:
         weights (E, T, 3), residuals (E, T, 2) px.
         """
         b = right_hand_sides(weights, residuals, self.at.A[..., self.common])
-        t = len(self.offset_prior)
-        v, w = np.nan_to_num(residuals[:, :t]), weights[:, :t]
-        x = (w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0)
-        y = (w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0)
-        return np.concatenate([b.sum(axis=0), x, y])
+        of_targets = sums_of_targets(weights, residuals, weights[..., 0] > 0)
+        return np.concatenate([b.sum(axis=0), of_targets[: len(self.offset_prior)].T.ravel()])
 
     def prior_matrix(self) -> Array:
         """Return the weights (width, width) of the common unknowns' priors."""

@@ -201,9 +201,9 @@ def place_on(
         tilted = (moved[:, :, None] * lever[:, None, :]).reshape(-1, 2)
         total += plane.sd_tilt**2 * tilted @ tilted.T
     noise = np.broadcast_to(np.asarray(sigmas, dtype=float), uv.shape)
-    for i, block in enumerate(inverse[:, :, :2] * noise[:, None, :]):
-        rows = slice(3 * i, 3 * i + 3)
-        total[rows, rows] += block @ block.T
+    of_noise = inverse[:, :, :2] * noise[:, None, :]
+    each = np.einsum("iaib->iab", total.reshape(len(X), 3, len(X), 3))  # a view
+    each += of_noise @ np.swapaxes(of_noise, 1, 2)
     if own is not None and member is not None:
         for k, Q in enumerate(own):
             at = np.flatnonzero(np.repeat(member == k, 3))

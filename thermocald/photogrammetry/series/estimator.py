@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2, median_known
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -198,10 +198,8 @@ class SeriesEstimator:
         """Select the points (E, T) that are not far off the image of a camera, values (16,)."""
         predicted = project(self.sensor, values[IOP], values[EOP], self.testfield.points)
         size = np.linalg.norm(self.grid.points - predicted, axis=2)
-        shown = use.any(axis=1)
-        usual = np.ones(len(use))
-        usual[shown] = np.nanmedian(np.where(use[shown], size[shown], np.nan), axis=1)
-        near: Mask = size < _FAR * np.maximum(usual, 1.0)[:, None]
+        usual = median_known(np.where(use, size, np.nan).T)
+        near: Mask = size < _FAR * np.fmax(usual, 1.0)[:, None]
         return near
 
     @property

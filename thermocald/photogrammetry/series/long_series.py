@@ -37,7 +37,7 @@ from thermocald.photogrammetry.series.adjustment import (
 from thermocald.photogrammetry.series.covariances import (
     correlated_error_cofactors,
     line_weights,
-    stillness,
+    scaled_covariances,
     with_excess,
 )
 from thermocald.photogrammetry.series.normals import (
@@ -45,7 +45,6 @@ from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     among_all,
     gathered,
-    normal_matrices,
     spread_windows,
 )
 from thermocald.photogrammetry.series.result import (
@@ -270,18 +269,11 @@ class KnownSeries:
         system = estimate.system
         unit, sigma0, redundancy = held.noise(estimate, self.used / epochs)
         covariance = self._covariance(system, epoch_variance(unit, redundancy, pooled))
-        still = np.full(len(grid), np.nan)
         if self.slow.any():
             # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
             covariance += (line * system.good)[:, None, None] ** 2 * self.slow
-        if s.exterior == "series":
-            N = normal_matrices(system.used(), system.design.at.A)
-            score = stillness(replace(system, N=N), estimate.residuals)
-            still = score / np.where(redundancy > 0, unit, 1.0)
-        relative_unit = unit / pooled
-        return estimate, judge_epochs(
-            held, estimate, covariance, relative_unit, sigma0, redundancy, still
-        )
+        judged = judge_epochs(held, estimate, covariance, unit, pooled, sigma0, redundancy)
+        return estimate, judged
 
     def _covariance(self, system: SeriesSystem, unit: Array) -> Array:
         """Return the covariances (E, 16, 16) of epochs relative to the series.
@@ -295,17 +287,10 @@ class KnownSeries:
             away = G - self.mean
             mine[rows] += away @ self.cofactors @ away.T
             if self.pairs:
-                mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0][
-                    np.ix_(own, own)
-                ]
+                mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0]
             if swayed.any():
                 added[rows] = G[:, :6] @ swayed @ G[:, :6].T
-        # The priors' part is scaled by the series' variance, not by the epoch's.
-        bound = system.prior_cofactors if system.design.own_prior.any() else 0.0
-        mine -= bound
-        mine *= unit[:, None, None]
-        mine += pooled * bound
-        mine += added
+        mine = scaled_covariances(mine, system, unit, pooled) + added
         mine = with_excess(mine, self.excess[own])
         mine[~system.good] = 0.0
         return among_all(mine, own)

@@ -26,7 +26,7 @@ from thermocald.photogrammetry.linalg import median_known, stacked_inverses
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -228,25 +228,6 @@ def chunks(epochs: int, targets: int) -> Iterator[slice]:
     Temporary arrays of a whole long series would also cost a page fault for every page.
     """
     return runs(epochs, max(_CHUNK_POINTS // max(targets, 1), 1))
-
-
-def same_rows(*arrays: NDArray[Any]) -> tuple[Index, Index]:
-    """Find equal rows of arrays (E, ...); return representatives (M,) and the one of each row (E,).
-
-    Epochs that see the same targets with the same weights have the same normal matrix.
-    """
-    E = len(arrays[0])
-    rng = np.random.default_rng(0)
-    mark = np.sum([array @ rng.random(array.shape[1]) for array in arrays], axis=0)
-    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
-    each = np.arange(E)
-    if 2 * len(first) > E:
-        return each, each
-    for part in chunks(E, max(array.shape[1] for array in arrays)):
-        like = first if len(first) == 1 else first[of[part]]
-        if not all(np.all(array[part] == array[like]) for array in arrays):
-            return each, each
-    return first, of
 
 
 def right_hand_sides(weights: Array, residuals: Array, A: Array, use: Mask | None = None) -> Array:

@@ -29,7 +29,6 @@ from thermocald.photogrammetry.series.normals import (
     normal_matrices,
     products,
     right_hand_sides,
-    same_rows,
     sums_of_targets,
 )
 
@@ -162,7 +161,7 @@ class SeriesSystem:
     weights (E, T, 3): a priori; use (E, T): points in use; N (E, 16, 16): empty without common
     unknowns; Q (E, p, p): cofactors of the epochs' own parameters, the common ones held; good (E,):
     epochs that determine their parameters; Q_common (q, q), or with offsets (q + 2T, q + 2T): empty
-    before `solved`; alike: epochs with the same matrices, from `same_rows`, None if outdated;
+    before `solved`; alike: epochs with the same matrices, from the function, None if outdated;
     coupled: the result of `couplings`, if it needs little memory.
     """
 
@@ -325,8 +324,16 @@ class SeriesSystem:
 
 
 def alike(weights: Array, use: Mask) -> tuple[Index, Index]:
-    """Find epochs with the same points in use with the same weights, as `same_rows` does."""
-    return same_rows(np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
+    """Find epochs with the same points in use with the same weights, and so the same matrices.
+
+    Returns representatives (M,) and the one of each epoch (E,); each its own if few are alike.
+    """
+    rng = np.random.default_rng(0)  # sums with random factors differ if rows do
+    rows = (np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
+    mark = np.sum([row @ rng.random(row.shape[1]) for row in rows], axis=0)
+    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
+    each = np.arange(len(mark))
+    return (each, each) if 2 * len(first) > len(mark) else (first, of)
 
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:

@@ -169,15 +169,10 @@ def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, flo
     if seen.sum() < _FEWEST_RADII or not np.ptp(radius[seen]) > 0:
         return float("nan"), float("nan")
     y, x, w = logarithms[seen] / n[seen], radius[seen] ** 2, n[seen].astype(float)
-    outermost = float(x.max())
-    x = x - (w @ x) / w.sum()
-    y = y - (w @ y) / w.sum()
-    information = float(w @ (x * x))
-    slope = float(w @ (x * y)) / information
-    scatter = float(w @ (y - slope * x) ** 2) / (len(y) - 2)
-    sd = np.sqrt(max(scatter, _LOG_CHI2) / information)
-    ratio = float(np.exp(0.5 * slope * outermost))
-    return ratio, ratio * 0.5 * outermost * float(sd)
+    line, Q = np.polyfit(x, y, 1, w=np.sqrt(w), cov="unscaled")
+    scatter = float(w @ (y - np.polyval(line, x)) ** 2) / (len(y) - 2)
+    ratio = float(np.exp(0.5 * line[0] * x.max()))
+    return ratio, ratio * 0.5 * float(x.max() * np.sqrt(max(scatter, _LOG_CHI2) * Q[0, 0]))
 
 
 def slow_course(epochs: int, step: int) -> Array:

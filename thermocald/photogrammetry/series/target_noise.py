@@ -129,7 +129,8 @@ def correlated_pairs(
     v = np.where(seen, residuals.reshape(E, -1), 0.0)
     mean = v.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, v - mean, 0.0)
-    left, right, covariances = [], [], []
+    none = np.empty(0, dtype=np.int64)
+    left, right, covariances = [none], [none], [np.empty(0)]
     for label in np.flatnonzero(np.bincount(group) > 1):
         targets = np.flatnonzero(group == label)
         columns = np.stack([2 * targets, 2 * targets + 1], axis=1).ravel()
@@ -145,9 +146,6 @@ def correlated_pairs(
             left.append(columns[i])
             right.append(columns[j])
             covariances.append(covariance[i, j])
-    if not left:
-        none = np.empty(0, dtype=np.int64)
-        return CorrelatedPairs(none, none, np.empty(0))
     return CorrelatedPairs(
         np.concatenate(left),
         np.concatenate(right),

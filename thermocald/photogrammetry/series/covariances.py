@@ -71,7 +71,7 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
 
 def scaled_covariances(Q: Array, system: SeriesSystem, unit: Array, pooled: float) -> Array:
     """Scale cofactors (E, p, p) by the epochs' variances (E,), the priors' part by the series'."""
-    bound = system.prior_cofactors
+    bound = system.Q @ system.design.own_prior @ system.Q
     covariances: Array = (Q - bound) * unit[:, None, None] + pooled * bound
     return covariances
 

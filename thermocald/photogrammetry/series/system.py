@@ -287,11 +287,6 @@ class SeriesSystem:
         """Return Aᵀ P l (E, 16) of every epoch."""
         return right_hand_sides(self.weights, residuals, self.design.at.A, self.use)
 
-    @property
-    def prior_cofactors(self) -> Array:
-        """Part (E, p, p) of the own parameters' cofactors that the priors contribute, Q P Q."""
-        return self.Q @ self.design.own_prior @ self.Q
-
     def own_gradient(self, residuals: Array, state: State) -> Array:
         """Return the gradient (E, p) of the own parameters and their priors; 0 at the solution."""
         own, A = self.design.own, self.design.at.A

@@ -13,6 +13,7 @@ Source: Terzakis and Lourakis (2020), SQPnP.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -96,15 +97,20 @@ def _interiors(
         return [interior]
     if nominal_c is not None:
         return [InteriorOrientation(nominal_c * f) for f in (1.0, 0.97, 1.03, 0.93, 1.07)]
-    half_mm = sensor.width * sensor.pixel_pitch / 2
-    lengths = half_mm / np.tan(np.radians(_FIELDS_OF_VIEW_DEG) / 2)
-    coarse = [InteriorOrientation(c) for c in lengths.tolist()]
+    coarse = [InteriorOrientation(c) for c in _distances(sensor, _FIELDS_OF_VIEW_DEG)]
     scores = []
     for candidate in coarse:
         found = _robust_resection(sensor, candidate, X, uv)
         scores.append(np.inf if found is None else float(np.median(found[1])))
     c = coarse[int(np.argmin(scores))].c
     return [InteriorOrientation(c * f) for f in (1.0, 0.96, 1.04, 0.92, 1.08, 0.88, 1.12)]
+
+
+def _distances(sensor: Sensor, views_deg: tuple[float, ...]) -> list[float]:
+    """Return the principal distances, mm, of cameras with these fields of view."""
+    half_mm = sensor.width * sensor.pixel_pitch / 2
+    found: list[float] = (half_mm / np.tan(np.radians(views_deg) / 2)).tolist()
+    return found
 
 
 def _robust_resection(
@@ -225,6 +231,8 @@ def resection(
     return sorted(zip(rms, poses, strict=True), key=lambda s: s[0])
 
 
+_QUICK_VIEWS_DEG = (60.0, 40.0, 80.0, 25.0)
+_GOOD_START = 0.02  # of the image's width: the RMS of a resection without distortion
 _ITERATIONS = 12
 _LEAST_SD_PX = 0.05
 _CUT = 5.0  # times the scatter, beyond which weights fall
@@ -254,10 +262,25 @@ def orient(
 ) -> Orientation:
     """Estimate an orientation from pairs of object points (n, 3) mm and image points (n, 2) px.
 
-    Raises the GeometryError of `approximate_orientation`, after which the pairs that fit are used.
+    Codes are hardly ever misread, so a plain resection is tried first. If it does not fit, the
+    robust and slower `approximate_orientation` follows. Raises its GeometryError.
     """
-    i, e, fits = approximate_orientation(sensor, points, image_points, nominal_c, interior)
-    part = refine(sensor, i, e, points[fits], image_points[fits], interior is not None)
+    lengths = _distances(sensor, _QUICK_VIEWS_DEG) if nominal_c is None else [nominal_c]
+    candidates = [InteriorOrientation(c) for c in lengths] if interior is None else [interior]
+    best = None
+    for candidate in candidates if len(points) >= 6 else ():
+        with suppress(GeometryError, IndexError):
+            rms, pose = resection(sensor, candidate, points, image_points)[0]
+            if best is None or rms < best[0]:
+                best = (rms, candidate, pose)
+            if best[0] < _GOOD_START * sensor.width:
+                break
+    if best is not None:
+        found = refine(sensor, *best[1:], points, image_points, known=interior is not None)
+        if found.scatter < 1.5 and np.mean(np.abs(found.residuals).max(axis=1) < 8.0) > 0.8:
+            return found
+    i, e, inliers = approximate_orientation(sensor, points, image_points, nominal_c, interior)
+    part = refine(sensor, i, e, points[inliers], image_points[inliers], interior is not None)
     residuals = _residuals(sensor, part.camera.interior, part.exterior, points, image_points)
     return Orientation(part.camera, part.exterior, residuals)
 

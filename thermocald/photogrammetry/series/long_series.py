@@ -56,7 +56,7 @@ from thermocald.photogrammetry.series.result import (
 from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import (
@@ -68,8 +68,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
     from thermocald.photogrammetry.series.mount import Movement
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
-
-    Kind = tuple[Index, SeriesSystem, Array]
 
 
 _FEW = 0.02  # share of a block's epochs from which a kind gets its own matrix
@@ -178,16 +176,16 @@ def _patterns(use: Mask) -> list[tuple[bytes, Index]]:
     return [(bits.tobytes(), np.flatnonzero(of.ravel() == k)) for k, bits in enumerate(seen)]
 
 
-def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
+def _kinds_of(design: Design, system: SeriesSystem) -> Iterator[tuple[Index, SeriesSystem, Array]]:
     """Group the epochs of a block by the targets that they see, with rare patterns in one group.
 
-    design: of the series; system: of the block, with the common unknowns held.
+    design: of the series; system: of the block, with the common unknowns held. Yields each kind's
+    epochs, a system (1,) of their mean weights, and the derivatives G (p, q + 2T).
     """
     good = np.flatnonzero(system.good)
     groups = sorted((good[at] for _, at in _patterns(system.use[good])), key=len, reverse=True)
     often = [rows for rows in groups[:_MOST] if len(rows) >= max(_FEW * len(good), 2)]
     rare = groups[len(often) :]
-    out = []
     for rows in [*often, np.sort(np.concatenate(rare))] if rare else often:
         weights = system.used(rows).mean(axis=0, keepdims=True)
         one = SeriesSystem.formed(design, weights, weights[..., 0] > 0)
@@ -195,8 +193,7 @@ def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
             G = np.zeros((len(design.own), design.width))
             for _, C in one.couplings():
                 G = one.Q[0] @ C[0]
-            out.append((rows, one, G))
-    return out
+            yield rows, one, G
 
 
 @dataclass(frozen=True, eq=False)

@@ -358,7 +358,8 @@ def estimate_movement(
     M, g = back.T @ M @ back, g @ back
     unit = _unit_variance(M, g)
     M, g = M / unit, g / unit
-    alike, axes = np.linalg.eigh(whiten @ _hidden(N, own, root) @ whiten)
+    alike, axes = np.linalg.eigh(_hidden(N, own, root))
+    axes = np.linalg.qr(np.linalg.solve(whiten, axes))[0]  # none contains those after it
     drifting = alike > _FOLLOWED
     period = min(period, len(trajectory) / _PERIODS) if drifting.any() else 0.0
     missing = np.flatnonzero(np.diff(rows) > (0.5 * period or np.inf)) + 1

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from tests.blind.world import turn as rotation
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
-from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -120,20 +119,10 @@ def intersect(uv: np.ndarray, draws: np.ndarray, level: np.ndarray, normal: np.n
         dy = b * radial + draws[:, 7] * (r2 + 2 * b**2) + 2 * draws[:, 6] * a * b
         a, b = x - dx, y - dy
     inside = np.column_stack([a, b, -draws[:, 0]])
-    ray = np.stack([rotation(*d[10:13]) @ v for d, v in zip(draws, inside, strict=True)])
+    ray = Rotation.from_euler("XYZ", draws[:, 10:13]).apply(inside)
     centre = draws[:, 13:16]
     t = (level - np.sum(normal * centre, axis=1)) / np.sum(normal * ray, axis=1)
     return centre + t[:, None] * ray
-
-
-def test_a_gross_error_is_rejected():
-    rng = np.random.default_rng(4)
-    points, Q = control_points(14, rng), camera_covariance()
-    _, field, seen = drawn(rng, points, Q, 10.0)
-    seen.points[5] += [9.0, -7.0]
-    r = resect(SENSOR, INTERIOR, Q, field, seen)
-    assert r.status == "ok"
-    assert r.rejected == (5,)
 
 
 @pytest.mark.parametrize(
@@ -166,25 +155,21 @@ def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
     assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 22.5  # 6 degrees of freedom
 
 
-def test_points_on_one_line_determine_no_pose():
-    rng = np.random.default_rng(6)
-    points = np.array([-2_000.0, 9_000.0, 500.0]) + np.linspace(0, 1, 8)[:, None] * [0, 20_000, 0]
-    Q = camera_covariance()
-    _, field, seen = drawn(rng, points, Q, 0.0)
-    r = resect(SENSOR, INTERIOR, Q, field, seen)
-    assert r.status != "ok"
-    assert r.reason
-
-
-def test_points_seen_at_one_pixel_determine_no_pose():
-    """A camera far away fitted them, or a solver of OpenCV ended in a traceback."""
-    rng = np.random.default_rng(7)
-    for n in (4, 8):
-        _, field, seen = drawn(rng, control_points(n, rng), camera_covariance(), 10.0)
-        seen.points[:] = 900.0
-        r = resect(SENSOR, INTERIOR, camera_covariance(), field, seen)
+def test_points_on_one_line_or_at_one_pixel_determine_no_pose():
+    """A camera far away fitted the latter, or a solver of OpenCV ended in a traceback."""
+    rng, Q = np.random.default_rng(7), camera_covariance()
+    line = np.array([-2_000.0, 9_000.0, 500.0]) + np.linspace(0, 1, 8)[:, None] * [0, 20_000, 0]
+    for points, reason in (
+        (line, "on one line"),
+        (control_points(4, rng), "all seen at one place"),
+        (control_points(8, rng), "all seen at one place"),
+    ):
+        _, field, seen = drawn(rng, points, Q, 0.0)
+        if points is not line:
+            seen.points[:] = 900.0
+        r = resect(SENSOR, INTERIOR, Q, field, seen)
         assert r.status == "no_orientation"
-        assert "all seen at one place" in r.reason
+        assert reason in r.reason
 
 
 def test_a_staff_is_read_along_its_line():
@@ -199,9 +184,3 @@ def test_a_staff_is_read_along_its_line():
     on_water, of_water = place_on(SENSOR, values, Q, uv, SIGMA, WATER)
     assert of_water[1, 1] > C[2, 2] > 0
     assert on_water[0, 2] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_point_above_the_horizon_is_refused():
-    values = np.concatenate([INTERIOR.as_array(), POSE])
-    with pytest.raises(GeometryError, match="above the horizon"):
-        place_on(SENSOR, values, np.zeros((16, 16)), [[1640.0, 20.0]], SIGMA, WATER)

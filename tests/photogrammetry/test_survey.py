@@ -9,19 +9,13 @@ import pytest
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
-from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.field.testfield import Distance, TestField
 from thermocald.photogrammetry.survey import survey
 from thermocald.physics.scene import Scene
 
 # The binned mode of a Raspberry Pi camera v2.1.
-CAMERA = CameraModel(
-    Sensor(1640, 1232, 0.00224),
-    InteriorOrientation(
-        c=3.05, x0=0.021, y0=-0.013, A1=-2.1e-3, A2=4.0e-4, A3=-2.0e-5, B1=4e-5, B2=-3e-5,
-        C1=3e-4, C2=-2e-4,
-    ),
-)  # fmt: skip
+CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), cases.INTERIOR)
 
 
 def bent(field, size, sag=5.0):
@@ -32,19 +26,14 @@ def bent(field, size, sag=5.0):
     return TestField.build(field.names, points, 0.0, field.diameters, field.kinds, field.codes)
 
 
-def photograph(truth, stations, camera=CAMERA):
+def photograph(truth, stations):
     """Render photographs of a field with the program's own renderer."""
-    scene = Scene(camera.sensor, truth)
+    scene = Scene(CAMERA.sensor, truth)
     pictures = {}
     for i, station in enumerate(stations):
-        frame = scene.render(camera.interior.as_array(), station.as_array(), seed=i)
+        frame = scene.render(CAMERA.interior.as_array(), station.as_array(), seed=i)
         pictures[f"photo{i}.png"] = lambda frame=frame: frame
     return pictures
-
-
-def measured_distance(truth, a, b, sigma, seed=0):
-    length = float(np.linalg.norm(truth.points[truth.index[a]] - truth.points[truth.index[b]]))
-    return Distance(a, b, length + np.random.default_rng(seed).normal(0, sigma), sigma)
 
 
 def assert_true(result, truth, least_accuracy=1 / 20_000):
@@ -64,8 +53,10 @@ def sheet():
     nominal = field_of((sheet,))
     truth = bent(nominal, sheet.size)
     stations = cases.convergent_stations(truth.points, 12, distance=620.0)
-    a, b = (nominal.names[row] for row in sheet.scale_bar)
-    return nominal, truth, photograph(truth, stations), measured_distance(truth, a, b, 0.02)
+    a, b = sheet.scale_bar
+    length = np.linalg.norm(truth.points[a] - truth.points[b]) + 0.0025
+    distance = Distance(nominal.names[a], nominal.names[b], float(length), 0.02)
+    return nominal, truth, photograph(truth, stations), distance
 
 
 @pytest.mark.slow

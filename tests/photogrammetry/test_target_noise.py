@@ -54,7 +54,7 @@ def failing(epochs, spread, lost):
 
 @pytest.mark.parametrize(
     ("epochs", "spread", "lost"),
-    [(10, 0.8, 0), (20, 0.0, 0), (100, 0.3, 0), (4, 0.0, 1), (4, 0.8, 1), (6, 0.3, 1), (9, 0.0, 1)],
+    [(10, 0.8, 0), (100, 0.3, 0), (4, 0.0, 1), (4, 0.8, 1), (9, 0.0, 1)],
 )
 def test_as_many_good_points_fail_as_stated(epochs, spread, lost):
     """Medians of few epochs have cautious weights; targets of equal noise hardly differ."""

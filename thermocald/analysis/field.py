@@ -24,7 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.epoch.geometry import (
+from thermocald.photogrammetry.epoch.adjustment import (
     GeometryBounds,
     image_coverage,
     weaknesses,

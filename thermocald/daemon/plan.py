@@ -18,8 +18,7 @@ from thermocald.config import parse_config
 from thermocald.errors import ConfigurationError, RecordingError
 from thermocald.hal import open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, GeometryBounds
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head

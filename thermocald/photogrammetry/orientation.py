@@ -1,14 +1,14 @@
 """Approximate orientation without initial values from the user.
 
 The resection itself is OpenCV's (SQPnP inside RANSAC), which needs a principal distance. The
-camera's data sheet gives it, or a direct linear transformation if the field has depth, or else a
-search over fields of view; the candidate with the smallest truncated residuals is taken.
+camera's data sheet gives it, or else a search over fields of view; the candidate with the smallest
+truncated residuals is taken.
 
 `orient` and `refine` start from coded targets and predict the image points and outlines of all
 others. For this purpose alone they adjust the pose and the interior orientation robustly, with a
 weak prior for each parameter. The proper adjustment is `epoch.adjustment`.
 
-Source: Terzakis and Lourakis (2020), SQPnP; Abdel-Aziz and Karara (1971), DLT.
+Source: Terzakis and Lourakis (2020), SQPnP.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
-    image_to_mm,
     partials,
     project,
     rays,
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
 FLIP = np.diag([1.0, -1.0, -1.0])
 """Our camera axes to OpenCV's, whose camera looks along +Z with y down."""
 
-_FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
+_FIELDS_OF_VIEW_DEG = (9.0, 13.0, 18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
 _TOLERANCE = 0.005  # of the image width, as the distortion is still unknown
 _MANY = 8  # so many pairs do not fit a pose of three of them by chance
 _MINIMUM = 4  # pairs
@@ -98,11 +97,7 @@ def _interiors(
         return [interior]
     if nominal_c is not None:
         return [InteriorOrientation(nominal_c * f) for f in (1.0, 0.97, 1.03, 0.93, 1.07)]
-    lengths = _distances(sensor, _FIELDS_OF_VIEW_DEG)
-    direct = _direct_linear_transformation(sensor, X, uv)
-    if direct is not None and lengths[-1] / 2 < direct < lengths[0] * 2:
-        lengths += [direct]
-    coarse = [InteriorOrientation(c) for c in lengths]
+    coarse = [InteriorOrientation(c) for c in _distances(sensor, _FIELDS_OF_VIEW_DEG)]
     scores = []
     for candidate in coarse:
         found = _robust_resection(sensor, candidate, X, uv)
@@ -234,28 +229,6 @@ def resection(
         return []
     rms = [float(np.sqrt(np.mean(_residuals(sensor, interior, p, X, uv) ** 2))) for p in poses]
     return sorted(zip(rms, poses, strict=True), key=lambda s: s[0])
-
-
-def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float | None:
-    """Return the principal distance, mm, from a DLT; None if the field has no depth."""
-    if len(X) < 6 or plane_fit(X, 0.02)[2]:
-        return None
-    centre, scale = X.mean(axis=0), X.std()
-    x = image_to_mm(sensor, uv)
-    size = np.abs(x).max()
-    h = np.column_stack([(X - centre) / scale, np.ones(len(X))])
-    zero = np.zeros_like(h)
-    rows = np.vstack(
-        [
-            np.hstack([h, zero, -h * (x[:, :1] / size)]),
-            np.hstack([zero, h, -h * (x[:, 1:] / size)]),
-        ]
-    )
-    P = np.linalg.svd(rows)[2][-1].reshape(3, 4)
-    KKt = P[:, :3] @ P[:, :3].T
-    KKt /= KKt[2, 2]
-    f2 = (KKt[0, 0] - KKt[0, 2] ** 2 + KKt[1, 1] - KKt[1, 2] ** 2) / 2
-    return float(np.sqrt(f2) * size) if f2 > 0 else None
 
 
 _QUICK_VIEWS_DEG = (60.0, 40.0, 80.0, 25.0)

@@ -266,7 +266,7 @@ def survey(
     sensor, names, photos, sizes, notes = _measure_first(pictures, pixel_pitch, nominal, progress)
     progress("first adjustment")
     known = None if nominal is None else nominal.points
-    scale = _first_distances(distances, photos, names, nominal)
+    scale = _first_distances(distances, photos, nominal)
     network = adjust_network(
         sensor, photos, names, scale, interior=interior, nominal=known, free=free
     )
@@ -296,31 +296,24 @@ def survey(
 
 
 def _first_distances(
-    distances: Sequence[Distance],
-    photos: Mapping[str, Observations],
-    names: Sequence[str],
-    nominal: TestField | None,
+    distances: Sequence[Distance], photos: Mapping[str, Observations], nominal: TestField | None
 ) -> Sequence[Distance]:
-    """Return the distances whose ends have been measured so far, or else one of the nominal field.
+    """Return a distance of the nominal field, if there is one, for the first adjustment.
 
-    A plain circle, or a code that was not read, is measured only once its place can be predicted.
+    A plain circle, or a code that was not read, is measured only once its place can be predicted,
+    which does not depend on the scale.
     """
-    seen = np.zeros(len(names), dtype=int)
-    for shown in photos.values():
-        seen[shown.targets] += 1
-    often = {names[int(row)] for row in np.flatnonzero(seen > 2)}
-    found = [d for d in distances if d.a in often and d.b in often]
-    if found or nominal is None or len(often) < 2 or not distances:
-        return found or distances
-    unknown = {name for d in distances for name in (d.a, d.b)} - set(names)
+    if nominal is None or not distances:
+        return distances
+    unknown = {name for d in distances for name in (d.a, d.b)} - set(nominal.names)
     if unknown:
         raise GeometryError(f"the test field has no target {' and '.join(sorted(unknown))}")
-    rows = [nominal.index[name] for name in sorted(often)]
-    first = rows[0]
-    reach = np.linalg.norm(nominal.points[rows] - nominal.points[first], axis=1)
-    last = rows[int(np.argmax(reach))]
-    length = float(reach.max())
-    return [Distance(names[first], names[last], length, 0.01 * length)]
+    often = np.flatnonzero(np.bincount(np.concatenate([o.targets for o in photos.values()])) > 2)
+    if len(often) < 2:
+        return distances
+    a, b = int(often[0]), int(often[-1])
+    length = float(np.linalg.norm(nominal.points[a] - nominal.points[b]))
+    return [Distance(nominal.names[a], nominal.names[b], length, 0.01 * length)]
 
 
 def _measure_first(

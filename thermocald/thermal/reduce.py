@@ -25,8 +25,12 @@ import numpy as np
 
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, cold_start
-from thermocald.photogrammetry.epoch.geometry import GeometryBounds
+from thermocald.photogrammetry.epoch.adjustment import (
+    AdjustmentSettings,
+    GeometryBounds,
+    adjust,
+    cold_start,
+)
 from thermocald.photogrammetry.field.testfield import (
     FAR_ELSEWHERE,
     Observations,

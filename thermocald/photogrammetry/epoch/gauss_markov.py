@@ -25,7 +25,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -114,21 +114,13 @@ class Problem:
         field: TestField,
         observations: Observations,
         unknowns: Index,
-        priors: Mapping[str, tuple[float, float]],
         known: tuple[Array, Array] | None = None,
     ) -> Problem:
         """Collect the inputs of the iteration.
 
-        priors: {name: (value, sd)}; known: values (16,) and covariance (16, 16) of a camera whose
-        free parameters were observed beforehand, in place of the priors.
+        known: values (16,) and covariance (16, 16) of parameters that were observed beforehand.
         """
         weight = value = _NO_PRIORS
-        if priors:
-            weight, value = np.zeros((len(unknowns),) * 2), np.zeros(len(unknowns))
-            for row, parameter in enumerate(unknowns):
-                if PARAMETER_NAMES[parameter] in priors:
-                    value[row], sd = priors[PARAMETER_NAMES[parameter]]
-                    weight[row, row] = sd**-2
         if known is not None:
             value = known[0][unknowns]
             weight = _weight_of(known[1][np.ix_(unknowns, unknowns)])

@@ -197,13 +197,14 @@ def place_on(
     total = shared @ covariance @ shared.T
     total += plane.sd_mm**2 * np.outer(moved.ravel(), moved.ravel())
     if plane.sd_tilt:  # a tilt lifts a point in proportion to its distance from the axis
-        lever = (X - plane.point) @ _across(normal[0]).T
+        axes = np.linalg.svd(normal[:1])[2][1:]
+        lever = (X - plane.point) @ axes.T
         tilted = (moved[:, :, None] * lever[:, None, :]).reshape(-1, 2)
         total += plane.sd_tilt**2 * tilted @ tilted.T
     noise = np.broadcast_to(np.asarray(sigmas, dtype=float), uv.shape)
-    for i, block in enumerate(inverse[:, :, :2] * noise[:, None, :]):
-        rows = slice(3 * i, 3 * i + 3)
-        total[rows, rows] += block @ block.T
+    of_noise = inverse[:, :, :2] * noise[:, None, :]
+    each = np.einsum("iaib->iab", total.reshape(len(X), 3, len(X), 3))  # a view
+    each += of_noise @ np.swapaxes(of_noise, 1, 2)
     if own is not None and member is not None:
         for k, Q in enumerate(own):
             at = np.flatnonzero(np.repeat(member == k, 3))
@@ -255,11 +256,3 @@ def _lines_of(profile: Profile, sensor: Sensor, values: Array, uv: Array) -> Lin
     direction = np.diff(profile.points, axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return Line(profile.points[chosen], direction[chosen], profile.sd_mm)
-
-
-def _across(normal: Array) -> Array:
-    """Return two unit vectors (2, 3) perpendicular to a normal and to each other."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = np.cross(normal, helper)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])

@@ -111,7 +111,7 @@ def settle(history: NDArray[np.int8], use: Mask, keep: Mask) -> Mask:
 def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     """Return the mask of observations to keep: the worst are rejected, those that fit taken back.
 
-    test (n,): of `point_tests`; alpha: error probability of one test. `series.snooping` has the
+    test (n,): of `point_tests`; alpha: error probability of one test. `series.system` has the
     same rule for many epochs; its arrays would cost a single epoch ten times as much.
     """
     if alpha <= 0:

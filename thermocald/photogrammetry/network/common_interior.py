@@ -25,8 +25,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     free_columns,
     turning_axes,
 )
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
+from thermocald.photogrammetry.epoch.adjustment import (
+    AdjustmentSettings,
+    image_coverage,
+    obliqueness_deg,
+    uncertain,
+)
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import median_variance

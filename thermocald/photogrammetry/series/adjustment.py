@@ -30,7 +30,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
     free_columns,
 )
-from thermocald.photogrammetry.epoch.geometry import weaknesses
+from thermocald.photogrammetry.epoch.adjustment import weaknesses
 from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
@@ -42,6 +42,7 @@ from thermocald.photogrammetry.series.covariances import (
     estimate_held_affinity,
     line_weights,
     perspective_cofactor_roots,
+    scaled_covariances,
     slow_target_covariance,
     stillness,
     typical_sensitivity,
@@ -58,15 +59,14 @@ from thermocald.photogrammetry.series.mount import (
     estimate_movement,
     image_px,
 )
-from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
+from thermocald.photogrammetry.series.normals import ObservationGrid, among_all, linearise
 from thermocald.photogrammetry.series.result import (
     Exterior,
     SeriesAdjustment,
     SeriesSettings,
     enough_targets,
 )
-from thermocald.photogrammetry.series.snooping import point_tests
-from thermocald.photogrammetry.series.system import State
+from thermocald.photogrammetry.series.system import State, point_tests
 from thermocald.photogrammetry.series.target_noise import (
     FEW_EPOCHS,
     excess_scatter,
@@ -182,7 +182,7 @@ def adjusted(
     use = grid.observed & enough_targets(grid, s)[:, None]
     first = State(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
     series = SeriesEstimator(
-        sensor, testfield, grid, grid.weights, s, windows=windows, field_variance=field_variance
+        sensor, testfield, grid, s, windows=windows, field_variance=field_variance
     )
     if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
         series = choose_exterior(series, "auto", len(use))
@@ -217,33 +217,29 @@ def result(
         unit, sigma0 = np.maximum(unit, pooled), np.maximum(sigma0, np.sqrt(pooled))
     relative, level, trend = all_cofactors(system)
     excess, own, sound = np.zeros(16), system.design.own, system.good
-    block = (slice(None), own[:, None], own)
+    held = s.exterior == "series"
     few = series.has_offsets and len(use) < FEW_EPOCHS
     # in few epochs the offsets absorb the common part of the image points' errors
     least = np.maximum(unit, 1.0) if few else unit
-    # The priors' part is scaled by the series' variance, not by the epoch's.
-    bound = system.prior_cofactors
-    relative[block] -= bound
     many = s.target_noise and len(use) >= FEW_EPOCHS
     pairs = series.pairs(estimate) if many else None
     if pairs:
         relative += correlated_error_cofactors(system, pairs, pooled)
-    relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
-    relative[block] += pooled * bound
+    each = epoch_variance(least, redundancy, pooled)
+    relative = scaled_covariances(relative, system, each, pooled)
     level *= pooled
     trend *= pooled
     movement = series.movement
-    if s.exterior == "series" and len(use) >= FEWEST_EPOCHS:
+    if held and len(use) >= FEWEST_EPOCHS:
         movement = estimate_mount_movement(series, estimate)
     slow: list[tuple[Array, Array]] = []
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
-        if s.exterior == "series":
-            each = system.Q @ system.N[:, own[:, None], EOP_COLUMNS]
-            relative[block] += each @ movement.swaying @ np.swapaxes(each, 1, 2)
+        if held:
+            follow = system.Q @ system.N[:, own[:, None], EOP_COLUMNS]
+            relative += follow @ movement.swaying @ np.swapaxes(follow, 1, 2)
         G = typical_sensitivity(system)
         trend[own[:, None], own] += G @ movement.tilt(line) @ G.T
-        held = s.exterior == "series"
         follows = G if held else np.eye(len(own))[:, -6:] - G
         for course, jump, V in movement.steps:
             changes = np.zeros((16, 16))
@@ -260,21 +256,18 @@ def result(
         of_targets = slow_target_covariance(system, changes, series.testfield.groups, few)
         slow.append((slow_course(len(use), step), of_targets))
     if s.target_noise:
-        variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
+        variances = np.diagonal(relative, axis1=1, axis2=2)
         inner = len(free_columns(s.free))
         found = _excess(series, estimate.values[:, own[:inner]], variances[:, :inner], sound)
         # the pose moves itself; its scatter beyond the noise is as large as the interior's
         usual = variances[sound].mean(axis=0) if sound.any() else np.ones(len(own))
         ratio = np.median(found / usual[:inner]) if inner else 0.0
         excess[own] = np.append(found, ratio * usual[inner:])
-        relative[block] = with_excess(relative[block], excess[own])
+        relative = with_excess(relative, excess[own])
     for course, changes in slow:
-        relative += course[:, None, None] ** 2 * changes
+        relative += course[:, None, None] ** 2 * changes[own[:, None], own]
         trend += (line @ course) ** 2 * changes
     relative[~sound] = 0.0
-    still = np.full(len(sigma0), np.nan)
-    if s.exterior == "series":
-        still = stillness(system, estimate.residuals) / np.where(redundancy > 0, unit, 1.0)
     known = sigma0[sound & np.isfinite(sigma0)]
     held_affinity = None
     if affinity and sound.any():
@@ -283,7 +276,7 @@ def result(
             series.field_variance,
         )  # fmt: skip
     return replace(
-        judge_epochs(series, estimate, relative, unit / pooled, sigma0, redundancy, still),
+        judge_epochs(series, estimate, among_all(relative, own), unit, pooled, sigma0, redundancy),
         level_covariance=level,
         excess_sd=np.sqrt(excess),
         trend_sd=np.sqrt(np.diag(trend)),
@@ -302,15 +295,10 @@ def result(
 
 def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, float]:
     """Return the noise of the outermost target over that in the image's middle, and its sd."""
-    system, sensor = estimate.system, series.sensor
-    half = 0.5 * np.array([sensor.width - 1, sensor.height - 1])
-    radius = np.linalg.norm(system.design.at.predicted - half, axis=1)
+    system = estimate.system
+    radius = np.linalg.norm(system.design.at.predicted - series.sensor.centre, axis=1)
     tests = point_tests(system, estimate.residuals)
-    if series.stated is not system.weights:
-        weights = system.weights[..., 0]
-        tests *= np.divide(
-            series.stated[..., 0], weights, out=np.zeros_like(weights), where=weights > 0
-        )
+    tests *= np.broadcast_to(series.ratios, (len(radius), 3))[:, 0]
     # with rejected points, as the noise would be too small without its largest values
     offered = series.grid.observed & system.good[:, None]
     return noise_by_radius(tests, offered, radius)
@@ -345,14 +333,14 @@ def judge_epochs(
     estimate: Estimate,
     covariance: Array,
     unit: Array,
+    pooled: float,
     sigma0: Array,
     redundancy: Array,
-    stillness: Array,
 ) -> SeriesAdjustment:
     """Give each epoch its status and reason; return a result without the series' own figures.
 
-    covariance (E, 16, 16); unit (E,): variance of unit weight over the series'; sigma0,
-    redundancy, stillness (E,).
+    covariance (E, 16, 16); unit (E,), pooled: variance of unit weight of the epochs and of the
+    series; sigma0, redundancy (E,).
     """
     sensor, testfield, grid, s = series.sensor, series.testfield, series.grid, series.s
     values, use = estimate.values.copy(), estimate.system.use
@@ -385,10 +373,10 @@ def judge_epochs(
         "blurred image",
     )
     fail(~estimate.solved, "weak_geometry", "these targets do not determine the parameters")
-    failing = fails_global_test(unit, redundancy)
+    failing = fails_global_test(unit / pooled, redundancy)
     if failing.any():
-        about = neighbours_variance(unit, estimate.solved)
-        failing = fails_global_test(unit / about, redundancy)
+        about = neighbours_variance(unit / pooled, estimate.solved)
+        failing = fails_global_test(unit / pooled / about, redundancy)
     fail(
         failing,
         "global_test",
@@ -424,8 +412,12 @@ def judge_epochs(
             rows[row] = True
             fail(rows, "weak_geometry", "; ".join(weak))
     values[[word != "ok" for word in status]] = np.nan
+    still = np.full(len(use), np.nan)
+    if s.exterior == "series":
+        score = stillness(estimate.system, estimate.residuals)
+        still = score / np.where(redundancy > 0, unit, 1.0)
     return SeriesAdjustment(
         s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, use, observed & ~use,
         estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
-        tuple(status), tuple(reasons), stillness,
+        tuple(status), tuple(reasons), still,
     )  # fmt: skip

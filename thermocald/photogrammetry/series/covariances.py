@@ -13,9 +13,9 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
 from thermocald.photogrammetry.series.normals import (
-    among_all,
     cofactors,
     linearise,
+    normal_matrices,
     sums_of_targets,
 )
 
@@ -35,19 +35,19 @@ _MOST_REMOVED = 0.6  # of the variance of a combination of parameters
 def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
     """Return the cofactors of all parameters.
 
-    Those relative to the series (E, 16, 16); those of the level (16, 16); and those of the change
-    of a straight line from the first to the last epoch by the common unknowns (16, 16).
+    Those of the own ones relative to the series (E, p, p); those of the level (16, 16); and those
+    of the change of a straight line from the first to the last epoch by the common unknowns (16,
+    16).
 
     An epoch's parameters depend on the common unknowns by -G. The mean of G over the epochs cancels
     in differences within the series; the deviation from it is the epoch's own.
     """
     design = system.design
     own, common = design.own, design.common
-    Q = system.Q
+    Q = system.Q.copy()
     level, trend = np.zeros((16, 16)), np.zeros((16, 16))
     width = len(system.Q_common)
     if width:
-        Q = Q.copy()
         mean, tilt = np.zeros((len(own), width)), np.zeros((len(own), width))
         line = line_weights(system.good)
         for part, C in system.couplings():
@@ -66,9 +66,14 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
         all_level[common] = root[: len(common)]
         all_level[own] -= mean @ root
         level = all_level @ all_level.T
-    relative = among_all(Q, own)
-    relative[~system.good] = 0.0
-    return relative, level, trend
+    return Q, level, trend
+
+
+def scaled_covariances(Q: Array, system: SeriesSystem, unit: Array, pooled: float) -> Array:
+    """Scale cofactors (E, p, p) by the epochs' variances (E,), the priors' part by the series'."""
+    bound = system.Q @ system.design.own_prior @ system.Q
+    covariances: Array = (Q - bound) * unit[:, None, None] + pooled * bound
+    return covariances
 
 
 def with_excess(covariance: Array, excess: Array) -> Array:
@@ -128,13 +133,13 @@ def slow_target_covariance(
 def correlated_error_cofactors(
     system: SeriesSystem, pairs: CorrelatedPairs, variance: float
 ) -> Array:
-    """Return the part of the own parameters' cofactors (E, 16, 16) from correlated errors.
+    """Return the part of the own parameters' cofactors (E, p, p) from correlated errors.
 
     variance: of unit weight of the series from which the pairs come.
     """
     design = system.design
     extra = pairs.normal_matrices(system.used(), design.at.A[..., design.own]) / variance
-    own = system.Q @ extra @ system.Q
+    own: Array = system.Q @ extra @ system.Q
     # Covariances from epochs that see different targets may be indefinite together: the variance
     # of a combination is reduced by three fifths at most.
     root = np.linalg.cholesky(system.Q)
@@ -143,7 +148,7 @@ def correlated_error_cofactors(
     back = root @ vectors
     own = (back * np.maximum(values, -_MOST_REMOVED)[:, None, :]) @ np.swapaxes(back, 1, 2)
     own[~system.good] = 0.0
-    return among_all(own, design.own)
+    return own
 
 
 def typical_sensitivity(system: SeriesSystem) -> Array:
@@ -256,8 +261,10 @@ def stillness(system: SeriesSystem, residuals: Array) -> Array:
 
     Rao's score test: the gradient of the six parameters, with the epoch's own ones reduced.
     """
-    b = system.gradient(residuals)
-    V, g = pose_equations(system.N, b, system.design.own, system.Q)
+    N, b = system.N, system.gradient(residuals)
+    if not len(N):  # the common unknowns are held
+        N = normal_matrices(system.used(), system.design.at.A)
+    V, g = pose_equations(N, b, system.design.own, system.Q)
     inverse, good = cofactors(V)
     score = np.einsum("ei,eij,ej->e", g, inverse, g)
     return np.where(good & system.good, score, np.nan)

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2, median_known
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -23,17 +23,15 @@ from thermocald.photogrammetry.series.normals import (
     planes,
     sums_of_squares,
 )
-from thermocald.photogrammetry.series.snooping import (
-    point_tests,
-    snoop_series,
-    typical_variance,
-)
 from thermocald.photogrammetry.series.system import (
     Design,
     SeriesSystem,
     State,
     Step,
     offset_weights,
+    point_tests,
+    snoop_series,
+    typical_variance,
 )
 from thermocald.photogrammetry.series.target_noise import (
     FEW_EPOCHS,
@@ -94,21 +92,19 @@ class Estimate(State):
 class SeriesEstimator:
     """A series with the settings of its adjustment.
 
-    grid: the observations with the weights in use; stated (E, T, 3): their stated weights; bound
-    (6, 6): inverse covariance of the mount's movements; movement: its variance components; choice:
-    why the exterior orientation is estimated as it is; held: the linearisation of held common
-    unknowns, None if they are estimated; unit: initial variance of unit weight for the priors;
-    windows: runs of consecutive epochs, if the series is a sample of a longer one; typical:
-    variance of unit weight for epochs too poor to estimate theirs, None for that of these epochs;
-    field_variance: factor of the field's stated covariance; freedom (T,), ratios (T, 3): degrees of
-    freedom of each target's estimated noise and its variances over the stated ones, None and 1 if
-    the noise is as stated.
+    grid: the observations with the weights in use; bound (6, 6): inverse covariance of the mount's
+    movements; movement: its variance components; choice: why the exterior orientation is estimated
+    as it is; held: the linearisation of held common unknowns, None if they are estimated; unit:
+    initial variance of unit weight for the priors, and with held unknowns that of epochs too poor
+    to estimate theirs; windows: runs of consecutive epochs, if the series is a sample of a longer
+    one; field_variance: factor of the field's stated covariance; freedom (T,), ratios (T, 3):
+    degrees of freedom of each target's estimated noise and its variances over the stated ones, None
+    and 1 if the noise is as stated.
     """
 
     sensor: Sensor
     testfield: TestField
     grid: ObservationGrid
-    stated: Array
     s: SeriesSettings
     bound: Array | None = None
     movement: Movement = STILL
@@ -116,7 +112,6 @@ class SeriesEstimator:
     held: Partials | None = None
     unit: float = 1.0
     windows: tuple[slice, ...] = ()
-    typical: float | None = None
     field_variance: float = 1.0
     freedom: Array | None = None
     ratios: Array | float = 1.0
@@ -142,7 +137,7 @@ class SeriesEstimator:
             estimate = series.solve(start, use, self.unit)
         if s.snooping_alpha > 0:
             estimate = series.snoop(estimate, offered)
-            as_stated = self.grid.weights is self.stated
+            as_stated = self.freedom is None and self.held is None
             if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and as_stated:
                 known = series._with_target_noise(estimate)
                 again = known.solve(estimate, estimate.system.use, 1.0)
@@ -203,10 +198,8 @@ class SeriesEstimator:
         """Select the points (E, T) that are not far off the image of a camera, values (16,)."""
         predicted = project(self.sensor, values[IOP], values[EOP], self.testfield.points)
         size = np.linalg.norm(self.grid.points - predicted, axis=2)
-        shown = use.any(axis=1)
-        usual = np.ones(len(use))
-        usual[shown] = np.nanmedian(np.where(use[shown], size[shown], np.nan), axis=1)
-        near: Mask = size < _FAR * np.maximum(usual, 1.0)[:, None]
+        usual = median_known(np.where(use, size, np.nan).T)
+        near: Mask = size < _FAR * np.fmax(usual, 1.0)[:, None]
         return near
 
     @property
@@ -344,54 +337,36 @@ class SeriesEstimator:
 
     def _snoop_apart(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Snoop epochs that share no unknowns, solving only changed ones again."""
-        values, residuals = estimate.values, estimate.residuals
-        converged = estimate.converged.copy()
-        system = whole = replace(estimate.system, use=estimate.system.use.copy())
-        use, rows = whole.use, np.arange(len(whole.use))
-        history = np.zeros(use.shape, dtype=np.int8)
+        system = replace(estimate.system, use=estimate.system.use.copy())
+        whole = replace(estimate, system=system, converged=estimate.converged.copy())
+        rows, history = np.arange(len(system.use)), np.zeros(system.use.shape, dtype=np.int8)
         part: slice | Index = slice(None)  # all epochs, without a copy
-        typical = self.typical
+        typical, last = None if self.held is None else self.unit, estimate
         for _ in range(_ROUNDS):
-            tests = point_tests(system, residuals[part])
+            use = last.system.use
+            tests = point_tests(last.system, last.residuals)
             if typical is None:  # in the first round, which has all epochs
                 typical = typical_variance(tests, use)
             keep = snoop_series(
-                tests, offered[part], use[part], self.s.carried, self.s.snooping_alpha, typical,
+                tests, offered[part], use, self.s.carried, self.s.snooping_alpha, typical,
                 self._noise_freedom,
             )  # fmt: skip
             seen = history[part]
-            keep = settle(seen, use[part], keep)
+            keep = settle(seen, use, keep)
             history[part] = seen
-            changed = (keep != use[part]).any(axis=1)
+            changed = (keep != use).any(axis=1)
             part = rows = rows[changed]
             if len(rows) == 0:
                 break
-            system = SeriesSystem.formed(whole.design, self.grid.weights[rows], keep[changed])
-            some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
-            values[rows], residuals[rows], converged[rows] = some._solve_again(
-                system, values[rows], residuals[rows], estimate
-            )
-            use[rows], whole.Q[rows], whole.good[rows] = system.use, system.Q, system.good
-            whole.alike = None
-        return replace(
-            estimate, values=values, residuals=residuals, system=whole, converged=converged
-        )
-
-    def _solve_again(
-        self, system: SeriesSystem, values: Array, left: Array, known: State
-    ) -> tuple[Array, Array, Mask]:
-        """Solve epochs whose points in use have changed, in place.
-
-        values (E, 16); left (E, T, 2) px: residuals. Returns both and a mask (E,) of convergence.
-        """
-        for _ in range(_ITERATIONS):
-            step = system.step(left, replace(known, values=values))
-            values[:, system.design.own] += step.d_own
-            if step.size < (_NEAR if self.held is None else _SMALLER):
-                system.move(left, step)
-                break
-            left = self._residuals(State(values, known.offsets, known.pose), left)
-        return values, left, step.sizes < _NEAR
+            some = replace(self, grid=self.grid[rows], held=system.design.at)
+            state = State(whole.values[rows], estimate.offsets, estimate.pose)
+            last = some._iterate(state, keep[changed], self.unit)
+            for name in ("values", "residuals", "converged"):
+                getattr(whole, name)[rows] = getattr(last, name)
+            for name in ("use", "Q", "good"):
+                getattr(system, name)[rows] = getattr(last.system, name)
+            system.alike = None
+        return whole
 
     def _linearised(self, values: Array, use: Mask, variance: float) -> SeriesSystem:
         at = self.held
@@ -463,7 +438,9 @@ class SeriesEstimator:
         vPv, redundancy = self.sums(estimate)
         redundancy = redundancy - used
         positive = redundancy > 0
-        stated = sums_of_squares(self.stated, estimate.residuals, estimate.system.use)
+        stated = sums_of_squares(
+            self.grid.weights * self.ratios, estimate.residuals, estimate.system.use
+        )
         return (
             vPv / np.where(positive, redundancy, 1.0),
             np.sqrt(stated / np.where(positive, redundancy, np.nan)),

@@ -303,12 +303,10 @@ def _wanderer(s: FieldSeries, free: FieldSeries, row: int) -> FieldMovement:
     w = s.w[:, row]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     sd = sigma * float(np.sqrt(np.mean(np.sum(inverse**2, axis=0)))) / np.sqrt(len(s.times))
-    slow = np.einsum(
-        "je,ek->jk", cosines(s.times), np.nan_to_num(free.residuals[:, row]) * np.sqrt(w)
-    )
+    power = _slow_power(replace(free, weights=s.weights))[row]
     return FieldMovement(
         "wander", np.array([row]), (s.names[row],), 0, 0.0, 0.0, np.zeros(len(s.times)),
-        np.zeros((1, 2)), size, float(sd), _size_px(smooth), float(np.sum(slow**2)),
+        np.zeros((1, 2)), size, float(sd), _size_px(smooth), float(power),
     )  # fmt: skip
 
 
@@ -418,13 +416,10 @@ def _board(s: FieldSeries, rows: Index) -> FieldMovement | None:
 def _rigid(s: FieldSeries, rows: Index) -> Array:
     """Return ∂ image points / ∂ shifts, rotations (2k, 6), px/mm; rotations at the board's size."""
     X = s.points[rows] - s.points[rows].mean(axis=0)
-    size = max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
-    x, y, z = X.T / size
-    o = np.zeros_like(x)
-    turns = np.stack([np.stack([o, -z, y]), np.stack([z, o, -x]), np.stack([-y, x, o])], axis=-1)
-    motion = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(X), 3, 3)), np.swapaxes(turns, 0, 1)], axis=2
-    )
+    X /= max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
+    shifts = np.broadcast_to(np.eye(3), (len(X), 3, 3))
+    turns = np.swapaxes(np.cross(np.eye(3), X[:, None]), 1, 2)
+    motion = np.concatenate([shifts, turns], axis=2)
     out: Array = (s.B[rows] @ motion).reshape(-1, 6)
     return out
 

@@ -37,7 +37,7 @@ from thermocald.photogrammetry.series.adjustment import (
 from thermocald.photogrammetry.series.covariances import (
     correlated_error_cofactors,
     line_weights,
-    stillness,
+    scaled_covariances,
     with_excess,
 )
 from thermocald.photogrammetry.series.normals import (
@@ -45,8 +45,6 @@ from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     among_all,
     gathered,
-    normal_matrices,
-    planes,
     spread_windows,
 )
 from thermocald.photogrammetry.series.result import (
@@ -58,9 +56,9 @@ from thermocald.photogrammetry.series.result import (
 from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -70,8 +68,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
     from thermocald.photogrammetry.series.mount import Movement
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
-
-    Kind = tuple[Index, SeriesSystem, Array]
 
 
 _FEW = 0.02  # share of a block's epochs from which a kind gets its own matrix
@@ -90,12 +86,9 @@ class CommonSums:
     """
 
     design: Design
-    gradient: Array = field(init=False)
+    gradient: Array | float = 0.0
     ends: tuple[int, int] | None = None
     patterns: dict[bytes, Array] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.gradient = np.zeros(self.design.width)
 
     def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
         """Add a block that begins at epoch `first`.
@@ -110,12 +103,10 @@ class CommonSums:
         self.ends = int(t[0]), int(t[-1])
         w = system.used(good)
         self.gradient += self.design.gradient(w, left[good])
-        seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
-        for k, bits in enumerate(seen):
-            at = np.flatnonzero(of.ravel() == k)
+        for bits, at in _patterns(system.use[good]):
             counts = [len(at), t[at].sum(), t[at] @ t[at]]
             pull, weights = right[good[at]].sum(axis=0), w[at].sum(axis=0)
-            self._count(bits.tobytes(), np.concatenate([counts, pull, weights.ravel()]))
+            self._count(bits, np.concatenate([counts, pull, weights.ravel()]))
 
     def merge(self, later: CommonSums) -> None:
         """Add the sums over later blocks."""
@@ -179,33 +170,30 @@ class CommonSums:
         return later, -mean @ change, line, rest
 
 
-def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
+def _patterns(use: Mask) -> list[tuple[bytes, Index]]:
+    """Return the patterns of targets in use (E, T), each with the rows of its epochs."""
+    seen, of = np.unique(np.packbits(use, axis=1), axis=0, return_inverse=True)
+    return [(bits.tobytes(), np.flatnonzero(of.ravel() == k)) for k, bits in enumerate(seen)]
+
+
+def _kinds_of(design: Design, system: SeriesSystem) -> Iterator[tuple[Index, SeriesSystem, Array]]:
     """Group the epochs of a block by the targets that they see, with rare patterns in one group.
 
-    design: of the series; system: of the block, with the common unknowns held.
+    design: of the series; system: of the block, with the common unknowns held. Yields each kind's
+    epochs, a system (1,) of their mean weights, and the derivatives G (p, q + 2T).
     """
     good = np.flatnonzero(system.good)
-    if not len(good):
-        return []
-    seen = np.packbits(system.use[good], axis=1)
-    _, of, count = np.unique(seen, axis=0, return_inverse=True, return_counts=True)
-    of = of.ravel()
-    often = np.argsort(-count, kind="stable")[:_MOST]
-    often = often[count[often] >= max(_FEW * len(good), 2)]
-    groups = [good[of == label] for label in often]
-    rest = good[~np.isin(of, often)]
-    if len(rest):
-        groups.append(rest)
-    out = []
-    for rows in groups:
+    groups = sorted((good[at] for _, at in _patterns(system.use[good])), key=len, reverse=True)
+    often = [rows for rows in groups[:_MOST] if len(rows) >= max(_FEW * len(good), 2)]
+    rare = groups[len(often) :]
+    for rows in [*often, np.sort(np.concatenate(rare))] if rare else often:
         weights = system.used(rows).mean(axis=0, keepdims=True)
         one = SeriesSystem.formed(design, weights, weights[..., 0] > 0)
         if one.good[0]:
             G = np.zeros((len(design.own), design.width))
             for _, C in one.couplings():
                 G = one.Q[0] @ C[0]
-            out.append((rows, one, G))
-    return out
+            yield rows, one, G
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,10 +203,9 @@ class KnownSeries:
     estimator: for further epochs, with the common unknowns held; design: the unknowns of the
     series; offsets (T, 2) px, pose (6,): the common ones; cofactors (q + 2T, q + 2T): theirs; mean
     (p, q + 2T): mean G by which own parameters depend on the common ones; used: number of
-    observations that these use up; excess (16,): variance of the epochs' excess scatter; ratios
-    (T, 3): of estimated to stated variances; middle (16,): start values of epochs; pairs:
-    correlated errors of targets; movement: of the mount; slow (16, 16): covariance of a straight
-    line over the series from slow errors.
+    observations that these use up; excess (16,): variance of the epochs' excess scatter; middle
+    (16,): start values of epochs; pairs: correlated errors of targets; movement: of the mount; slow
+    (16, 16): covariance of a straight line over the series from slow errors.
     """
 
     estimator: SeriesEstimator
@@ -229,7 +216,6 @@ class KnownSeries:
     mean: Array
     used: float
     excess: Array
-    ratios: Array | float
     middle: Array
     pairs: CorrelatedPairs | None
     movement: Movement
@@ -249,15 +235,10 @@ class KnownSeries:
         )
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
-        T = series.grid.points.shape[1]
-        none = ObservationGrid(planes(2, 0, T), planes(3, 0, T))
-        held = replace(
-            series, grid=none, stated=none.weights, held=at, unit=unit, windows=(), typical=unit
-        )
+        held = replace(series, grid=series.grid[:0], held=at, unit=unit, windows=())
         known = cls(
             held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
-            system.common_share, sample.excess_sd**2, series.ratios, middle,
-            sample.pairs, sample.movement, slow,
+            system.common_share, sample.excess_sd**2, middle, sample.pairs, sample.movement, slow,
         )  # fmt: skip
         sums = CommonSums(design)
         right = np.zeros((len(sample.values), len(design.own)))
@@ -265,7 +246,7 @@ class KnownSeries:
         return replace(known, mean=sums.solved(known)[0].mean)
 
     def adjusted(
-        self, grid: ObservationGrid, epochs: int, line: Array | None = None
+        self, grid: ObservationGrid, epochs: int, line: Array
     ) -> tuple[Estimate, SeriesAdjustment]:
         """Adjust epochs with the common unknowns held.
 
@@ -274,29 +255,22 @@ class KnownSeries:
         level and the series' own figures.
         """
         s, pooled = self.estimator.s, self.estimator.unit
-        weighted = ObservationGrid(grid.points, grid.weights / self.ratios)
+        weighted = ObservationGrid(grid.points, grid.weights / self.estimator.ratios)
         values = np.tile(self.middle, (len(grid), 1))
         if len(self.design.common):
             values[:, EOP] = self.pose
-        held, estimate = replace(self.estimator, grid=weighted, stated=grid.weights).adjusted(
+        held, estimate = replace(self.estimator, grid=weighted).adjusted(
             State(values, self.offsets, self.pose),
             grid.observed & enough_targets(grid, s)[:, None],
         )
         system = estimate.system
         unit, sigma0, redundancy = held.noise(estimate, self.used / epochs)
         covariance = self._covariance(system, epoch_variance(unit, redundancy, pooled))
-        still = np.full(len(grid), np.nan)
-        if line is not None and self.slow.any():
+        if self.slow.any():
             # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
             covariance += (line * system.good)[:, None, None] ** 2 * self.slow
-        if line is not None and s.exterior == "series":
-            N = normal_matrices(system.used(), system.design.at.A)
-            score = stillness(replace(system, N=N), estimate.residuals)
-            still = score / np.where(redundancy > 0, unit, 1.0)
-        relative_unit = unit / pooled
-        return estimate, judge_epochs(
-            held, estimate, covariance, relative_unit, sigma0, redundancy, still
-        )
+        judged = judge_epochs(held, estimate, covariance, unit, pooled, sigma0, redundancy)
+        return estimate, judged
 
     def _covariance(self, system: SeriesSystem, unit: Array) -> Array:
         """Return the covariances (E, 16, 16) of epochs relative to the series.
@@ -310,17 +284,10 @@ class KnownSeries:
             away = G - self.mean
             mine[rows] += away @ self.cofactors @ away.T
             if self.pairs:
-                mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0][
-                    np.ix_(own, own)
-                ]
+                mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0]
             if swayed.any():
                 added[rows] = G[:, :6] @ swayed @ G[:, :6].T
-        # The priors' part is scaled by the series' variance, not by the epoch's.
-        bound = system.prior_cofactors if system.design.own_prior.any() else 0.0
-        mine -= bound
-        mine *= unit[:, None, None]
-        mine += pooled * bound
-        mine += added
+        mine = scaled_covariances(mine, system, unit, pooled) + added
         mine = with_excess(mine, self.excess[own])
         mine[~system.good] = 0.0
         return among_all(mine, own)
@@ -331,8 +298,7 @@ class LongAdjustment:
     """An adjusted long series; parameters in the order of `PARAMETER_NAMES`.
 
     rows: the epochs; level_sd, trend_sd (16,): as in `SeriesAdjustment`; sample: the adjustment of
-    the epochs `sampled` (P,) together, with covariances, residuals and offsets; passes: number of
-    times that the observations were read.
+    the epochs `sampled` (P,) together, with covariances, residuals and offsets.
     """
 
     rows: EpochRows
@@ -340,7 +306,6 @@ class LongAdjustment:
     trend_sd: Array
     sample: SeriesAdjustment
     sampled: Index
-    passes: int
 
 
 _TOGETHER_POINTS = 1_300_000  # a day of 150 targets: 200 MB
@@ -395,7 +360,7 @@ def adjust_long_series(
         known = later
     level, trend = _carry(known, later, own, line, rows)
     sampled = np.concatenate([np.arange(w.start, w.stop) for w in windows])
-    return LongAdjustment(rows, level, trend, sample, sampled, passes)
+    return LongAdjustment(rows, level, trend, sample, sampled)
 
 
 def _adjust_block(

@@ -52,7 +52,6 @@ _UPDATES = 150
 _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six directions
 _SLOW_COST = 2.0  # further log-likelihood that a memory must gain
 _NEGLIGIBLE = 0.02  # of the noise's variance
-_MOST_FREQUENCIES = 2000
 _LEAK_DEGREE = 6
 _LEAST_PER_DEGREE = 20  # fast frequencies; with fewer much of the mount's movement would be lost
 _END = 15  # epochs at each end that give the slope there
@@ -71,22 +70,18 @@ def components(trajectory: Array, period: float, held: bool = False) -> tuple[Ar
     power = _cosines(levelled) ** 2
     n = len(trajectory)
     omega = np.pi * np.arange(1, n) / n
-    if len(power) > _MOST_FREQUENCIES:  # the high ones are alike and are pooled
-        power, omega, count = _pooled(power, omega)
-    else:
-        count = np.ones(len(power))
     one = np.ones_like(omega)
     drift = _drift(omega, period)
     memories = _PHI if period else _LONG_PHI
     evidence = np.empty((len(memories), 3, power.shape[1]))  # still, white, with memory
-    _, walking = _fit(power, count, np.stack([drift]))
+    _, walking = _fit(power, np.stack([drift]))
     evidence[:, 0] = walking
-    (_, trembling), likelihood = _fit(power, count, np.stack([drift, one]))
+    (_, trembling), likelihood = _fit(power, np.stack([drift, one]))
     evidence[:, 1] = likelihood - _WHITE_COST
     phi = memories[:, None]
     sway = (1 - phi**2) / (1 - 2 * phi * np.cos(omega) + phi**2)
     shapes = np.stack(np.broadcast_arrays(drift, one, sway), axis=1)
-    swaying, likelihood = _fit(power, count, shapes)
+    swaying, likelihood = _fit(power, shapes)
     evidence[:, 2] = likelihood - _WHITE_COST - _SLOW_COST
     evidence -= evidence.max(axis=(0, 1))
     plausible = np.exp(evidence)
@@ -100,9 +95,9 @@ def components(trajectory: Array, period: float, held: bool = False) -> tuple[Ar
     by_memory = plausible[:, 2] * swaying[:, 2]
     by_memory *= np.array([1.0 - mean_variance(phi, n) for phi in memories])[:, None]
     if not period:  # without a drift of the camera all slow movement is the mount's
-        missing = (count @ power) / n - 1.0 - white - by_memory.sum(axis=0)
+        missing = power.sum(axis=0) / n - 1.0 - white - by_memory.sum(axis=0)
         if held:  # a still camera's noise is not a movement
-            missing[walking + 0.5 * (count @ power) < _WHITE_COST] = 0.0
+            missing[walking + 0.5 * power.sum(axis=0) < _WHITE_COST] = 0.0
         by_memory[-1] = np.maximum(by_memory[-1] + missing, 0.0)
     negligible = white + by_memory.sum(axis=0) < _NEGLIGIBLE
     white[negligible], by_memory[:, negligible] = 0.0, 0.0
@@ -170,47 +165,29 @@ def _cosines(trajectory: Array) -> Array:
     return coefficients
 
 
-def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:
-    """Average the power of high frequencies in equal groups; return power, omega and counts."""
-    half = _MOST_FREQUENCIES // 2
-    groups = np.array_split(np.arange(half, len(power)), half)
-    return (
-        np.concatenate([power[:half], np.stack([power[g].mean(axis=0) for g in groups])]),
-        np.concatenate([omega[:half], [omega[g].mean() for g in groups]]),
-        np.concatenate([np.ones(half), [len(g) for g in groups]]),
-    )
-
-
-def _fit(power: Array, count: Array, shapes: Array) -> tuple[Array, Array]:
+def _fit(power: Array, shapes: Array) -> tuple[Array, Array]:
     """Fit the sizes of spectra (..., components, m) on white noise of variance 1.
 
-    power (m, k); count (m,): frequencies in each. Returns the sizes (..., components, k) and the
-    log-likelihood (..., k).
+    power (m, k). Returns the sizes (..., components, k) and the log-likelihood (..., k).
     """
-    weight = count[:, None]
     # Spectra are steep: each starts at the size that explains the power of its own frequencies.
-    share = shapes * count
-    share /= np.maximum(share.sum(axis=-1, keepdims=True), 1e-300)
+    share = shapes / np.maximum(shapes.sum(axis=-1, keepdims=True), 1e-300)
     peak = (shapes * share).sum(axis=-1, keepdims=True)
     sizes = (share @ power) / np.maximum(peak, 1e-300) / shapes.shape[-2]
-    across, counted = np.swapaxes(shapes, -1, -2), weight * power
+    across = np.swapaxes(shapes, -1, -2)
     for _ in range(_UPDATES):
-        model = 1.0 + across @ sizes
-        inverse = 1.0 / model
-        up = shapes @ (counted * inverse**2)
-        down = shapes @ (weight * inverse)
-        sizes = sizes * np.sqrt(up / np.maximum(down, 1e-300))
+        inverse = 1.0 / (1.0 + across @ sizes)
+        up = shapes @ (power * inverse**2)
+        sizes = sizes * np.sqrt(up / np.maximum(shapes @ inverse, 1e-300))
     model = 1.0 + across @ sizes
-    likelihood = -0.5 * (weight * (np.log(model) + power / model)).sum(axis=-2)
+    likelihood = -0.5 * (np.log(model) + power / model).sum(axis=-2)
     return sizes, likelihood
 
 
 def mean_variance(phi: float, n: int) -> float:
     """Return the variance of the mean of n values with unit variance and correlation φ^|i-j|."""
-    if n <= 1 or phi >= 1:
-        return 1.0
-    sum_ = (1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (n * (1 - phi) ** 2)
-    return float(min(sum_ / n, 1.0))
+    apart = np.arange(n)
+    return float(2.0 * phi**apart @ (n - apart) - n) / n**2 if n else 1.0
 
 
 _HIDDEN = 0.3  # of the noise's variance, below which a movement cannot be estimated per epoch
@@ -286,12 +263,10 @@ class Movement:
         white: Array = self.white * float(weights @ weights)
         if not self.slow.any():
             return white
-        # w'Rw for R = φ^|i-j| in one pass
-        phi, carried, total = float(np.exp(-1.0 / self.memory)), 0.0, 0.0
-        for first in range(0, len(weights), 1 << 16):
-            for w in weights[first : first + (1 << 16)].tolist():
-                total += w * (w + 2.0 * carried)
-                carried = phi * (carried + w)
+        # w'Rw for R = φ^|i-j|, by the autocorrelation of w
+        n, phi = len(weights), float(np.exp(-1.0 / self.memory))
+        products = np.fft.irfft(np.abs(np.fft.rfft(weights, 2 * n)) ** 2, 2 * n)[:n]
+        total = 2.0 * float(phi ** np.arange(n) @ products) - float(products[0])
         about_mean = 1.0 - mean_variance(phi, int(np.count_nonzero(weights)))
         return white + self.slow * (total / max(about_mean, 1e-6))
 

@@ -26,7 +26,7 @@ from thermocald.photogrammetry.linalg import median_known, stacked_inverses
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -90,22 +90,18 @@ class ObservationGrid:
         points, weights = planes(2, *shape), planes(3, *shape)
         points[...] = np.nan
         weights[...] = 0.0
-        variance = sigmas**2
-        inverse = np.zeros((len(epochs), 3))
-        if covariances is None:
-            np.divide(1.0, variance, out=inverse[:, :2])
-        else:
-            determinant = variance[:, 0] * variance[:, 1] - covariances**2
-            inverse[:, :2] = variance[:, ::-1] / determinant[:, None]
-            inverse[:, 2] = -covariances / determinant
+        xy = np.zeros(len(epochs)) if covariances is None else covariances
         points[epochs, targets] = measured
-        weights[epochs, targets] = inverse
+        weights[epochs, targets] = inverses_of(sigmas[:, 0] ** 2, sigmas[:, 1] ** 2, xy)
         grid = cls(points, weights)
         weights[grid.repeated] = 0.0
         return grid
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __getitem__(self, rows: slice | Index) -> ObservationGrid:
+        return ObservationGrid(self.points[rows], self.weights[rows])
 
     def blocks(
         self, windows: Sequence[slice] | None = None, size: int = 1000
@@ -115,7 +111,7 @@ class ObservationGrid:
         windows: only the epochs of these slices, ascending.
         """
         for rows in runs(len(self), size, windows):
-            yield rows.start, ObservationGrid(self.points[rows], self.weights[rows])
+            yield rows.start, self[rows]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle with one component after the other, so that the copy has the same order."""
@@ -150,6 +146,12 @@ class ObservationGrid:
         weights = self.weights.copy(order="K")
         weights[mask] = 0.0
         return ObservationGrid(self.points, weights)
+
+
+def inverses_of(xx: Array, yy: Array, xy: Array) -> Array:
+    """Invert covariances of image points (n,); return the weights (n, 3) xx, yy, xy."""
+    weights: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+    return weights
 
 
 def _of_planes(points: Array, weights: Array) -> ObservationGrid:
@@ -226,25 +228,6 @@ def chunks(epochs: int, targets: int) -> Iterator[slice]:
     Temporary arrays of a whole long series would also cost a page fault for every page.
     """
     return runs(epochs, max(_CHUNK_POINTS // max(targets, 1), 1))
-
-
-def same_rows(*arrays: NDArray[Any]) -> tuple[Index, Index]:
-    """Find equal rows of arrays (E, ...); return representatives (M,) and the one of each row (E,).
-
-    Epochs that see the same targets with the same weights have the same normal matrix.
-    """
-    E = len(arrays[0])
-    rng = np.random.default_rng(0)
-    mark = np.sum([array @ rng.random(array.shape[1]) for array in arrays], axis=0)
-    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
-    each = np.arange(E)
-    if 2 * len(first) > E:
-        return each, each
-    for part in chunks(E, max(array.shape[1] for array in arrays)):
-        like = first if len(first) == 1 else first[of[part]]
-        if not all(np.all(array[part] == array[like]) for array in arrays):
-            return each, each
-    return first, of
 
 
 def right_hand_sides(weights: Array, residuals: Array, A: Array, use: Mask | None = None) -> Array:
@@ -393,38 +376,32 @@ def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> Observation
     """Read the epochs of some windows into one grid."""
     if isinstance(source, ObservationGrid) and list(windows) == [slice(0, len(source))]:
         return source
-    whole = ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
-    done = 0
-    for _, grid in source.blocks(windows):
-        if not done:
-            size = sum(w.stop - w.start for w in windows), grid.points.shape[1]
-            whole = ObservationGrid(planes(2, *size), planes(3, *size))
-        rows = slice(done, done + len(grid))
-        whole.points[rows], whole.weights[rows] = grid.points, grid.weights
-        done += len(grid)
-    return whole
+    return joined([grid for _, grid in source.blocks(windows)])
+
+
+def joined(grids: Sequence[ObservationGrid]) -> ObservationGrid:
+    """Return the grid of the epochs of several grids, one after the other."""
+    if not grids:
+        return ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
+    points, weights = ([getattr(g, name) for g in grids] for name in ("points", "weights"))
+    return ObservationGrid(np.concatenate(points), np.concatenate(weights))
 
 
 def recut(
     blocks: Iterable[tuple[int, ObservationGrid]], length: int
 ) -> Iterator[tuple[int, ObservationGrid]]:
     """Yield the epochs of blocks `length` at a time, so that blocks do not depend on the reader."""
-    points: list[Array] = []
-    weights: list[Array] = []
-    begin = held = 0
+    begin, parts = 0, list[ObservationGrid]()
     for first, grid in blocks:
-        if not held:
+        if not parts:
             begin = first
-        points.append(grid.points)
-        weights.append(grid.weights)
-        held += len(grid)
-        if held < length:
+        parts.append(grid)
+        if sum(map(len, parts)) < length:
             continue
-        p, w = np.concatenate(points), np.concatenate(weights)
-        whole = held // length * length
-        for k in range(0, whole, length):
-            yield begin + k, ObservationGrid(p[k : k + length], w[k : k + length])
-        begin, held = begin + whole, held - whole
-        points, weights = [p[whole:]], [w[whole:]]
-    if held:
-        yield begin, ObservationGrid(np.concatenate(points), np.concatenate(weights))
+        whole = joined(parts)
+        end = len(whole) // length * length
+        for rows in runs(end, length):
+            yield begin + rows.start, whole[rows]
+        begin, parts = begin + end, [whole[end:]] if end < len(whole) else []
+    if parts:
+        yield begin, joined(parts)

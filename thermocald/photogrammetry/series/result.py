@@ -107,10 +107,9 @@ class EpochRows:
     def empty(cls, epochs: int) -> EpochRows:
         """Return rows without content, for `put`."""
         values, sd = np.empty((2, epochs, 16))
-        sigma0, redundancy, stillness = np.empty((3, epochs))
-        observed, rejected = np.empty((2, epochs), dtype=np.int64)
-        words, sentences = [""] * epochs, [""] * epochs
-        return cls(values, sd, sigma0, redundancy, stillness, observed, rejected, words, sentences)
+        a, b, c = np.empty((3, epochs))
+        m, n = np.empty((2, epochs), dtype=np.int64)
+        return cls(values, sd, a, b, c, m, n, [""] * epochs, [""] * epochs)
 
     def put(self, first: int, part: EpochRows) -> None:
         """Store consecutive epochs, from epoch `first` on."""
@@ -211,19 +210,17 @@ class SeriesAdjustment:
         if len(targets) == n:
             return self
 
-        def wide(array: NDArray[Any], axis: int, fill: Any) -> NDArray[Any]:
-            shape = list(array.shape)
-            shape[axis] = n
-            out = np.full(shape, fill, dtype=array.dtype)
-            out[(slice(None),) * axis + (targets,)] = array
+        def wide(array: NDArray[Any], fill: Any) -> NDArray[Any]:
+            out = np.full((len(array), n, *array.shape[2:]), fill, dtype=array.dtype)
+            out[:, targets] = array
             return out
 
         return replace(
             self,
-            observed=wide(self.observed, 1, False),
-            rejected=wide(self.rejected, 1, False),
-            residuals=wide(self.residuals, 1, np.nan),
-            offsets=wide(self.offsets, 0, np.nan),
+            observed=wide(self.observed, False),
+            rejected=wide(self.rejected, False),
+            residuals=wide(self.residuals, np.nan),
+            offsets=wide(self.offsets[None], np.nan)[0],
         )
 
 

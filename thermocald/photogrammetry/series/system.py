@@ -1,9 +1,10 @@
-"""The linearised series: normal equations of all epochs with their common unknowns reduced.
+"""The linearised series: normal equations with common unknowns reduced, and data snooping.
 
 A `Design` defines the unknowns and their priors. Own parameters are those of an epoch (p of them),
 common ones those of the series (q parameters, then the offsets in x and in y of the T targets). A
 parameter may be both: an epoch's own part is then drawn to the common one, as a random effect.
-Arrays only; `covariances` gives the accuracy.
+Arrays only; `covariances` gives the accuracy. Data snooping tests every point against its own
+epoch, as `epoch.snooping` does, for all epochs at once.
 
 Source: the reduction of common unknowns as Helmert blocking, Wolf, H. (1978): The Helmert block
 method.
@@ -18,14 +19,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
-from thermocald.photogrammetry.linalg import inverse_of_determined
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, limit_2d
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2, inverse_of_determined
 from thermocald.photogrammetry.series.normals import (
     Partials,
     chunks,
     cofactors,
+    inverses_of,
     normal_matrices,
+    products,
     right_hand_sides,
-    same_rows,
+    sums_of_targets,
 )
 
 if TYPE_CHECKING:
@@ -89,11 +93,8 @@ class Design:
         weights (E, T, 3), residuals (E, T, 2) px.
         """
         b = right_hand_sides(weights, residuals, self.at.A[..., self.common])
-        t = len(self.offset_prior)
-        v, w = np.nan_to_num(residuals[:, :t]), weights[:, :t]
-        x = (w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0)
-        y = (w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0)
-        return np.concatenate([b.sum(axis=0), x, y])
+        of_targets = sums_of_targets(weights, residuals, weights[..., 0] > 0)
+        return np.concatenate([b.sum(axis=0), of_targets[: len(self.offset_prior)].T.ravel()])
 
     def prior_matrix(self) -> Array:
         """Return the weights (width, width) of the common unknowns' priors."""
@@ -127,9 +128,7 @@ def offset_weights(field: TestField, at: Partials) -> Array:
     tiny = 1e-12  # px²: a target without sigma has no offset
     xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
     yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny
-    xy = (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1)
-    weights: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
-    return weights
+    return inverses_of(xx, yy, (at.B[:, 0] * at.B[:, 1] * variance).sum(axis=1))
 
 
 _FARTHEST_PX = 200.0  # largest movement of an image point by one step
@@ -162,7 +161,7 @@ class SeriesSystem:
     weights (E, T, 3): a priori; use (E, T): points in use; N (E, 16, 16): empty without common
     unknowns; Q (E, p, p): cofactors of the epochs' own parameters, the common ones held; good (E,):
     epochs that determine their parameters; Q_common (q, q), or with offsets (q + 2T, q + 2T): empty
-    before `solved`; alike: epochs with the same matrices, from `same_rows`, None if outdated;
+    before `solved`; alike: epochs with the same matrices, from the function, None if outdated;
     coupled: the result of `couplings`, if it needs little memory.
     """
 
@@ -288,11 +287,6 @@ class SeriesSystem:
         """Return Aᵀ P l (E, 16) of every epoch."""
         return right_hand_sides(self.weights, residuals, self.design.at.A, self.use)
 
-    @property
-    def prior_cofactors(self) -> Array:
-        """Part (E, p, p) of the own parameters' cofactors that the priors contribute, Q P Q."""
-        return self.Q @ self.design.own_prior @ self.Q
-
     def own_gradient(self, residuals: Array, state: State) -> Array:
         """Return the gradient (E, p) of the own parameters and their priors; 0 at the solution."""
         own, A = self.design.own, self.design.at.A
@@ -325,5 +319,104 @@ class SeriesSystem:
 
 
 def alike(weights: Array, use: Mask) -> tuple[Index, Index]:
-    """Find epochs with the same points in use with the same weights, as `same_rows` does."""
-    return same_rows(np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
+    """Find epochs with the same points in use with the same weights, and so the same matrices.
+
+    Returns representatives (M,) and the one of each epoch (E,); each its own if few are alike.
+    """
+    rng = np.random.default_rng(0)  # sums with random factors differ if rows do
+    rows = (np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
+    mark = np.sum([row @ rng.random(row.shape[1]) for row in rows], axis=0)
+    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
+    each = np.arange(len(mark))
+    return (each, each) if 2 * len(first) > len(mark) else (first, of)
+
+
+def point_tests(system: SeriesSystem, residuals: Array) -> Array:
+    """Return the test (E, T) of every image point against its epoch: χ² with 2 degrees of freedom.
+
+    Points not in use are tested as check points. The common unknowns count as error-free, as they
+    come from all epochs.
+    """
+    first, of = system.alike or alike(system.weights, system.use)
+    E, T = residuals.shape[:2]
+    pairs = products(system.design.at.A[..., system.design.own])
+    shared = _test_weights(system, first, pairs) if len(first) < E else None
+    test = np.empty((E, T))
+    for part in chunks(E, T):
+        if shared is None:
+            xx, yy, xy = _test_weights(system, part, pairs)
+        else:
+            xx, yy, xy = shared if len(first) == 1 else shared[:, of[part]]
+        x, y = residuals[part, :, 0], residuals[part, :, 1]
+        out = np.multiply(xx, x, out=test[part])
+        out += xy * y
+        out *= x
+        out += yy * y * y
+    test[np.isnan(test)] = 0.0
+    return test
+
+
+def _test_weights(
+    system: SeriesSystem, epochs: slice | Index, products: tuple[Array, Array, Array]
+) -> Array:
+    """Return the residuals' inverse covariance (3, M, T): xx, yy, twice xy; 0 without a test."""
+    weights = system.weights[epochs]
+    rows, columns = np.triu_indices(len(system.design.own))
+    Q = system.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
+    sign = np.where(system.use[epochs], -1.0, 1.0)
+    lxx, lyy, lxy = (sign * (Q @ pairs.T) for pairs in products)
+    offered = weights[..., 0] > 0
+    wx, wy, wxy = (np.where(offered, weights[..., k], k < 2) for k in range(3))
+    determinant = wx * wy - wxy * wxy
+    vxx, vyy = wy / determinant + lxx, wx / determinant + lyy
+    vxy = 0.5 * lxy - wxy / determinant
+    d = vxx * vyy - vxy * vxy
+    d[~(offered & (d > 1e-9 / determinant))] = np.inf
+    inverse = np.stack([vyy, vxx, -2 * vxy])
+    inverse /= d
+    return inverse
+
+
+def _variances(tests: Array, used: Mask) -> Array:
+    """Return variances of unit weight (E,) from each epoch's median, robust to gross errors."""
+    n = used.sum(axis=1)
+    half = np.minimum(n // 2, tests.shape[1] - 1)
+    ordered = np.where(used, tests, np.inf)
+    ordered.sort(axis=1)
+    middle = ordered[np.arange(len(n)), half]
+    return np.where(n > 0, middle, 1.0) / MEDIAN_CHI2
+
+
+def typical_variance(tests: Array, used: Mask) -> float:
+    """Return the epochs' median variance of unit weight; 1 without residuals."""
+    variances = _variances(tests, used)
+    return float(np.median(variances[used.any(axis=1)])) or 1.0 if used.any() else 1.0
+
+
+def snoop_series(
+    tests: Array,
+    offered: Mask,
+    used: Mask,
+    unknowns: int,
+    alpha: float,
+    typical: float,
+    freedom: Array | None,
+) -> Mask:
+    """Return the mask (E, T) of image points to keep, by the rule of `epoch.snooping.snoop`.
+
+    typical: variance of unit weight of the series, for epochs too poor to estimate theirs; freedom
+    (T,): degrees of freedom of each target's noise, None if the noise is as stated.
+    """
+    keep = offered.copy()
+    for part in chunks(*used.shape):
+        test, use = tests[part], used[part]
+        n = use.sum(axis=1)
+        few = 2 * n - unknowns < TRUSTED_REDUNDANCY
+        variance = np.where(few, typical, _variances(test, use))
+        uncertain = np.where(few, 0.0, 1.0 / np.maximum(n, 1))[:, None]
+        if freedom is not None:
+            uncertain = uncertain + 1.0 / freedom
+        fits = test <= np.maximum(variance, 1e-12)[:, None] * limit_2d(alpha, uncertain)
+        worst = np.where(use, test, 0.0).max(axis=1, initial=0.0)
+        keep[part] &= fits | (use & (test < (np.where(few, 1.0, 0.5) * worst)[:, None]))
+    return keep

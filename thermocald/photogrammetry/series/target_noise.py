@@ -129,7 +129,8 @@ def correlated_pairs(
     v = np.where(seen, residuals.reshape(E, -1), 0.0)
     mean = v.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, v - mean, 0.0)
-    left, right, covariances = [], [], []
+    none = np.empty(0, dtype=np.int64)
+    left, right, covariances = [none], [none], [np.empty(0)]
     for label in np.flatnonzero(np.bincount(group) > 1):
         targets = np.flatnonzero(group == label)
         columns = np.stack([2 * targets, 2 * targets + 1], axis=1).ravel()
@@ -145,9 +146,6 @@ def correlated_pairs(
             left.append(columns[i])
             right.append(columns[j])
             covariances.append(covariance[i, j])
-    if not left:
-        none = np.empty(0, dtype=np.int64)
-        return CorrelatedPairs(none, none, np.empty(0))
     return CorrelatedPairs(
         np.concatenate(left),
         np.concatenate(right),
@@ -169,15 +167,10 @@ def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, flo
     if seen.sum() < _FEWEST_RADII or not np.ptp(radius[seen]) > 0:
         return float("nan"), float("nan")
     y, x, w = logarithms[seen] / n[seen], radius[seen] ** 2, n[seen].astype(float)
-    outermost = float(x.max())
-    x = x - (w @ x) / w.sum()
-    y = y - (w @ y) / w.sum()
-    information = float(w @ (x * x))
-    slope = float(w @ (x * y)) / information
-    scatter = float(w @ (y - slope * x) ** 2) / (len(y) - 2)
-    sd = np.sqrt(max(scatter, _LOG_CHI2) / information)
-    ratio = float(np.exp(0.5 * slope * outermost))
-    return ratio, ratio * 0.5 * outermost * float(sd)
+    line, Q = np.polyfit(x, y, 1, w=np.sqrt(w), cov="unscaled")
+    scatter = float(w @ (y - np.polyval(line, x)) ** 2) / (len(y) - 2)
+    ratio = float(np.exp(0.5 * line[0] * x.max()))
+    return ratio, ratio * 0.5 * float(x.max() * np.sqrt(max(scatter, _LOG_CHI2) * Q[0, 0]))
 
 
 def slow_course(epochs: int, step: int) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch, Polygon
+from matplotlib.patches import PathPatch, Polygon, Wedge
 from matplotlib.path import Path as Curve
 from matplotlib.transforms import Affine2D
 
@@ -269,18 +269,9 @@ def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
 
 def _ring_segment(centre: tuple[float, float], r: float, begin: float, end: float) -> Any:
     """Return an arc of the ring; codes run clockwise but y is up: angles are negated."""
-    arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
-    unit = np.asarray(arc.vertices, dtype=float)
-    outer, inner = unit * outline.RING_OUTER * r, unit[::-1] * outline.RING_INNER * r
-    codes = np.concatenate(
-        [
-            np.asarray(arc.codes),
-            [Curve.LINETO],
-            np.full(len(inner) - 1, Curve.CURVE4),
-            [Curve.CLOSEPOLY],
-        ]
-    )
-    return Curve(np.concatenate([outer, inner, outer[:1]]) + np.array(centre), codes)
+    width = (outline.RING_OUTER - outline.RING_INNER) * r
+    angles = -360 * end, -360 * begin
+    return Wedge(centre, outline.RING_OUTER * r, *angles, width=width).get_path()
 
 
 def _legend(pen: Pen, sheet: Sheet) -> None:

@@ -139,10 +139,7 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
     for _ in range(_HALVINGS):
         if min(sample.shape) >= 2:
             sample = cv2.resize(sample, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    levels = np.iinfo(image.dtype).max + 1
-    histogram = cv2.calcHist([sample], [0], None, [levels], [0, levels])
-    share = np.cumsum(histogram, dtype=float) / sample.size
-    low, high = (int(v) for v in np.searchsorted(share, np.array(_PERCENTILES) / 100))
+    low, high = np.percentile(sample, _PERCENTILES, method="inverted_cdf").astype(int)
     top = 255 if image.dtype == np.uint8 else max(int(sample.max()), 1023)
     if high - low < _LEAST_CONTRAST / 255 * top:
         if high < 0.12 * top:

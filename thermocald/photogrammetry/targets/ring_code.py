@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import cache
-from math import inf
 from typing import TYPE_CHECKING
 
 import cv2
@@ -52,7 +51,7 @@ from thermocald.photogrammetry.targets.outline import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -135,8 +134,7 @@ def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
 
 ANGLES = 84  # a multiple of 12 and of 14
 COARSE_ANGLES = 28
-_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.05, 0.45
-_EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
+_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.1, 0.45
 _INSIDE = 0.6  # level of a sample, 0 background, 1 ink
 
 
@@ -174,22 +172,6 @@ def sample(
         x, y = (np.ascontiguousarray(around[:, :, k]).reshape(-1, angles) for k in (0, 1))
         grey[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, len(radii), angles)
     return grey if ink is None else (grey - ink[0][:, None, None]) / ink[1][:, None, None]
-
-
-def sized(image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]) -> LocalMap:
-    """Return the maps with the size of the discs at half their contrast; ink: as in `sample`.
-
-    The size from a contour depends on its threshold, and may be wrong by a pixel.
-    """
-    level = sample(image, maps, _EDGE_RADII, COARSE_ANGLES, ink)
-    # the radius is where the ink ends: the sum of the levels outwards
-    step = _EDGE_RADII[1] - _EDGE_RADII[0]
-    radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
-    across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ _circle(COARSE_ANGLES), axis=1)
-    excess = np.median((radius - 1) * across, axis=1)
-    axes = np.linalg.norm(maps.linear, axis=1)
-    factor = np.maximum(1 + excess[:, None] / axes, 0.5)
-    return LocalMap(maps.centre, maps.linear * factor[:, None, :], maps.second)
 
 
 def in_perspective(
@@ -332,28 +314,17 @@ _MISFIT_OF_FEW = 0.06
 
 
 def read_codes(
-    image: NDArray[np.uint8],
-    candidates: LocalMap,
-    polarity: int,
-    wanted: tuple[Collection[tuple[int, int]], float] = ((), inf),
+    image: NDArray[np.uint8], candidates: LocalMap, polarity: int
 ) -> dict[tuple[int, int], int]:
     """Read the ring codes around discs; return the candidate's index of each code (bits, number).
 
     polarity: -1 dark on light, 1 light on dark. Both families are read, since a ring of one may be
-    mistaken for one of the other. A code that is read twice is dropped, since one is wrong. wanted:
-    codes, and how many of them are enough; with fewer, discs without a code are read again in
-    perspective.
+    mistaken for one of the other. A code that is read twice is dropped, since one is wrong.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates, polarity)
     ink = gap, contrast
-    maps = sized(image, candidates.select(rows), ink)
-    found = _read(image, maps, ink)
     # Seen from near and obliquely, a large ring is eccentric to its disc by pixels.
-    left = np.nonzero(found[:, 0] == 0)[0]
-    codes, enough = wanted
-    if len(left) and sum(tuple(c) in codes for c in found.tolist()) < enough:
-        grey = gap[left], contrast[left]
-        found[left] = _read(image, in_perspective(image, maps.select(left), grey), grey)
+    found = _read(image, in_perspective(image, candidates.select(rows), ink), ink)
     read = [(bits, number) for bits, number in found.tolist()]
     count = Counter(read)
     return {
@@ -494,7 +465,7 @@ def find_coded(
         enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
         for scale, polarity in SEARCHES if image.shape[1] > _LARGE_WIDTH else SEARCHES[2:]:
             candidates = find_circles(grey, scale, polarity)
-            codes = read_codes(grey, candidates, polarity, (row_of, enough))
+            codes = read_codes(grey, candidates, polarity)
             ours = {row_of[code]: place for code, place in codes.items() if code in row_of}
             foreign = foreign or len(ours) < len(codes)
             for row, place in _circles_by_marker(grey, candidates, named):

@@ -109,11 +109,9 @@ class Sheet:
         if len(coded) < 2:
             return None
         x, y, _ = self.field.points.T
-        lowest = [i for i in coded if y[i] == y[coded].min()]
-        row = sorted(lowest, key=lambda i: x[i])
-        if len(row) < 2:
-            row = sorted(coded, key=lambda i: y[i])
-        return row[0], row[-1]
+        upwards = sorted(coded, key=lambda i: (y[i], x[i]))
+        lowest = [i for i in upwards if y[i] == y[upwards[0]]]
+        return (upwards[0], lowest[-1]) if len(lowest) > 1 else (upwards[0], upwards[-1])
 
 
 def paper_size(text: str, *, landscape: bool = False) -> tuple[float, float]:

@@ -65,9 +65,8 @@ def normal_cdf(z: Single) -> Single:
 
 def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any]:
     """Return the text (n,) of the first test (n,) that is true, empty if none is."""
-    reasons = np.full(len(tests[0][0]), "", dtype=object)
-    for bad, word in reversed(tests):
-        reasons[bad] = word
+    bad, words = zip(*tests, strict=True)
+    reasons: NDArray[Any] = np.select(bad, words, "").astype(object)
     return reasons
 
 
@@ -99,13 +98,10 @@ def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single,
     u += np.multiply(u2, ey, out=u2)
     v *= ex
     v += np.multiply(v2, ey, out=v2)
-    if m.any():
-        back = inverse_2x2(shape).astype(np.float32)[..., None]
-        s, t = back[:, 0, 0] * u, back[:, 1, 1] * v
-        s += np.multiply(back[:, 0, 1], v, out=v2)
-        t += np.multiply(back[:, 1, 0], u, out=v2)
-    else:
-        s, t = u.copy(), v.copy()
+    back = inverse_2x2(shape).astype(np.float32)[..., None]
+    s, t = back[:, 0, 0] * u, back[:, 1, 1] * v
+    s += np.multiply(back[:, 0, 1], v, out=v2)
+    t += np.multiply(back[:, 1, 0], u, out=v2)
     rho = u * u
     rho += np.multiply(v, v, out=v2)
     np.sqrt(rho, out=rho)

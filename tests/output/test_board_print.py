@@ -83,7 +83,8 @@ def test_a_printed_board_is_found_where_its_csv_says(tmp_path, kind):
     sheet = Sheet(image, size, np.zeros(3), np.eye(3)[:2])
     middle = np.array([*size, 0.0]) / 2
     stand = middle + 1.1 * max(size) * np.array([0.45, -0.3, 1.0]) / 1.14
-    found = measure(photograph([sheet], CAMERA, looking_at(stand, middle, 0.3)), field)
+    station = looking_at(stand, middle, 0.3)
+    found = measure(photograph([sheet], CAMERA, station, finer=2), field)
     assert found.status.ok
     assert len(found.observations) == len(field)
     rays = CAMERA.rays(found.observations.points)

@@ -123,7 +123,7 @@ def local_maps(
 REACH_PX = 4.0
 """Pixels farther from the outline do not depend on the centre."""
 _THIN = 3
-_CHUNK_PIXELS = 120_000  # of the windows that are processed together
+_CHUNK_PIXELS = 60_000  # of the windows that are processed together
 _CUT_PX = 2.0  # pixels this near to the outline must be in the image
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
 

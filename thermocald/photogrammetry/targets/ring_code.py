@@ -18,9 +18,8 @@ the grey values.
 Around each candidate, grey values are sampled on circles in the coordinates of the ellipse. A coded
 target has its disc in one grey, a gap around it in the other, background outside its ring, and all
 transitions in the ring on a raster of 12 or 14 bits. The code that was read is then drawn, blurred,
-and compared with the samples, after a small shift, rotation and scaling. Only a ring that passes
-all these checks and has an existing code is accepted, since the codes have little redundancy, but
-their shape has much.
+and compared with the samples. Only a ring that passes all these checks and has an existing code is
+accepted, since the codes have little redundancy, but their shape has much.
 
 The search is from the frequent to the rare: dark on light in a reduced image first, light on dark
 at full size last, until enough codes are found for an orientation.
@@ -222,7 +221,6 @@ def in_perspective(
 
 RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
 _BLURS_PX = (0.8, 1.4)
-_LARGEST_SHIFT = 0.2  # radii, of a ring against its disc, by perspective and distortion
 # Largest RMS of the samples against the drawn code, in levels; less for large targets, whose edges
 # are a smaller part of the ring.
 _MISFIT = 0.13
@@ -270,34 +268,9 @@ def ring_misfit(
         drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
         drawn -= np.float32(1)
         drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
-        misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))
+        rms = np.sqrt(np.mean((level[left] - drawn) ** 2, axis=(1, 2)))
+        misfit[left] = np.minimum(misfit[left], rms)
     return misfit
-
-
-def _rms_after_shift(level: Single, drawn: Single) -> Array:
-    """Return the RMS (n,) of level minus drawn (n, radii, angles), fitted by shift, turn, scale."""
-    n = len(level)
-    radii = np.array(RADII, dtype=np.float32)
-    rho, (cosine, sine) = radii[:, None], _circle(ANGLES).astype(np.float32)
-    outwards = np.gradient(drawn, radii, axis=1)
-    around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
-    around *= np.float32(ANGLES / (4 * np.pi))
-    design = np.stack(
-        [
-            outwards * cosine - around * sine / rho,
-            outwards * sine + around * cosine / rho,
-            around,
-            outwards * rho,
-        ],
-        axis=1,
-    ).reshape(n, 4, -1)
-    residual = (level - drawn).reshape(n, -1)
-    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4, dtype=np.float32)
-    shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
-    shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
-    left = residual - (shift[:, None] @ design)[:, 0]
-    rms: Array = np.sqrt(np.mean(left * left, axis=1))
-    return rms
 
 
 _COARSE_RADII = (0.5, 1.5, 2.5, 3.4)

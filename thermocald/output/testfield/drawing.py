@@ -188,12 +188,10 @@ def _draw_corner(
     axes.axis("off")
     floor, left, right = (sheet.size for sheet in sheets)
     x, y, z = np.eye(3)
-    outlines = {
-        "1": np.array([0 * x, floor[0] * x, floor[0] * x + floor[1] * y, floor[1] * y]),
-        "2": np.array([0 * x, left[0] * x, left[0] * x + left[1] * z, left[1] * z]),
-        "3": np.array([0 * x, right[0] * y, right[0] * y + right[1] * z, right[1] * z]),
-    }
-    for (name, corners), grey in zip(outlines.items(), ("0.88", "0.95", "0.92"), strict=True):
+    for name, (width, height), u, v, grey in (
+        ("1", floor, x, y, "0.88"), ("2", left, x, z, "0.95"), ("3", right, y, z, "0.92"),
+    ):  # fmt: skip
+        corners = np.array([0 * u, width * u, width * u + height * v, height * v])
         axes.add_patch(Polygon(_seen(corners), facecolor=grey, edgecolor="black", linewidth=1.2))
         middle = _seen(corners).mean(axis=0)
         axes.text(*middle, name, fontsize=3 * size, ha="center", va="center")

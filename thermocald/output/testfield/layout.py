@@ -59,11 +59,7 @@ _SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
 
 
 _TITLES = ("1 floor (XY)", "2 left wall (XZ)", "3 right wall (YZ)")
-_EDGES = {
-    _TITLES[0]: {"left": "A", "lower": "B"},
-    _TITLES[1]: {"lower": "B", "right": "C"},
-    _TITLES[2]: {"lower": "A", "left": "C"},
-}
+_EDGES = ({"left": "A", "lower": "B"}, {"lower": "B", "right": "C"}, {"lower": "A", "left": "C"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +95,7 @@ class Sheet:
     @property
     def edges(self) -> dict[str, str]:
         """The letters of the edges that meet another sheet, by side: left, right, lower."""
-        return _EDGES.get(self.title, {})
+        return _EDGES[_TITLES.index(self.title)] if self.title in _TITLES else {}
 
     @property
     def scale_bar(self) -> tuple[int, int] | None:

@@ -75,10 +75,8 @@ class LocalMap:
     @property
     def semi_axes(self) -> Array:
         """The semi-axes (n, 2) of the ellipses, px, the major one first."""
-        # in closed form, as `inverse_2x2`
-        a, b, c, d = (self.linear[:, i, k] for i in (0, 1) for k in (0, 1))
-        mean, difference = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
-        return np.stack([mean + difference, np.abs(mean - difference)], axis=1)
+        axes: Array = np.linalg.svd(self.linear, compute_uv=False)
+        return axes
 
     @property
     def half_extent(self) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.marks import mostly_slow
 from tests.photogrammetry import board_images
 from tests.photogrammetry.exact_rendering import noisy, rms
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
@@ -16,7 +15,7 @@ from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.frame import tracking
 from thermocald.photogrammetry.frame.measurement import Measurement
 from thermocald.photogrammetry.frame.tracking import Tracker
-from thermocald.photogrammetry.targets.boards import aprilgrid, charuco
+from thermocald.photogrammetry.targets.boards import charuco
 
 FIELD, NORMALS = small_field()
 STATION = station(800.0)
@@ -124,16 +123,13 @@ def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
     assert np.abs(_z(back)).max() < 5
 
 
-@pytest.fixture(scope="module", params=mostly_slow(["aprilgrid", "charuco"], "charuco"))
-def board(request):
+@pytest.fixture(scope="module")
+def board():
     """Return a board and photographs of it: two from one stand, one where a pattern repeats."""
-    if request.param == "charuco":
-        pattern = (11, 8, 30.0, 22.5, "DICT_5X5_250")
-        field, sheet = charuco(*pattern), board_images.charuco_sheet(*pattern, legacy=False)
-    else:
-        field, sheet = aprilgrid(6, 6, 40.0, 0.3), board_images.aprilgrid_sheet(6, 6, 40.0, 0.3)
+    pattern = (11, 8, 30.0, 22.5, "DICT_5X5_250")
+    field, sheet = charuco(*pattern), board_images.charuco_sheet(*pattern, legacy=False)
     frames, away = [], np.array([150.0, -120.0, 380.0])
-    for step in (0.0, 60.0 if request.param == "charuco" else 52.0):
+    for step in (0.0, 60.0):
         middle = field.points.mean(axis=0) + np.array([step, 0, 0])
         stand = looking_at(middle + away, middle, 0.3)
         frames.append(photograph([sheet], SMALL_CAMERA, stand, noise=0.0))

@@ -75,8 +75,7 @@ class LocalMap:
     @property
     def semi_axes(self) -> Array:
         """The semi-axes (n, 2) of the ellipses, px, the major one first."""
-        axes: Array = np.linalg.svd(self.linear, compute_uv=False)
-        return axes
+        return np.linalg.svd(self.linear, compute_uv=False).astype(float, copy=False)
 
     @property
     def half_extent(self) -> Array:

@@ -220,7 +220,7 @@ def in_perspective(
 
 
 RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
-_BLURS_PX = (0.8, 1.4)
+_BLUR_PX = 1.0  # with which a code is drawn
 # Largest RMS of the samples against the drawn code, in levels; less for large targets, whose edges
 # are a smaller part of the ring.
 _MISFIT = 0.13
@@ -240,7 +240,7 @@ def ring_misfit(
     which: NDArray[np.int64],
     within: Array,
 ) -> Array:
-    """Return the RMS (n,) of samples against the ring that was read, drawn with one of two blurs.
+    """Return the RMS (n,) of samples against the ring that was read, drawn with a usual blur.
 
     level (n, radii, angles): samples at `RADII`, 0 background, 1 ink; ones (n, bits): the code that
     was read; which, within (n, angles): the segment of each angle, and its place in it, 0 to 1.
@@ -258,19 +258,13 @@ def ring_misfit(
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
     across, side = px.astype(np.float32), (angle * along).astype(np.float32)
     rho = np.array(RADII, dtype=np.float32)[:, None]
-    misfit = np.full(len(level), np.inf)
-    for blur in _BLURS_PX:
-        left = np.nonzero(misfit > allowed_misfit(maps))[0]
-        if len(left) == 0:
-            break
-        scale = (across[left] / np.float32(blur))[:, None]
-        drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
-        drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
-        drawn -= np.float32(1)
-        drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
-        rms = np.sqrt(np.mean((level[left] - drawn) ** 2, axis=(1, 2)))
-        misfit[left] = np.minimum(misfit[left], rms)
-    return misfit
+    scale = (across / np.float32(_BLUR_PX))[:, None]
+    drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
+    drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
+    drawn -= np.float32(1)
+    drawn *= normal_cdf(rho * (side / np.float32(_BLUR_PX))[:, None])
+    rms: Array = np.sqrt(np.mean((level - drawn) ** 2, axis=(1, 2), dtype=float))
+    return rms
 
 
 _COARSE_RADII = (0.5, 1.5, 2.5, 3.4)

@@ -18,7 +18,6 @@ from tests.photogrammetry.fields import (
     small_field,
     station,
 )
-from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import blur_trend, frame_figures, measure
@@ -144,17 +143,6 @@ def test_two_targets_are_too_few(frame):
     assert {FIELD.names[t] for t in found.observations.targets} <= {"X0.0", "Y0.0"}
 
 
-def test_hidden_targets_are_missed_with_a_reason(clean):
-    covered = clean.copy()
-    covered[500:700, 700:900] = 120
-    found = measure(noisy(covered, np.random.default_rng(4)), FIELD)
-    inside = np.all((_truth() > (705, 505)) & (_truth() < (895, 695)), axis=1)
-    assert inside.sum() >= 3
-    assert set(np.flatnonzero(inside).tolist()) <= found.missed.keys()
-    assert all(found.missed.values())
-    assert np.abs(_z(found.observations, _truth())).max() < 6
-
-
 @pytest.mark.parametrize("grey", [0, 255])
 def test_a_hand_or_a_glare_without_noise_hides_only_what_is_behind_it(frame, grey):
     """The level of the noise was that of the covered half, 0, and all targets were disturbed."""
@@ -163,13 +151,8 @@ def test_a_hand_or_a_glare_without_noise_hides_only_what_is_behind_it(frame, gre
     found = measure(frame, FIELD)
     assert found.status.ok
     assert free - 2 <= len(found.observations) <= free + 2
+    assert all(found.missed.values())
     assert 0.85 <= np.sqrt(np.mean(_z(found.observations, _truth()) ** 2)) <= 1.15
-
-
-def test_an_invalid_code_is_refused(frame):
-    wrong = TestField.build(["a"], [[0, 0, 0]], diameters=10, codes="RING14:1")
-    with pytest.raises(TestFieldError, match="RING14:1"):
-        measure(frame, wrong)
 
 
 @pytest.fixture(scope="module")

@@ -77,13 +77,10 @@ def _allowed(text):
 # --- other programs: OpenCV's and mrcal's own readers; formulas from the others' manuals -------
 
 
-def _radial_tangential(x, y, k1, k2, p1, p2, k3=0.0):
-    r2 = x * x + y * y
-    f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return (
-        x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * f + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+def _projected(view, fx, fy, cx, cy, *distortion):
+    """OpenCV's projection, which ROS, COLMAP and Kalibr share."""
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return cv2.projectPoints(view, np.zeros(3), np.zeros(3), K, np.array(distortion))[0][:, 0]
 
 
 def _opencv(path, camera, view):
@@ -91,7 +88,7 @@ def _opencv(path, camera, view):
     K, d = (storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients"))
     assert [int(storage.getNode(n).real()) for n in ("image_width", "image_height")] == [3280, 2464]
     storage.release()
-    return cv2.projectPoints(view, np.zeros(3), np.zeros(3), K, d)[0][:, 0]
+    return _projected(view, *K[[0, 1, 0, 1], [0, 1, 2, 2]], *d.ravel())
 
 
 _MRCAL = """
@@ -144,10 +141,8 @@ def _ros(path, camera, view):
     ):  # fmt: skip
         assert (info[key]["rows"], info[key]["cols"]) == shape
         assert len(info[key]["data"]) == shape[0] * shape[1]
-    K = np.array(info["camera_matrix"]["data"]).reshape(3, 3)
-    k1, k2, p1, p2, k3 = info["distortion_coefficients"]["data"]
-    x, y = _radial_tangential(*(view[:, :2] / view[:, 2:]).T, k1, k2, p1, p2, k3)
-    return np.column_stack([K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]])
+    K = np.array(info["camera_matrix"]["data"])
+    return _projected(view, *K[[0, 4, 2, 5]], *info["distortion_coefficients"]["data"])
 
 
 def _colmap(path, camera, view):
@@ -158,21 +153,16 @@ def _colmap(path, camera, view):
     assert (model, len(parameters)) == (
         ("FULL_OPENCV", 12) if camera.interior.A3 else ("OPENCV", 8)
     )
-    fx, fy, cx, cy, k1, k2, p1, p2, *rest = (float(p) for p in parameters)
-    x, y = _radial_tangential(*(view[:, :2] / view[:, 2:]).T, k1, k2, p1, p2, *rest[:1])
-    assert not any(rest[1:])
-    return np.column_stack([fx * x + cx, fy * y + cy]) - 0.5
+    return _projected(view, *(float(p) for p in parameters)) - 0.5
 
 
 def _kalibr(path, camera, view):
     cam = yaml.safe_load(path.read_text())["cam0"]
     assert (cam["camera_model"], cam["distortion_model"]) == ("pinhole", "radtan")
     assert cam["resolution"] == [3280, 2464]
-    fu, fv, pu, pv = cam["intrinsics"]
-    x, y = _radial_tangential(*(view[:, :2] / view[:, 2:]).T, *cam["distortion_coeffs"])
     # without a sixth-order term the fit cannot be exact, and says so
     assert _stated(path.read_text())[0] > 0.1 or camera.interior.A3 == 0
-    return np.column_stack([fu * x + pu, fv * y + pv])
+    return _projected(view, *cam["intrinsics"], *cam["distortion_coeffs"])
 
 
 def _metashape(path, camera, view):

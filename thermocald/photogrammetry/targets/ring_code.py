@@ -227,12 +227,6 @@ _MISFIT = 0.13
 _MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
 
 
-def allowed_misfit(maps: LocalMap) -> Array:
-    """Return the largest misfit (n,), in levels, with which a ring around each disc is accepted."""
-    allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
-    return np.minimum(allowed, _MISFIT)
-
-
 def ring_misfit(
     level: Single,
     maps: LocalMap,
@@ -395,7 +389,8 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
         misfit[rows] = ring_misfit(
             level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
         )
-        misfit[misfit > allowed_misfit(maps)] = np.inf
+        allowed = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
+        misfit[misfit > np.minimum(allowed, _MISFIT)] = np.inf
         one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
         misfit[(one_arc | (ones.sum(axis=1) <= 2)) & (misfit > _MISFIT_OF_FEW)] = np.inf
     return codes, misfit

@@ -133,7 +133,8 @@ def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
 
 ANGLES = 84  # a multiple of 12 and of 14
 COARSE_ANGLES = 28
-_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.1, 0.45
+_PROFILE_ANGLES = 42
+_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.15, 0.45
 _INSIDE = 0.6  # level of a sample, 0 background, 1 ink
 
 
@@ -183,11 +184,11 @@ def in_perspective(
     (w·u) R² in the direction u, instead of at R = 1, 2, 3.
     """
     rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
-    level = sample(image, maps, rho.tolist(), ANGLES, ink)
-    u = _circle(ANGLES)
+    level = sample(image, maps, rho.tolist(), _PROFILE_ANGLES, ink)
+    u = _circle(_PROFILE_ANGLES)
     # away from the ends of an arc, whose corners blur rounds
     ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
-    ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
+    ring &= np.roll(ring, 1, axis=1) & np.roll(ring, -1, axis=1)
     normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
     for radius, rising in ((1.0, False), (RING_INNER, True), (RING_OUTER, False)):
         window = np.abs(rho - radius) < _PROFILE_REACH

@@ -89,16 +89,6 @@ def test_targets_of_a_corrected_frame_agree_with_its_camera_and_pose(thermal):
     assert comment["pose"]["sd_X0"] == pytest.approx(1e-3)
 
 
-def test_missing_exif_is_written(thermal):
-    exif = Image.open(io.BytesIO(corrected(thermal, png(seen_at(thermal, HOT))))).getexif()
-    details = exif.get_ifd(0x8769)
-    assert (exif[0x0110], exif[0x0112], exif[0x0131]) == ("gauge", 1, "thermocald")
-    assert details[0x9003] == "2023:11:14 22:13:20"
-    assert (details[0x9011], details[0x9291]) == ("+00:00", "250")
-    assert details[0x920A] == pytest.approx(thermal.model.interior.c, abs=1e-4)
-    assert details[0xA20E] == pytest.approx(1 / thermal.model.sensor.pixel_pitch, abs=1e-3)
-
-
 def test_exif_colours_and_comment_of_the_camera_stay(thermal):
     """The EXIF orientation of a phone's frame does not turn the pixels."""
     grey = seen_at(thermal, HOT)

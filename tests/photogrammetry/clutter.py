@@ -10,7 +10,7 @@ FINER = 2
 
 
 def clutter(seed: int) -> np.ndarray:
-    """Draw a frame of ellipses, discs with closed rings, flowers of discs, chessboards, letters."""
+    """Draw a frame of ellipses, discs with closed rings, flowers, bars, chessboards, letters."""
     rng = np.random.default_rng(seed)
     image = np.full((HEIGHT * FINER, WIDTH * FINER), int(rng.integers(60, 220)), dtype=np.uint8)
     for _ in range(rng.integers(20, 90)):
@@ -30,19 +30,17 @@ def _grey(rng) -> int:
     return int(rng.integers(0, 256))
 
 
-def _axes(rng) -> tuple[int, int]:
-    r = int(rng.integers(6, 70))
-    return r, max(3, int(r * rng.uniform(0.4, 1)))
+def _ellipses(*radii: int):
+    """Return a function that draws concentric ellipses in turn in one grey and its negative."""
 
+    def draw(image, rng) -> None:
+        at, angle, grey, a = _place(rng), rng.uniform(0, 180), _grey(rng), int(rng.integers(6, 70))
+        b = max(3, int(a * rng.uniform(0.4, 1)))
+        for i, k in enumerate(radii):
+            shade = 255 - grey if i % 2 else grey
+            cv2.ellipse(image, at, (k * a, k * b), angle, 0, 360, shade, -1)
 
-def _ellipse(image, rng) -> None:
-    cv2.ellipse(image, _place(rng), _axes(rng), rng.uniform(0, 180), 0, 360, _grey(rng), -1)
-
-
-def _closed_ring(image, rng) -> None:
-    at, (a, b), angle, grey = _place(rng), _axes(rng), rng.uniform(0, 180), _grey(rng)
-    for k, shade in ((3, grey), (2, 255 - grey), (1, grey)):
-        cv2.ellipse(image, at, (k * a, k * b), angle, 0, 360, shade, -1)
+    return draw
 
 
 def _flower(image, rng) -> None:
@@ -58,28 +56,18 @@ def _bar(image, rng) -> None:
     cv2.line(image, _place(rng), _place(rng), _grey(rng), int(rng.integers(1, 12)))
 
 
-def _box(image, rng) -> None:
-    cv2.rectangle(image, _place(rng), _place(rng), _grey(rng), int(rng.choice([-1, 2, 5])))
-
-
 def _letters(image, rng) -> None:
     text = "".join(chr(rng.integers(48, 123)) for _ in range(8))
     font, size = int(rng.integers(0, 8)), rng.uniform(0.5, 3)
     cv2.putText(image, text, _place(rng), font, size, _grey(rng), int(rng.integers(1, 8)))
 
 
-def _polygon(image, rng) -> None:
-    corners = rng.integers(-60, 60, (int(rng.integers(3, 8)), 2)) + np.array(_place(rng))
-    cv2.fillPoly(image, [corners.astype(np.int32)], _grey(rng))
-
-
 def _chessboard(image, rng) -> None:
     (x, y), grey, size = _place(rng), _grey(rng), int(rng.integers(6, 24))
-    for i in range(6):
-        for j in range(6):
-            corner = (x + i * size, y + j * size)
-            shade = grey if (i + j) % 2 else 255 - grey
-            cv2.rectangle(image, corner, (corner[0] + size - 1, corner[1] + size - 1), shade, -1)
+    for i, j in np.ndindex(6, 6):
+        corner = (x + i * size, y + j * size)
+        shade = grey if (i + j) % 2 else 255 - grey
+        cv2.rectangle(image, corner, (corner[0] + size - 1, corner[1] + size - 1), shade, -1)
 
 
-_THINGS = (_ellipse, _closed_ring, _flower, _bar, _box, _letters, _polygon, _chessboard)
+_THINGS = (_ellipses(1), _ellipses(3, 2, 1), _flower, _bar, _letters, _chessboard)

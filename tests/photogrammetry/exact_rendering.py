@@ -100,7 +100,7 @@ class Scene:
         exterior: ExteriorOrientation,
         window: tuple[int, int, int, int] | None = None,
         blur: float = 0.8,
-        finer: int = 4,
+        finer: int = 3,
     ) -> np.ndarray:
         """Return noise-free grey values (h, w) of the frame or of a window (x, y, w, h).
 

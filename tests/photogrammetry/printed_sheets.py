@@ -26,21 +26,15 @@ BEYOND = 120.0
 def rasterised(pdf: Path, page: int, dpi: float) -> np.ndarray:
     """Return one page as a grey image (H, W)."""
     pdfium = pytest.importorskip("pypdfium2")
-    document = pdfium.PdfDocument(pdf)
-    try:
+    with pdfium.PdfDocument(pdf) as document:
         bitmap = document[page].render(scale=dpi / 72, grayscale=True)
         return bitmap.to_numpy().copy().reshape(bitmap.height, bitmap.width)
-    finally:
-        document.close()
 
 
 def page_count(pdf: Path) -> int:
     pdfium = pytest.importorskip("pypdfium2")
-    document = pdfium.PdfDocument(pdf)
-    try:
+    with pdfium.PdfDocument(pdf) as document:
         return len(document)
-    finally:
-        document.close()
 
 
 @dataclass(frozen=True)

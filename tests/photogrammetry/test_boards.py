@@ -21,44 +21,17 @@ from thermocald.store.recording.testfield_file import read_board, read_rings
 CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
 
 
-@pytest.fixture(scope="module")
-def taken():
-    """Photographs by board, stand and roll, each taken once."""
-    return {}
-
-
-def seen(sheet, field, stand, roll=0.3, taken=None):
+def seen(sheet, field, stand, roll=0.3):
     """Measure a photograph; return also errors (n, 2) px, and the number of visible corners."""
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(stand), middle, roll)
-    taken = {} if taken is None else taken
-    key = (id(sheet), stand, roll)
-    if key not in taken:
-        taken[key] = photograph([sheet], CAMERA, station)
-    found = measure(taken[key], field)
+    found = measure(photograph([sheet], CAMERA, station), field)
     truth = CAMERA.project(station, field.points)
     visible = int(CAMERA.sensor.contains(truth, 6.0).sum())
     return found, found.observations.points - truth[found.observations.targets], visible
 
 
-@pytest.fixture(scope="module")
-def april():
-    return images.aprilgrid_sheet(6, 6, 40.0, 0.3), boards.aprilgrid(6, 6, 40.0, 0.3)
-
-
-STANDS = [(0.0, 0.0, 420.0), (150.0, -120.0, 380.0), (-250.0, 60.0, 300.0)]
 OBLIQUE = [(0.0, 0.0, 300.0), (-200.0, 50.0, 220.0), (-260.0, 90.0, 180.0)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stand", STANDS)
-def test_all_corners_of_an_aprilgrid(april, stand, taken):
-    found, errors, visible = seen(*april, stand, taken=taken)
-    assert found.status.ok
-    assert len(found.observations) >= visible >= 138
-    assert np.sqrt(np.mean(errors**2)) < 0.006
-    ratio = np.sqrt(np.mean((errors / found.observations.sigmas) ** 2))
-    assert 0.9 < ratio < 1.1
 
 
 def drawn_exactly(field, columns, rows, size, spacing):
@@ -107,29 +80,31 @@ def test_the_tags_of_an_aprilgrid_are_the_published_ones():
     assert int(word, 2) == images.APRIL_TAG_0
 
 
-@pytest.mark.parametrize("turn", mostly_slow([1, 2, 3], 2))
-def test_corners_in_another_order_are_not_ok(april, turn, taken):
-    sheet, field = april
-    codes = tuple(f"{c[:-1]}{(int(c[-1]) + turn) % 4}" for c in field.codes)
-    found, _, _ = seen(sheet, replace(field, codes=codes), STANDS[2], taken=taken)
-    assert found.status.word == "other_field"
-    assert "another order" in found.status.reason
-    if turn == 2:
-        assert "180°" in found.status.reason
+def test_corners_in_another_order_are_not_ok():
+    sheet, field = (
+        images.aprilgrid_sheet(3, 3, 40.0, 0.3, px=150),
+        boards.aprilgrid(3, 3, 40.0, 0.3),
+    )
+    middle = field.points.mean(axis=0)
+    station = looking_at(middle + np.array([-150.0, 40.0, 250.0]), middle, 0.3)
+    frame = photograph([sheet], CAMERA, station, finer=2)
+    for turn in (1, 2, 3):
+        codes = tuple(f"{c[:-1]}{(int(c[-1]) + turn) % 4}" for c in field.codes)
+        status = measure(frame, replace(field, codes=codes)).status
+        assert status.word == "other_field"
+        assert "another order" in status.reason
+        assert ("turned by 180°" in status.reason) == (turn == 2)
 
 
-@pytest.mark.parametrize(
-    ("name", "columns", "rows", "legacy"),
-    [("DICT_5X5_250", 11, 8, False), ("DICT_4X4_50", 9, 6, True)],
-)
-def test_all_corners_of_a_charuco_board(name, columns, rows, legacy):
-    field = boards.charuco(columns, rows, 30.0, 22.5, name, legacy=legacy)
-    sheet = images.charuco_sheet(columns, rows, 30.0, 22.5, name, legacy)
+def test_all_corners_of_a_charuco_board():
+    """As OpenCV drew it before 4.6; a present one: `test_a_printed_board_is_found_…`."""
+    field = boards.charuco(9, 6, 30.0, 22.5, "DICT_4X4_50", legacy=True)
+    sheet = images.charuco_sheet(9, 6, 30.0, 22.5, "DICT_4X4_50", legacy=True)
     found, errors, visible = seen(sheet, field, (150.0, -120.0, 380.0))
     assert found.status.ok
     assert len(found.observations) == visible == len(field)
     chess = np.array([field.kinds[r] == "chess_corner" for r in found.observations.targets])
-    assert chess.sum() == (columns - 1) * (rows - 1)
+    assert chess.sum() == 8 * 5
     assert np.sqrt(np.mean(errors[chess] ** 2)) < 0.01
     ratio = errors[chess] / found.observations.sigmas[chess]
     assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.4

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
-from tests.photogrammetry.fields import SMALL_CAMERA, draw_marker
+from tests.photogrammetry.fields import PI_CAMERA, SMALL_CAMERA, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets.corner import measure_corners
@@ -23,7 +23,7 @@ def measure_markers(image, field, missed=None):
 APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
 
 
-def _board(dictionaries=(APRILTAG, ARUCO), size=60.0):
+def _board(size=60.0):
     """Return field and scene of 4 × 3 markers in Z = 0, from alternating dictionaries."""
     scene, markers = Scene(), {}
     for k in range(12):
@@ -32,13 +32,10 @@ def _board(dictionaries=(APRILTAG, ARUCO), size=60.0):
         corners = np.array(
             [[x, y + size, 0], [x + size, y + size, 0], [x + size, y, 0], [x, y, 0.0]]
         )
-        draw_marker(scene, dictionaries[k % len(dictionaries)], k, corners, markers)
-    names, points, codes = [], [], []
-    for (dictionary, number), corners in markers.items():
-        for k in range(4):
-            names.append(f"{number}.{k}")
-            points.append(corners[k])
-            codes.append(f"{dictionary}:{number}:{k}")
+        draw_marker(scene, (APRILTAG, ARUCO)[k % 2], k, corners, markers)
+    names = [f"{number}.{k}" for _, number in markers for k in range(4)]
+    codes = [f"{name}:{number}:{k}" for name, number in markers for k in range(4)]
+    points = np.concatenate(list(markers.values()))
     return TestField.build(names, points, 0.01, np.nan, "marker_corner", codes), scene
 
 
@@ -90,9 +87,7 @@ def test_markers_of_two_dictionaries_are_in_the_fields_order():
     assert list(observed.targets) == list(range(48))
     assert set(observed.quality) == {"blur", "contrast", "grey", "noise", "saturation"}
     assert np.median(observed.quality["blur"]) == pytest.approx(0.8, abs=0.05)
-
-
-def test_markers_outside_the_field_are_ignored():
+    # markers outside the field are ignored
     part = FIELD.subset(np.arange(8))
     assert list(measure_markers(_frontal(3), part).targets) == list(range(8))
 
@@ -110,8 +105,6 @@ def test_a_marker_seen_twice_is_dropped():
 
 @pytest.mark.slow
 def test_markers_are_found_at_half_size_and_measured_at_full_size():
-    from tests.photogrammetry.fields import PI_CAMERA
-
     image = noisy(SCENE.render(PI_CAMERA, VIEWS["frontal"]), np.random.default_rng(5))
     observed = measure_markers(image, FIELD)
     truth = PI_CAMERA.project(VIEWS["frontal"], FIELD.points)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import cv2
@@ -19,7 +18,6 @@ from tests.photogrammetry.fields import (
     small_field,
     station,
 )
-from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import blur_trend, frame_figures, measure
@@ -43,6 +41,9 @@ def _truth(exterior=STATION, field: TestField = FIELD) -> np.ndarray:
     return SMALL_CAMERA.project(exterior, field.points)
 
 
+VISIBLE = int(SMALL_SENSOR.contains(_truth(), 15).sum())
+
+
 def _z(observations, truth) -> np.ndarray:
     return (observations.points - truth[observations.targets]) / observations.sigmas
 
@@ -50,7 +51,7 @@ def _z(observations, truth) -> np.ndarray:
 def test_all_targets_without_a_prior(frame):
     found = measure(frame, FIELD)
     assert found.status.ok
-    assert len(found.observations) == SMALL_SENSOR.contains(_truth(), 15).sum()
+    assert len(found.observations) == VISIBLE
     assert set(found.missed.values()) <= {"cut off by the image's edge"}
     z = _z(found.observations, _truth())
     assert 0.85 <= np.sqrt(np.mean(z**2)) <= 1.15  # 200 values have 5 %
@@ -64,19 +65,19 @@ def test_all_targets_without_a_prior(frame):
 
 
 @pytest.mark.parametrize(
-    ("name", "change"),
+    "change",
     [
-        ("upside down", lambda image: np.ascontiguousarray(image[::-1, ::-1])),
-        ("16 bit", lambda image: image.astype(np.uint16) * 257),
-        ("12 bit in 16", lambda image: image.astype(np.uint16) * 16),
-        ("negative", lambda image: 255 - image),
-        ("dim", lambda image: image // 4),
+        lambda image: np.ascontiguousarray(image[::-1, ::-1]),
+        lambda image: image.astype(np.uint16) * 16,
+        lambda image: 255 - image,
+        lambda image: image // 4,
     ],
+    ids=["upside down", "12 bit in 16", "negative", "dim"],
 )
-def test_unusual_frames_are_measured(frame, name, change):
+def test_unusual_frames_are_measured(frame, change):
     found = measure(change(frame), FIELD)
-    assert found.status.ok, name
-    assert len(found.observations) >= 0.99 * len(measure(frame, FIELD).observations)
+    assert found.status.ok
+    assert len(found.observations) >= 0.99 * VISIBLE
 
 
 @pytest.mark.parametrize(
@@ -127,47 +128,31 @@ def test_all_targets_are_measured_after_a_large_drift(frame):
     i = SMALL_CAMERA.interior
     earlier = i.with_values(c=i.c * 0.99, x0=i.x0 + 30 * SMALL_SENSOR.pixel_pitch)
     found = measure(frame, FIELD, CameraSpec("", SMALL_SENSOR, interior=earlier))
-    assert len(found.observations) == len(measure(frame, FIELD).observations)
+    assert len(found.observations) == VISIBLE
     assert np.abs(_z(found.observations, _truth())).max() < 5
 
 
-def test_two_targets_are_too_few(clean):
-    image = np.full(clean.shape, 190.0)
+def test_two_targets_are_too_few(frame):
+    image = np.full_like(frame, 190)
     for name in ("X0.0", "Y0.0"):
         x, y = np.rint(_truth()[FIELD.index[name]]).astype(int)
         part = (slice(y - 45, y + 45), slice(x - 45, x + 45))
-        image[part] = clean[part]
-    found = measure(noisy(image, np.random.default_rng(3)), FIELD)
+        image[part] = frame[part]
+    found = measure(image, FIELD)
     assert found.status.word == "too_few"
     assert {FIELD.names[t] for t in found.observations.targets} <= {"X0.0", "Y0.0"}
-
-
-def test_hidden_targets_are_missed_with_a_reason(clean):
-    covered = clean.copy()
-    covered[500:700, 700:900] = 120
-    found = measure(noisy(covered, np.random.default_rng(4)), FIELD)
-    inside = np.all((_truth() > (705, 505)) & (_truth() < (895, 695)), axis=1)
-    assert inside.sum() >= 3
-    for row in np.nonzero(inside)[0]:
-        assert found.missed[int(row)]
-    assert np.abs(_z(found.observations, _truth())).max() < 6
 
 
 @pytest.mark.parametrize("grey", [0, 255])
 def test_a_hand_or_a_glare_without_noise_hides_only_what_is_behind_it(frame, grey):
     """The level of the noise was that of the covered half, 0, and all targets were disturbed."""
-    free = np.count_nonzero(measure(frame, FIELD).observations.points[:, 0] < 680)
+    free = np.count_nonzero(SMALL_SENSOR.contains(_truth(), 15) & (_truth()[:, 0] < 680))
     frame[:, 700:] = grey
     found = measure(frame, FIELD)
     assert found.status.ok
     assert free - 2 <= len(found.observations) <= free + 2
+    assert all(found.missed.values())
     assert 0.85 <= np.sqrt(np.mean(_z(found.observations, _truth()) ** 2)) <= 1.15
-
-
-def test_an_invalid_code_is_refused(frame):
-    wrong = TestField.build(["a"], [[0, 0, 0]], diameters=10, codes="RING14:1")
-    with pytest.raises(TestFieldError, match="RING14:1"):
-        measure(frame, wrong)
 
 
 @pytest.fixture(scope="module")
@@ -230,31 +215,22 @@ def test_circles_named_by_a_marker(mixed):
 
 
 @pytest.mark.slow
-def test_visible_targets_are_found(capsys):
+def test_visible_targets_are_found():
     """Random stations, up to 63° oblique, both inks, blur, uneven light, obstacles, highlights."""
-    visible = found = wrong = 0
-    causes: Counter[str] = Counter()
-    z = []
+    visible, z = 0, []
     for seed in range(40):
-        case = _random_case(seed)
-        measured = measure(case["frame"], case["field"], CameraSpec("", SMALL_SENSOR))
-        seen = np.isin(np.arange(len(case["field"])), measured.observations.targets)
-        visible += int(case["visible"].sum())
-        found += int((seen & case["visible"]).sum())
-        for row in np.nonzero(case["visible"] & ~seen)[0]:
-            causes[measured.missed.get(int(row), measured.status.word)] += 1
-        error = np.abs(measured.observations.points - case["truth"][measured.observations.targets])
-        wrong += int((error.max(axis=1, initial=0.0) > 1.0).sum())
-        mask = case["visible"][measured.observations.targets]
-        z.append(_z(measured.observations, case["truth"])[mask])
-    with capsys.disabled():
-        print(f"\n{found} of {visible} visible targets found; missed: {dict(causes)}")
-    assert wrong == 0
-    assert found >= 0.99 * visible
-    assert 0.9 <= np.sqrt(np.mean(np.concatenate(z) ** 2)) <= 1.1
+        field, frame, truth, in_view = _random_case(seed)
+        measured = measure(frame, field, CameraSpec("", SMALL_SENSOR)).observations
+        assert np.abs(measured.points - truth[measured.targets]).max(initial=0.0) < 1.0
+        visible += int(in_view.sum())
+        z.append(_z(measured, truth)[in_view[measured.targets]])
+    z = np.concatenate(z)
+    assert len(z) >= 0.99 * visible
+    assert 0.9 <= np.sqrt(np.mean(z**2)) <= 1.1
 
 
-def _random_case(seed: int) -> dict:
+def _random_case(seed: int):
+    """Return a field, its frame, the true image points, and which targets are in view."""
     rng = np.random.default_rng(seed)
     diameter, bits = float(rng.uniform(12, 18)), int(rng.choice([12, 14]))
     field, normals = corner_field(per_side=6, spacing=75.0, diameter=diameter, bits=bits)
@@ -297,12 +273,7 @@ def _random_case(seed: int) -> dict:
     for i in np.nonzero(visible)[0]:
         (x0, y0), (x1, y1) = low[i].astype(int), high[i].astype(int)
         visible[i] = not spoilt[y0:y1, x0:x1].any()
-    return {
-        "field": field,
-        "frame": noisy(image, rng, rng.uniform(1, 4)),
-        "truth": maps.centre,
-        "visible": visible,
-    }
+    return field, noisy(image, rng, rng.uniform(1, 4)), maps.centre, visible
 
 
 def _points(n: int, rng: np.random.Generator) -> np.ndarray:

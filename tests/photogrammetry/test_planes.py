@@ -40,18 +40,7 @@ def test_two_boards_on_one_wall_and_a_loose_target():
     assert labels[0] != labels[16]
 
 
-def test_a_sheet_may_bulge():
-    x, y = (g.ravel() for g in np.meshgrid(np.arange(8) * 60.0, np.arange(8) * 60.0))
-    z = 2 * (1 - ((x - 210) ** 2 + (y - 210) ** 2) / 210**2)  # 4 mm from the middle to a corner
-    slope = np.column_stack([4 * (x - 210) / 210**2, 4 * (y - 210) / 210**2, np.ones_like(x)])
-    true = slope / np.linalg.norm(slope, axis=1, keepdims=True)
-    angle = np.degrees(np.arccos(np.abs(np.sum(target_normals(np.c_[x, y, z]) * true, axis=1))))
-    assert np.max(angle) < 3.0
-
-
-@pytest.mark.parametrize(
-    ("columns", "rows", "step", "bend"), [(12, 9, 30, 2), (16, 12, 50, 50), (20, 14, 25, 20)]
-)
+@pytest.mark.parametrize(("columns", "rows", "step", "bend"), [(12, 9, 30, 2), (16, 12, 50, 50)])
 def test_all_rows_of_a_bent_sheet_have_its_normals(columns, rows, step, bend):
     x, y = (g.ravel() * step for g in np.meshgrid(np.arange(columns), np.arange(rows)))
     u = 2 * x / x.max() - 1

@@ -36,16 +36,6 @@ def test_codes_follow_the_published_rule(bits, count):
         ring_code.codes(13)
 
 
-@pytest.mark.parametrize("bits", ring_code.BITS)
-def test_segments_draw_the_code_up_to_rotation(bits):
-    for number in ring_code.codes(bits):
-        drawn = 0
-        for begin, end in ring_code.segments(bits, number):
-            for k in range(round(begin * bits), round(end * bits)):
-                drawn |= 1 << (bits - 1 - k % bits)
-        assert ring_code.smallest_rotation(drawn, bits) == number
-
-
 @pytest.mark.parametrize(
     "code",
     ["RING12:1", "RING13:65", "RING12:", "RING12:x", "RING14:65.0",
@@ -89,18 +79,6 @@ def test_a_code_seen_twice_is_dropped():
     side = len(patch)
     image[y + 200 : y + 200 + side, x : x + side] = noisy(patch, np.random.default_rng(5))
     assert _codes(image) == {(14, ring_code.codes(14)[7])}
-
-
-def test_a_mirrored_target_has_the_mirrored_code():
-    targets = single_targets(diameters=(24,), tilts=(0, 20, 40), bits=14)
-    image = np.ascontiguousarray(targets.frame(np.random.default_rng(6), 2.0)[:, ::-1])
-    drawn = {(14, ring_code.codes(14)[7 * k]) for k in range(3)}
-    mirrored = {(14, _mirrored(number)) for _, number in drawn}
-    assert _codes(image) == mirrored
-
-
-def _mirrored(number: int, bits: int = 14) -> int:
-    return ring_code.smallest_rotation(int(format(number, f"0{bits}b")[::-1], 2), bits)
 
 
 @pytest.mark.slow

@@ -30,27 +30,22 @@ def sheet(tmp_path_factory):
     return printed.field, put_up(folder / "testfield.pdf", PAGE, TRIM)
 
 
-def frame_from(sheet, stand, noise=0.0):
+def frame_from(sheet, stand):
     field, sheets = sheet
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(STANDS[stand]), middle, 0.4)
     seen = CAMERA.sensor.contains(CAMERA.project(station, field.points), 30.0).sum()
-    return photograph(sheets, CAMERA, station, noise=noise, blur=0.4, finer=2), int(seen)
-
-
-def found_at(frame, field, scale):
-    small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return len(measure(frame if scale == 1 else small, field).observations)
+    return photograph(sheets, CAMERA, station, noise=2.0, blur=0.4, finer=2), int(seen)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stand", STANDS)
-@pytest.mark.parametrize("noise", [0.0, 2.0])
-def test_fifty_scales(sheet, stand, noise):
-    """Every second scale is without noise, the others with it."""
-    frame, seen = frame_from(sheet, stand, noise)
-    scales = np.linspace(0.2, 1.0, 50)[noise > 0 :: 2]
-    found = [found_at(frame, sheet[0], scale) for scale in scales]
+def test_seventeen_scales(sheet, stand):
+    frame, seen = frame_from(sheet, stand)
+    found = []
+    for scale in np.linspace(0.2, 1.0, 17):
+        small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        found.append(len(measure(small, sheet[0]).observations))
     assert min(found) >= 0.97 * seen, found
     assert seen >= 50
 

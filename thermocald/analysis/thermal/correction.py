@@ -40,9 +40,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.photogrammetry.targets.image_file import (
     EncodedImage,
-    has_exif,
     with_comment,
-    with_exif,
     with_metadata,
 )
 from thermocald.result import jsonable, with_sds
@@ -182,10 +180,6 @@ class FrameCorrector:
         resampled = self._maps.resample(image, result.interior.as_array())
         _, data = cv2.imencode(".jpg", resampled, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         jpeg = with_metadata(data.tobytes(), encoded)
-        if not has_exif(jpeg):
-            pixels = 1.0 / sensor.pixel_pitch
-            when = calibrated.epoch.frame_time
-            jpeg = with_exif(jpeg, self._camera, when, self._steady.interior.c, pixels)
         epoch, pose = calibrated.epoch, None
         if result.exterior is not None:
             sd = np.sqrt(np.diag(result.covariance)[EOP])

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch, Polygon
+from matplotlib.patches import PathPatch, Polygon, Wedge
 from matplotlib.path import Path as Curve
 from matplotlib.transforms import Affine2D
 
@@ -188,12 +188,10 @@ def _draw_corner(
     axes.axis("off")
     floor, left, right = (sheet.size for sheet in sheets)
     x, y, z = np.eye(3)
-    outlines = {
-        "1": np.array([0 * x, floor[0] * x, floor[0] * x + floor[1] * y, floor[1] * y]),
-        "2": np.array([0 * x, left[0] * x, left[0] * x + left[1] * z, left[1] * z]),
-        "3": np.array([0 * x, right[0] * y, right[0] * y + right[1] * z, right[1] * z]),
-    }
-    for (name, corners), grey in zip(outlines.items(), ("0.88", "0.95", "0.92"), strict=True):
+    for name, (width, height), u, v, grey in (
+        ("1", floor, x, y, "0.88"), ("2", left, x, z, "0.95"), ("3", right, y, z, "0.92"),
+    ):  # fmt: skip
+        corners = np.array([0 * u, width * u, width * u + height * v, height * v])
         axes.add_patch(Polygon(_seen(corners), facecolor=grey, edgecolor="black", linewidth=1.2))
         middle = _seen(corners).mean(axis=0)
         axes.text(*middle, name, fontsize=3 * size, ha="center", va="center")
@@ -269,18 +267,9 @@ def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
 
 def _ring_segment(centre: tuple[float, float], r: float, begin: float, end: float) -> Any:
     """Return an arc of the ring; codes run clockwise but y is up: angles are negated."""
-    arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
-    unit = np.asarray(arc.vertices, dtype=float)
-    outer, inner = unit * outline.RING_OUTER * r, unit[::-1] * outline.RING_INNER * r
-    codes = np.concatenate(
-        [
-            np.asarray(arc.codes),
-            [Curve.LINETO],
-            np.full(len(inner) - 1, Curve.CURVE4),
-            [Curve.CLOSEPOLY],
-        ]
-    )
-    return Curve(np.concatenate([outer, inner, outer[:1]]) + np.array(centre), codes)
+    width = (outline.RING_OUTER - outline.RING_INNER) * r
+    angles = -360 * end, -360 * begin
+    return Wedge(centre, outline.RING_OUTER * r, *angles, width=width).get_path()
 
 
 def _legend(pen: Pen, sheet: Sheet) -> None:

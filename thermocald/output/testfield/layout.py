@@ -59,11 +59,7 @@ _SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
 
 
 _TITLES = ("1 floor (XY)", "2 left wall (XZ)", "3 right wall (YZ)")
-_EDGES = {
-    _TITLES[0]: {"left": "A", "lower": "B"},
-    _TITLES[1]: {"lower": "B", "right": "C"},
-    _TITLES[2]: {"lower": "A", "left": "C"},
-}
+_EDGES = ({"left": "A", "lower": "B"}, {"lower": "B", "right": "C"}, {"lower": "A", "left": "C"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +95,7 @@ class Sheet:
     @property
     def edges(self) -> dict[str, str]:
         """The letters of the edges that meet another sheet, by side: left, right, lower."""
-        return _EDGES.get(self.title, {})
+        return _EDGES[_TITLES.index(self.title)] if self.title in _TITLES else {}
 
     @property
     def scale_bar(self) -> tuple[int, int] | None:
@@ -109,11 +105,9 @@ class Sheet:
         if len(coded) < 2:
             return None
         x, y, _ = self.field.points.T
-        lowest = [i for i in coded if y[i] == y[coded].min()]
-        row = sorted(lowest, key=lambda i: x[i])
-        if len(row) < 2:
-            row = sorted(coded, key=lambda i: y[i])
-        return row[0], row[-1]
+        upwards = sorted(coded, key=lambda i: (y[i], x[i]))
+        lowest = [i for i in upwards if y[i] == y[upwards[0]]]
+        return (upwards[0], lowest[-1]) if len(lowest) > 1 else (upwards[0], upwards[-1])
 
 
 def paper_size(text: str, *, landscape: bool = False) -> tuple[float, float]:

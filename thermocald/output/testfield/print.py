@@ -151,19 +151,15 @@ class Board:
 
     def squares(self) -> Iterator[tuple[float, float, float]]:
         """Yield the black squares that are not markers: lower left x, y and side, mm."""
-        s = self.square
         if self._tags:
             step = self.marker + self._gap
             for j, i in product(range(self.rows + 1), range(self.columns + 1)):
                 yield i * step - self._gap, j * step - self._gap, self._gap
-        elif self.kind == "chessboard":
-            for j, i in product(range(self.rows + 1), range(self.columns + 1)):
-                if (i + self.rows - j) % 2 == 0:  # the upper left one is black
-                    yield i * s, j * s, s
         else:
-            white = {(int(x // s), int(y // s)) for _, (x, y), *_ in self.markers()}
-            for j, i in product(range(self.rows), range(self.columns)):
-                if (i, j) not in white:
+            s, more = self.square, int(self.kind == "chessboard")
+            white = self.legacy and self.rows % 2 == 0  # the upper left one
+            for j, i in product(range(self.rows + more), range(self.columns + more)):
+                if (i + self.rows + more - 1 - j) % 2 == white:
                     yield i * s, j * s, s
 
     def markers(self) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:

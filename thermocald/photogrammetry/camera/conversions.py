@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 
 if TYPE_CHECKING:
@@ -43,7 +43,9 @@ if TYPE_CHECKING:
 EXACT_PX = 1e-7
 _GRID = (41, 31)
 _CHECK_GRID = (97, 73)
-_NO_POSE = np.zeros(6)
+_STEP = 1e-30j
+"""All families are polynomial or rational: a complex step gives a derivative without a difference.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,14 +103,14 @@ def convert(
     if not exact:
         result = least_squares(
             lambda v: (project_target(v, directions) - grid).ravel(), result,
-            lambda v: _derivative(project_target, v, directions),
+            partial(_derivative, lambda v: project_target(v, directions)),
             x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=None, max_nfev=50,
         ).x  # fmt: skip
         residual = project_target(result, checked) - check
     propagated = None
     if covariance is not None:
-        G = _derivative(project_target, result, directions)
-        F = _derivative(project_source, values, directions)
+        G = _derivative(lambda v: project_target(v, directions), result)
+        F = _derivative(lambda v: project_source(v, directions), values)
         scales = np.linalg.norm(G, axis=0)
         scales[scales == 0] = 1.0  # a parameter without effect is 0
         J = np.linalg.lstsq(G / scales, F, rcond=1e-14)[0] / scales[:, None]
@@ -128,57 +130,27 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
     c, x0, y0, C1 = own[[0, 1, 2, 8]]
     from_point = (pixels - sensor.centre) * sensor.pixel_pitch - np.array([x0, -y0])
     d: Array = from_point / np.array([c * (1 + C1), c])
-    step = 1e-6
-    for _ in range(60):
-        r = pixels - family.project(sensor, values, d)
-        worst = float(np.max(np.abs(r))) if np.all(np.isfinite(r)) else np.inf
-        if worst < 1e-9:
-            return d
-        J = np.empty((len(d), 2, 2))
-        for k, e in enumerate(step * np.eye(2)):
-            ahead, behind = (family.project(sensor, values, d + by) for by in (e, -e))
-            J[:, :, k] = (ahead - behind) / (2 * step)
-        try:
-            d = d + np.linalg.solve(J, r[..., None])[..., 0]
-        except np.linalg.LinAlgError:
-            break
-    # the numerical derivative limits the accuracy
-    if worst < EXACT_PX:
-        return d
+    with np.errstate(all="ignore"):  # a distortion that folds back may run away
+        for _ in range(60):
+            r = pixels - family.project(sensor, values, d)
+            worst = float(np.max(np.abs(r)))
+            if worst < 1e-9:
+                return d
+            J = [np.imag(family.project(sensor, values, d + by)) for by in _STEP * np.eye(2)]
+            try:
+                d = d + np.linalg.solve(np.stack(J, axis=-1) / abs(_STEP), r[..., None])[..., 0]
+            except np.linalg.LinAlgError:
+                break
     raise GeometryError(
         f"the {family.name} model has no rays for some of the image: its distortion folds back "
         "inside the picture; it was calibrated over a smaller area, or its parameters are wrong"
     )
 
 
-def _derivative(
-    function: Callable[[Array, Array], Array], values: Array, directions: Array
-) -> Array:
-    """Return ∂(image points)/∂(parameters), (2n, u), by central differences.
-
-    All families are polynomial or rational in their parameters; a step moves the image by about a
-    hundredth of a pixel.
-    """
-    G = np.zeros((2 * len(directions), len(values)))
-    base = function(values, directions)
-    for k in range(len(values)):
-        h = 1e-6 * max(abs(values[k]), 1e-3)
-        for _ in range(30):
-            moved = values.copy()
-            moved[k] += h
-            shift = float(np.nanmax(np.abs(function(moved, directions) - base)))
-            if shift == 0:
-                h *= 1e3
-            elif 1e-4 < shift < 1e-1:
-                break
-            else:
-                h *= 1e-2 / shift
-        plus, minus = values.copy(), values.copy()
-        plus[k] += h
-        minus[k] -= h
-        ahead, behind = (function(v, directions).ravel() for v in (plus, minus))
-        G[:, k] = (ahead - behind) / (plus[k] - minus[k])
-    return G
+def _derivative(function: Callable[[Array], Array], values: Array) -> Array:
+    """Return ∂function/∂values, the function's values in a column, exact to the last digits."""
+    columns = [np.imag(function(values + by)).ravel() for by in _STEP * np.eye(len(values))]
+    return np.stack(columns, axis=1) / abs(_STEP)
 
 
 def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, float]:
@@ -186,11 +158,9 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
 
     values (10,), covariance (10, 10). `exact` is 1 without affinity and shear, else 0.
     """
-    family, step = opencv(5), 1e-30
+    family = opencv(5)
     terms = family.from_brown(sensor, values).tolist()
-    # complex-step derivative, exact to the last digit
-    stepped = family.from_brown(sensor, values[:, None] + 1j * step * np.eye(10))
-    J = np.imag(stepped) / step
+    J = _derivative(partial(family.from_brown, sensor), values)
     found: dict[str, float] = {"width": sensor.width, "height": sensor.height}
     for name, value, variance in zip(
         family.parameters, terms, np.diag(J @ covariance @ J.T).tolist(), strict=True
@@ -199,9 +169,16 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
     return {**found, "exact": float(values[8] == 0 and values[9] == 0)}
 
 
+def _pixels(sensor: Sensor, x: Array, y: Array) -> Array:
+    """Return image points (n, 2) px from x, y mm; unlike `image_to_px`, also of complex numbers."""
+    return np.column_stack([x, -y]) / sensor.pixel_pitch + sensor.centre
+
+
 def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
-    points = np.column_stack([directions[:, 0], -directions[:, 1], -np.ones(len(directions))])
-    return project(sensor, iop, _NO_POSE, points)
+    c, x0, y0, *_, C1, C2 = iop
+    x, y = c * directions[:, 0], -c * directions[:, 1]
+    dx, dy = _balanced_correction(iop, 0.0, x, y)
+    return _pixels(sensor, x0 + x + dx + C1 * x + C2 * y, y0 + y + dy)
 
 
 BROWN = Family(
@@ -225,14 +202,20 @@ def opencv(count: int) -> Family:
     )
 
 
-def _project_opencv(_: Sensor, values: Array, directions: Array) -> Array:
-    import cv2
+def _sixteen(values: Array) -> Array:
+    """Return all of OpenCV's parameters, 0 for those that a model does not have."""
+    return np.pad(values, (0, len(_OPENCV) - len(values)))
 
-    fx, fy, cx, cy, *distortion = values.tolist()
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    points, none = np.column_stack([directions, np.ones(len(directions))]), np.zeros(3)
-    found = cv2.projectPoints(points, none, none, K, np.array(distortion))[0]
-    return np.asarray(found, dtype=float).reshape(-1, 2)
+
+def _project_opencv(_: Sensor, values: Array, directions: Array) -> Array:
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = _sixteen(values)
+    x, y = directions[:, 0], directions[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4)
+    return np.column_stack([fx * xd + cx, fy * yd + cy])
 
 
 def _opencv_of_brown(sensor: Sensor, iop: Array) -> Array:
@@ -249,7 +232,7 @@ def _opencv_of_brown(sensor: Sensor, iop: Array) -> Array:
 
 def _brown_of_opencv(sensor: Sensor, values: Array) -> Array:
     """Convert OpenCV's parameters to ours: a rational denominator to first order, no thin prism."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, *_ = np.pad(values, (0, 16 - len(values)))
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, *_ = _sixteen(values)
     p, c, centre = sensor.pixel_pitch, fy * sensor.pixel_pitch, sensor.centre
     A3 = 0.0 if k4 or k5 or k6 else k3 / c**6
     return np.array(
@@ -313,13 +296,13 @@ def measured_point(r0: float) -> Family:
             with np.errstate(over="ignore", invalid="ignore"):  # tested below
                 dx, dy = _balanced_correction(values, r0, x, y)
                 new_x, new_y = ideal_x + (dx + C1 * x + C2 * y), ideal_y + dy
-                change = float(np.max(np.hypot(new_x - x, new_y - y)))
+                change = float(np.max(np.abs(new_x - x) + np.abs(new_y - y)))
             x, y = new_x, new_y
             if change < 1e-12 * sensor.pixel_pitch:
                 break
             if not np.isfinite(change):
                 raise GeometryError(f"the {name} does not converge over the image")
-        return np.column_stack([x0 + x, -(y0 + y)]) / sensor.pixel_pitch + sensor.centre
+        return _pixels(sensor, x0 + x, y0 + y)
 
     def of_brown(_: Sensor, iop: Array) -> Array:
         """Keep the distortion terms, the constant part of r0 in c; convert affinity exactly."""
@@ -345,8 +328,7 @@ def aicon(r0: float) -> Family:
         x, y = c * directions[:, 0], -c * directions[:, 1]
         dx, dy = _balanced_correction(values, r0, x, y)
         x, y = x + dx, y + dy
-        image = np.column_stack([x0 + (1 + C1) * x + C2 * y, -(y0 + y)])
-        return image / sensor.pixel_pitch + sensor.centre
+        return _pixels(sensor, x0 + (1 + C1) * x + C2 * y, y0 + y)
 
     return Family(
         f"AICON model, R0 {r0:g} mm",

@@ -9,7 +9,7 @@ import json
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import yaml
@@ -19,10 +19,12 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel
+
+_T = TypeVar("_T")
 
 
 def yaml_mapping(text: str) -> dict[Any, Any]:
@@ -64,6 +66,14 @@ def numbers(values: Any, what: str, counts: tuple[int, ...]) -> Array:
         wanted = " or ".join(map(str, counts))
         raise ConfigurationError(f"{what} has {len(result)} numbers, not {wanted}")
     return result
+
+
+def among(known: Mapping[str, _T], given: Any, what: str) -> _T:
+    """Return what is known of a model that a file names; `what` names it in the error."""
+    found = known.get(str(given))
+    if found is None:
+        raise ConfigurationError(f"{what} {given!r}: only {', '.join(known)} can be read")
+    return found
 
 
 _LARGEST = 1e9

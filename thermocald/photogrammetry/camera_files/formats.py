@@ -49,6 +49,7 @@ from thermocald.photogrammetry.camera.conversions import Family, aicon, measured
 from thermocald.photogrammetry.camera_files.camera_record import (
     CameraRecord,
     Format,
+    among,
     number,
     numbers,
     yaml_mapping,
@@ -149,12 +150,7 @@ def _encode_ros(record: CameraRecord) -> str:
 
 def _decode_ros(text: str) -> CameraRecord:
     document = yaml_mapping(text)
-    model = document.get("distortion_model")
-    count = _ROS_COUNTS.get(str(model))
-    if count is None:
-        raise ConfigurationError(
-            f"distortion_model {model!r}: only plumb_bob and rational_polynomial can be read"
-        )
+    count = among(_ROS_COUNTS, document.get("distortion_model"), "distortion_model")
     return _of_matrices(document, (count,))
 
 
@@ -236,12 +232,7 @@ def _decode_mrcal(text: str) -> CameraRecord:
         raise ConfigurationError("not a dictionary in Python's notation") from None
     if not isinstance(document, dict):
         raise ConfigurationError("not a dictionary")
-    lens = document.get("lensmodel")
-    count = _MRCAL_COUNTS.get(str(lens))
-    if count is None:
-        raise ConfigurationError(
-            f"lensmodel {lens!r}: only {', '.join(sorted(_MRCAL_COUNTS))} can be read"
-        )
+    count = among(_MRCAL_COUNTS, document.get("lensmodel"), "lensmodel")
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
     size = numbers(document.get("imagersize"), "imagersize", (2,))
     return CameraRecord(size, opencv(count), values)
@@ -284,13 +275,8 @@ def _decode_colmap(text: str) -> CameraRecord:
     if len(cameras) != 1:
         raise ConfigurationError(f"the file has {len(cameras)} cameras: keep the line of one")
     fields = cameras[0]
-    if len(fields) < 5 or fields[1] not in _COLMAP_SLOTS:
-        shown = fields[1] if len(fields) > 1 else ""
-        raise ConfigurationError(
-            f"camera model {shown!r}: only {', '.join(_COLMAP_SLOTS)} can be read"
-        )
-    slots = _COLMAP_SLOTS[fields[1]]
-    given = [number(f, f"parameter {i + 1}") for i, f in enumerate(fields[4:])]
+    slots = among(_COLMAP_SLOTS, fields[1] if len(fields) > 4 else "", "camera model")
+    given = [number(f, f"parameter {i}") for i, f in enumerate(fields[4:], 1)]
     if len(given) != len(slots):
         raise ConfigurationError(f"{fields[1]} has {len(slots)} parameters, not {len(given)}")
     values = np.zeros(12)

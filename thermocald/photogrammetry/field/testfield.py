@@ -122,14 +122,10 @@ class TestField:
     def subset(self, rows: ArrayLike) -> TestField:
         """Return the test field of some rows (indices)."""
         r = np.asarray(rows, dtype=int)
-        return TestField(
-            tuple(self.names[i] for i in r),
-            self.points[r],
-            self.sigmas[r],
-            self.diameters[r],
-            tuple(self.kinds[i] for i in r),
-            tuple(self.codes[i] for i in r),
+        names, kinds, codes = (
+            tuple(column[i] for i in r) for column in (self.names, self.kinds, self.codes)
         )
+        return TestField(names, self.points[r], self.sigmas[r], self.diameters[r], kinds, codes)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
-from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, Word, inspect_frame
+from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.targets.markers import (
     corners_turned_deg,
     is_marker,
@@ -269,24 +269,24 @@ class _Frame:
         foreign: bool = False,
     ) -> Measurement:
         """Return the measurement with its status; foreign: codes of another field were seen."""
-        word: Word = "ok"
-        n, why = len(observations), ""
-        if n < _FEWEST and foreign:
-            word, why = (
-                "other_field",
-                "the ring codes in the frame are not those of this test field",
-            )
-        elif n == 0:
-            word, why = "nothing_found", _why_nothing(self._missed)
-            if not any(self._field.codes):
-                why = (
-                    "the test field has no coded target and the camera's orientation is unknown: "
-                    "plain circles alone cannot be identified"
-                )
-        elif n < _FEWEST:
-            word, why = "too_few", f"only {n} targets are found in the frame"
-        status = FrameStatus(word, why)
+        status = self._status(len(observations), foreign)
         return Measurement(observations, status, self._missed, orientation, self._places)
+
+    def _status(self, n: int, foreign: bool) -> FrameStatus:
+        if n >= _FEWEST:
+            return OK
+        if foreign:
+            why = "the ring codes in the frame are not those of this test field"
+            return FrameStatus("other_field", why)
+        if n:
+            return FrameStatus("too_few", f"only {n} targets are found in the frame")
+        why = _why_nothing(self._missed)
+        if not any(self._field.codes):
+            why = (
+                "the test field has no coded target and the camera's orientation is unknown: "
+                "plain circles alone cannot be identified"
+            )
+        return FrameStatus("nothing_found", why)
 
     def _other_field(self, why: str) -> Measurement:
         status = FrameStatus("other_field", why)

@@ -267,7 +267,7 @@ def _track_circles(
     fit = weights.apply(image)
     old, p, misfit = weights.parameters, fit.parameters, fit.misfit
     top = float(np.iinfo(image.dtype).max)
-    level = max(float(_median(misfit[seen])) if seen.any() else 1.0, 1.0)
+    level = max(float(np.median(misfit[seen])) if seen.any() else 1.0, 1.0)
     disturbed = (
         (np.abs(p[:, :2] - old[:, :2]).max(axis=1, initial=0.0) > RENEWED_AT_PX)
         | (misfit > _MISFIT * level)
@@ -279,10 +279,10 @@ def _track_circles(
     again = disturbed | ~seen
     calm = ~again
     # the noise may have changed since the weights were computed; calm targets show by how much
-    factor = float(_median(misfit[calm])) ** 2 if calm.any() else 1.0
+    factor = float(np.median(misfit[calm])) ** 2 if calm.any() else 1.0
     np.multiply(fit.covariances, factor, out=fit.covariances)
     # assume that the others have moved like the calm ones
-    shift = _median(p[calm, :2] - old[calm, :2]) if calm.any() else np.zeros(2)
+    shift = np.median(p[calm, :2] - old[calm, :2], axis=0) if calm.any() else np.zeros(2)
     if again.any():
         if np.abs(shift).max() > farthest:
             return None
@@ -304,11 +304,3 @@ def _track_circles(
         missed.update(fit.missed(rows))
     fit = replace(fit, noise=fit.noise.scaled(factor))
     return fit.observations(rows, good), (rows, weights, good)
-
-
-def _median(values: Array) -> Array:
-    """Return the median along the first axis; np.median takes five times as long for few values."""
-    ordered = np.sort(values, axis=0)
-    n = len(ordered)
-    middle: Array = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
-    return middle

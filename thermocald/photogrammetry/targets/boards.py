@@ -265,15 +265,11 @@ def _find_board(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | Non
 def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
     """Return whether the square outside the first corner is darker than its neighbours."""
     right, down = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
-    diagonal = [grid[0, 0] - 0.4 * (right + down), grid[0, 0] + 0.4 * (right + down)]
-    beside = [grid[0, 0] + 0.4 * (right - down), grid[0, 0] - 0.4 * (right - down)]
-
-    def mean(places: list[Array]) -> float:
-        at = np.array(places)
-        at = np.clip(np.rint(at), 0, np.array(grey.shape[::-1]) - 1).astype(int)
-        return float(grey[at[:, 1], at[:, 0]].mean())
-
-    return mean(diagonal) < mean(beside)
+    around = [-right - down, right + down, right - down, down - right]
+    at = np.rint(grid[0, 0] + 0.4 * np.array(around))
+    x, y = np.clip(at, 0, np.array(grey.shape[::-1]) - 1).astype(int).T
+    values = grey[y, x].astype(float)
+    return bool(values[:2].sum() < values[2:].sum())
 
 
 def predict_corners(

@@ -44,30 +44,21 @@ if TYPE_CHECKING:
 _PIXEL_VARIANCE = 1 / 12
 _NORM = float(1 / np.sqrt(2 * np.pi))
 # Φ(z) = (1 + tanh(z·polynomial(z²)))/2 to 2e-5, fitted by minimax on 0 ≤ z ≤ 6.
-_CDF = tuple(np.float32(c) for c in (-3.171207e-4, 3.680406e-2, 0.79771415))
-_HALF, _ONE, _FARTHEST = np.float32(0.5), np.float32(1.0), np.float32(6.0)
+_CDF = (-3.171207e-4, 3.680406e-2, 0.79771415)
 
 
 def normal_cdf(z: Single) -> Single:
     """Return the standard normal distribution function to 2e-5, ten times as fast as exactly."""
-    z = np.minimum(np.maximum(z, -_FARTHEST), _FARTHEST)
+    z = np.minimum(np.maximum(z, np.float32(-6.0)), np.float32(6.0))
     square = z * z
-    value = square * _CDF[0]
-    value += _CDF[1]
-    value *= square
-    value += _CDF[2]
-    value *= z
-    np.tanh(value, out=value)
-    value += _ONE
-    value *= _HALF
-    return value
+    value = 0.5 + 0.5 * np.tanh(z * ((_CDF[0] * square + _CDF[1]) * square + _CDF[2]))
+    return cast("Single", value)
 
 
 def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any]:
     """Return the text (n,) of the first test (n,) that is true, empty if none is."""
-    reasons = np.full(len(tests[0][0]), "", dtype=object)
-    for bad, word in reversed(tests):
-        reasons[bad] = word
+    bad, words = zip(*tests, strict=True)
+    reasons: NDArray[Any] = np.select(bad, words, "").astype(object)
     return reasons
 
 
@@ -80,8 +71,7 @@ def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single,
     terms are of third order, and move no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
     """
     inverse = maps.inverse
-    shape = m[:, [[0, 1], [1, 2]]]
-    shape[:, [0, 1], [0, 1]] += 1.0
+    shape = m[:, [[0, 1], [1, 2]]] + np.eye(2)
     L = shape @ inverse
     bend = (L @ maps.second)[:, :, [[0, 1], [1, 2]]]
     twice = np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]  # 2 P
@@ -94,39 +84,15 @@ def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single,
     e[0], e[1], e[2] = 1.0, ex, ey
     elements = scratch("elements", (8, *ex.shape), np.float32)
     np.matmul(linear.reshape(-1, 8, 3), e.transpose(1, 0, 2), out=elements.transpose(1, 0, 2))
-    a11, a12, a21, a22, u, u2, v, v2 = elements
-    u *= ex
-    u += np.multiply(u2, ey, out=u2)
-    v *= ex
-    v += np.multiply(v2, ey, out=v2)
-    if m.any():
-        back = inverse_2x2(shape).astype(np.float32)[..., None]
-        s, t = back[:, 0, 0] * u, back[:, 1, 1] * v
-        s += np.multiply(back[:, 0, 1], v, out=v2)
-        t += np.multiply(back[:, 1, 0], u, out=v2)
-    else:
-        s, t = u.copy(), v.copy()
-    rho = u * u
-    rho += np.multiply(v, v, out=v2)
-    np.sqrt(rho, out=rho)
-    np.maximum(rho, np.float32(1e-6), out=rho)
-    u /= rho
-    v /= rho
-    determinant = a11 * a22
-    determinant -= np.multiply(a12, a21, out=v2)
-    # ∇ρ = Aᵀ(u, v)
-    a11 *= u
-    a11 += np.multiply(a21, v, out=v2)
-    a12 *= u
-    a12 += np.multiply(a22, v, out=v2)
-    nx, ny = a11, a12
-    slope = nx * nx
-    slope += np.multiply(ny, ny, out=v2)
-    np.sqrt(slope, out=slope)
-    np.maximum(slope, np.float32(1e-9), out=slope)
-    nx /= slope
-    ny /= slope
-    return rho, slope, nx, ny, determinant, s, t, u, v
+    a11, a12, a21, a22, ux, uy, vx, vy = elements
+    u, v = ux * ex + uy * ey, vx * ex + vy * ey
+    back = inverse_2x2(shape).astype(np.float32)[..., None]
+    s, t = back[:, 0, 0] * u + back[:, 0, 1] * v, back[:, 1, 0] * u + back[:, 1, 1] * v
+    rho = np.maximum(np.sqrt(u * u + v * v), 1e-6)
+    u, v = u / rho, v / rho
+    nx, ny = a11 * u + a21 * v, a12 * u + a22 * v  # ∇ρ = Aᵀ(u, v)
+    slope = np.maximum(np.sqrt(nx * nx + ny * ny), 1e-9)
+    return rho, slope, nx / slope, ny / slope, a11 * a22 - a12 * a21, s, t, u, v
 
 
 def blurred_disc(
@@ -142,53 +108,35 @@ def blurred_disc(
     p = parameters.astype(np.float32)
     ex, ey = x - p[:, 0, None], y - p[:, 1, None]
     rho, slope, nx, ny, determinant, s, t, u, v = _in_plane(maps, parameters[:, 2:5], ex, ey)
-    blur = p[:, 5, None]
+    blur, b, a, gx, gy = (p[:, i, None] for i in range(5, 10))
     width = np.sqrt(blur * blur + np.float32(_PIXEL_VARIANCE))
     # half the outline's curvature tangentᵀ AᵀA tangent/|∇ρ| = (det A)²/|∇ρ|³, since A maps the
     # tangent to a vector of length det A/|∇ρ| across the radius
-    other = np.divide(determinant, slope)
-    kappa = np.multiply(other, other, out=determinant)
-    kappa /= slope
-    kappa *= _HALF
-    d = np.subtract(_ONE, rho, out=rho)
-    d /= slope
-    z: Single = np.divide(d, width)
-    z -= np.multiply(kappa, width, out=other)
+    other = determinant / slope
+    kappa = 0.5 * other * other / slope
+    d = (1 - rho) / slope
+    z = d / width - kappa * width
     phi = normal_cdf(z)
-    b, a = p[:, 6, None], p[:, 7, None]
-    light = p[:, 8, None] * ex
-    light += np.multiply(p[:, 9, None], ey, out=other)
-    light += _ONE
-    reflect = a * phi
-    reflect += b
+    light = 1 + gx * ex + gy * ey
+    reflect = b + a * phi
+    edge = np.exp(-0.5 * z * z) * (_NORM * a) * light
     j = np.empty((10, *x.shape), dtype=np.float32) if out is None else out
-    z *= z
-    z *= -_HALF
-    edge = np.exp(z, out=z)
-    edge *= np.float32(_NORM) * a
-    edge *= light
     # with respect to the blur: edge (d/s² + κ/2) (−blur/s)
-    d /= width * width
-    d += kappa
-    d *= edge
-    np.multiply(d, -blur / width, out=j[5])
+    np.multiply(edge * (d / (width * width) + kappa), -blur / width, out=j[5])
     edge /= width
     np.multiply(edge, nx, out=j[0])
     np.multiply(edge, ny, out=j[1])
-    edge /= slope
+    edge /= -slope
     u *= edge
     v *= edge
-    np.multiply(u, np.negative(s, out=s), out=j[2])
-    np.multiply(v, np.negative(t, out=t), out=j[4])
-    u *= t
-    v *= s
-    np.add(u, v, out=j[3])
+    np.multiply(u, s, out=j[2])
+    np.add(u * t, v * s, out=j[3])
+    np.multiply(v, t, out=j[4])
     j[6] = light
     np.multiply(phi, light, out=j[7])
     np.multiply(reflect, ex, out=j[8])
     np.multiply(reflect, ey, out=j[9])
-    reflect *= light
-    return reflect, j
+    return reflect * light, j
 
 
 _SMALLEST_SEMI_AXIS_PX = 1.8

@@ -186,10 +186,8 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     side = np.linalg.norm(sides, axis=-1).min(axis=0)
     along = np.minimum(0.45 * side, REACH_PX)
     half = int(np.ceil(along.max()))
-    offset = np.arange(-half, half + 1)
-    origin = np.rint(corners).astype(int)
-    x = (origin[:, 0, None, None] + offset[None, None, :]).repeat(len(offset), 1).reshape(n, -1)
-    y = (origin[:, 1, None, None] + offset[None, :, None]).repeat(len(offset), 2).reshape(n, -1)
+    down, right = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
+    x, y = (np.rint(corners).astype(int).T)[..., None] + np.stack([right, down])[:, None]
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
 

@@ -13,15 +13,14 @@ Source: ITU-T Recommendation T.81, B.2 (markers and headers) and A.2 (order of t
 JPEGs are decoded by libjpeg-turbo through simplejpeg, to the luminance only, in two thirds of the
 time of OpenCV. OpenCV decodes other files and those that simplejpeg refuses, to the same pixels.
 
-EXIF and comments are written, or copied to another file: CIPA DC-008 (Exif 2.32), 4.5.4 (segments
-of a JPEG) and 4.6 (tags); PNG specification (third edition), 11.3.
+EXIF is copied to another file, and comments are written: CIPA DC-008 (Exif 2.32), 4.5.4 (segments
+of a JPEG); PNG specification (third edition), 11.3.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +33,7 @@ from thermocald.arrays import scratch
 from thermocald.errors import ImageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
@@ -151,9 +150,9 @@ def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | N
         layout = _layout(data)
         if layout is None:
             return None
-        size = (layout.width, layout.height)
-        low = np.clip(boxes[:, :2], 0, size)
-        high = np.clip(boxes[:, 2:], 0, size)
+        low, high = np.clip(boxes.reshape(-1, 2, 2), 0, (layout.width, layout.height)).swapaxes(
+            0, 1
+        )
         seen = (high > low).all(axis=1)
         if not seen.any():
             return None
@@ -349,15 +348,10 @@ def _read(path: Path, name: str) -> bytes:
         raise ImageError(f"{name}: cannot be read: {error.strerror or error}") from error
 
 
-_Value = str | int | float
-_APP1, _COMMENT = 0xE1, 0xFE
-_EXIF = b"Exif\0\0"
-_METADATA_JPEG = {_APP1, 0xE2, 0xED, _COMMENT}
+_COMMENT = 0xFE
+_METADATA_JPEG = {0xE1, 0xE2, 0xED, _COMMENT}
 """EXIF and XMP, colour profile, IPTC, comment."""
 _METADATA_PNG = {b"eXIf", b"iCCP", b"tEXt", b"zTXt", b"iTXt", b"pHYs"}
-_DETAILS = 0x8769  # the tag that points to EXIF's own directory
-_PER_MM = 4  # EXIF's unit of a focal plane's resolution
-_FRACTION = 10_000  # denominator of rational numbers
 
 
 def with_metadata(image: bytes, source: bytes) -> bytes:
@@ -374,64 +368,15 @@ def with_metadata(image: bytes, source: bytes) -> bytes:
     return image
 
 
-def has_exif(image: bytes) -> bool:
-    """Return whether an encoded image is a JPEG with EXIF."""
-    return image.startswith(_JPEG) and any(
-        kind == _APP1 and image[begin + 4 : begin + 10] == _EXIF
-        for kind, begin, _ in _segments(image)
-    )
-
-
-def with_exif(jpeg: bytes, camera: str, utc: float, focal_mm: float, pixels_per_mm: float) -> bytes:
-    """Return a JPEG with EXIF: camera, time (utc, s), upright orientation, focal length, pixels."""
-    moment = datetime.fromtimestamp(utc, UTC)
-    base: dict[int, _Value] = {0x0110: camera, 0x0112: 1, 0x0131: "thermocald", _DETAILS: 0}
-    details: dict[int, _Value] = {
-        0x9003: moment.strftime("%Y:%m:%d %H:%M:%S"), 0x9011: "+00:00",
-        0x9291: f"{moment.microsecond // 1000:03d}", 0x920A: focal_mm,
-        0xA20E: pixels_per_mm, 0xA20F: pixels_per_mm, 0xA210: _PER_MM,
-    }  # fmt: skip
-    base[_DETAILS] = 8 + len(_directory(base, 8))
-    tiff = b"II*\0" + struct.pack("<I", 8) + _directory(base, 8)
-    return _with_segment(jpeg, _APP1, _EXIF + tiff + _directory(details, len(tiff)))
-
-
 def with_comment(jpeg: bytes, text: str) -> bytes:
     """Return a JPEG with a comment after its other metadata; text: below 65 kB."""
-    return _with_segment(jpeg, _COMMENT, text.encode())
-
-
-def _directory(entries: Mapping[int, _Value], start: int) -> bytes:
-    """Return a TIFF directory, little-endian, at the offset `start`: str is ASCII, int long,
-    float rational.
-    """
-    head, tail = struct.pack("<H", len(entries)), b""
-    behind = start + 2 + 12 * len(entries) + 4
-    for tag, value in sorted(entries.items()):
-        kind, count = 4, 1
-        if isinstance(value, str):
-            data = value.encode("ascii", "replace") + b"\0"
-            kind, count = 2, len(data)
-        elif isinstance(value, float):
-            data, kind = struct.pack("<II", round(value * _FRACTION), _FRACTION), 5
-        else:
-            data = struct.pack("<I", value)
-        if len(data) > 4:
-            at = behind + len(tail)
-            tail += data + b"\0" * (len(data) % 2)
-            data = struct.pack("<I", at)
-        head += struct.pack("<HHI4s", tag, kind, count, data)
-    return head + struct.pack("<I", 0) + tail
-
-
-def _with_segment(jpeg: bytes, kind: int, content: bytes) -> bytes:
-    """Insert a segment after those with metadata."""
     place = 2
     for marker, _, end in _segments(jpeg):
         if marker not in _METADATA_JPEG and marker != 0xE0:
             break
         place = end
-    segment = struct.pack(">BBH", 0xFF, kind, len(content) + 2) + content
+    content = text.encode()
+    segment = struct.pack(">BBH", 0xFF, _COMMENT, len(content) + 2) + content
     return jpeg[:place] + segment + jpeg[place:]
 
 

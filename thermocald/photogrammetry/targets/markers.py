@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 _FEWEST = 3
 _NEIGHBOURS = 4
 _AGREEMENT = 0.6
+_COMPLEX = np.array([1, 1j])
 
 
 def corners_turned_deg(found: Corners, testfield: TestField) -> int:
@@ -56,23 +57,22 @@ def corners_turned_deg(found: Corners, testfield: TestField) -> int:
     field = np.array([testfield.points[[row for row, _ in pairs]] for pairs in whole])
     image = np.array([[at for _, at in pairs] for pairs in whole])
     centre, seen = field.mean(axis=1), image.mean(axis=1)
-    cosines, sines = [], []
+    turns = []
     for k in range(len(whole)):
         # the map of the field's directions into the image by this marker
         linear = np.linalg.lstsq(field[k] - centre[k], image[k] - seen[k], rcond=None)[0]
         near = np.argsort(np.linalg.norm(centre - centre[k], axis=1), kind="stable")
-        for other in near[1 : _NEIGHBOURS + 1].tolist():
-            mapped, true = (centre[other] - centre[k]) @ linear, seen[other] - seen[k]
-            size = float(np.linalg.norm(mapped) * np.linalg.norm(true))
-            if size > 0:
-                cosines.append(float(mapped @ true) / size)
-                sines.append(float(mapped[0] * true[1] - mapped[1] * true[0]) / size)
-    cosine, sine = float(np.median(cosines)), float(np.median(sines))
-    if cosine < -_AGREEMENT:
+        others = near[1 : _NEIGHBOURS + 1]
+        mapped = (centre[others] - centre[k]) @ linear @ _COMPLEX
+        turns.append((seen[others] - seen[k]) @ _COMPLEX * mapped.conj())
+    turn = np.concatenate(turns)
+    turn = turn[turn != 0] / np.abs(turn[turn != 0])
+    if not len(turn):
+        return 0
+    sine = float(np.median(turn.imag))
+    if np.median(turn.real) < -_AGREEMENT:
         return 180
-    if abs(sine) > _AGREEMENT:
-        return 90 if sine > 0 else 270
-    return 0
+    return 0 if abs(sine) <= _AGREEMENT else 90 if sine > 0 else 270
 
 
 _TAG_0_UPRIGHT = "110101"  # first row of tag 0 of the family 36h11; 1 is white

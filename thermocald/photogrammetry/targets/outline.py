@@ -19,6 +19,7 @@ not a correction to an ellipse but part of the outline, and thus includes the di
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -123,7 +124,7 @@ def local_maps(
 REACH_PX = 4.0
 """Pixels farther from the outline do not depend on the centre."""
 _THIN = 3
-_CHUNK_PIXELS = 120_000  # of the windows that are processed together
+_CHUNK_PIXELS = 80_000  # of the windows that are processed together
 _CUT_PX = 2.0  # pixels this near to the outline must be in the image
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
 
@@ -290,6 +291,7 @@ _COMPACTNESS = 0.5
 _AREA_TOLERANCE = 0.12
 _RADIUS_TOLERANCE = 0.03
 _SMALLEST_AXIS = 1.5
+_MOMENTS = ("m00", "m10", "m01", "mu20", "mu11", "mu02")
 _LARGEST_AXIS_RATIO = 3.2  # an obliqueness of 60°, and some perspective
 
 
@@ -331,12 +333,13 @@ def _ellipses(contours: Sequence[Any], longest: float) -> Array:
     if not used:
         return np.zeros((0, 5))
     count = np.array([len(c) for c in used])
-    first = np.cumsum(count) - count
     which = np.repeat(np.arange(len(used)), count)
     points = np.concatenate(used)[:, 0].T.astype(float)
-    begin = points[:, first]
-    points -= begin[:, which]
-    area, length, centre, (xx, xy, yy) = _moments(points, first, count)
+    # the area is positive for outlines, negative for holes
+    area = -np.array([cv2.contourArea(c, oriented=True) for c in used])
+    length = np.array([cv2.arcLength(c, closed=True) for c in used])
+    moments = np.array([itemgetter(*_MOMENTS)(cv2.moments(c)) for c in used]).T
+    *centre, xx, xy, yy = moments[1:] / np.maximum(moments[0], 1e-9)
     mean, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     # the semi-axes of an ellipse are twice the roots of its principal moments
     a, b = (2 * np.sqrt(np.maximum(mean + sign * difference, 1e-6)) for sign in (1, -1))
@@ -351,36 +354,9 @@ def _ellipses(contours: Sequence[Any], longest: float) -> Array:
     # distance of the contour from the ellipse, in the plane where that is the unit circle
     c, s = np.cos(angle), np.sin(angle)
     axes = np.stack([c / a, s / a, -s / b, c / b])[:, which]
-    dx, dy = points - centre[:, which]
+    dx, dy = points - np.stack(centre)[:, which]
     u, v = axes[0] * dx + axes[1] * dy, axes[2] * dx + axes[3] * dy
     off = np.bincount(which, np.abs(np.sqrt(u * u + v * v) - 1)) / count
     keep &= off < _RADIUS_TOLERANCE + 0.35 / b
-    ellipses: Array = np.stack([*(centre + begin), a, b, angle], axis=1)[keep]
+    ellipses: Array = np.stack([*centre, a, b, angle], axis=1)[keep]
     return ellipses
-
-
-def _moments(
-    points: Array, first: NDArray[np.int64], count: NDArray[np.int64]
-) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
-    """Return area, length, centre (2, n), and central second moments xx, xy, yy of n polygons.
-
-    The area is positive for outlines, negative for holes; moments are divided by it (Green's
-    theorem). points (2, k): of all polygons; first, count (n,): where each begins, and its number
-    of points.
-    """
-    after = np.arange(1, points.shape[1] + 1)
-    after[first + count - 1] = first
-    (x, y), (x1, y1) = points, points[:, after]
-    cross = x1 * y - x * y1
-
-    def integral(values: Array) -> Array:
-        return np.add.reduceat(values, first)
-
-    area = integral(cross) / 2
-    length = integral(np.hypot(x1 - x, y1 - y))
-    per_area = 1 / np.where(area == 0, 1.0, area)
-    cx, cy = (integral((p + p1) * cross) / 6 * per_area for p, p1 in ((x, x1), (y, y1)))
-    xx, yy = (integral((p * (p + p1) + p1 * p1) * cross) / 12 for p, p1 in ((x, x1), (y, y1)))
-    xy = integral((2 * (x * y + x1 * y1) + x * y1 + x1 * y) * cross) / 24
-    about = (xx * per_area - cx * cx, xy * per_area - cx * cy, yy * per_area - cy * cy)
-    return area, length, np.stack([cx, cy]), about

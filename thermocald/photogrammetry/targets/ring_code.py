@@ -18,9 +18,8 @@ the grey values.
 Around each candidate, grey values are sampled on circles in the coordinates of the ellipse. A coded
 target has its disc in one grey, a gap around it in the other, background outside its ring, and all
 transitions in the ring on a raster of 12 or 14 bits. The code that was read is then drawn, blurred,
-and compared with the samples, after a small shift, rotation and scaling. Only a ring that passes
-all these checks and has an existing code is accepted, since the codes have little redundancy, but
-their shape has much.
+and compared with the samples. Only a ring that passes all these checks and has an existing code is
+accepted, since the codes have little redundancy, but their shape has much.
 
 The search is from the frequent to the rare: dark on light in a reduced image first, light on dark
 at full size last, until enough codes are found for an orientation.
@@ -30,7 +29,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import cache
-from math import inf
 from typing import TYPE_CHECKING
 
 import cv2
@@ -52,7 +50,7 @@ from thermocald.photogrammetry.targets.outline import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -135,8 +133,8 @@ def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
 
 ANGLES = 84  # a multiple of 12 and of 14
 COARSE_ANGLES = 28
-_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.05, 0.45
-_EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
+_PROFILE_ANGLES = 42
+_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.15, 0.45
 _INSIDE = 0.6  # level of a sample, 0 background, 1 ink
 
 
@@ -176,22 +174,6 @@ def sample(
     return grey if ink is None else (grey - ink[0][:, None, None]) / ink[1][:, None, None]
 
 
-def sized(image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]) -> LocalMap:
-    """Return the maps with the size of the discs at half their contrast; ink: as in `sample`.
-
-    The size from a contour depends on its threshold, and may be wrong by a pixel.
-    """
-    level = sample(image, maps, _EDGE_RADII, COARSE_ANGLES, ink)
-    # the radius is where the ink ends: the sum of the levels outwards
-    step = _EDGE_RADII[1] - _EDGE_RADII[0]
-    radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
-    across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ _circle(COARSE_ANGLES), axis=1)
-    excess = np.median((radius - 1) * across, axis=1)
-    axes = np.linalg.norm(maps.linear, axis=1)
-    factor = np.maximum(1 + excess[:, None] / axes, 0.5)
-    return LocalMap(maps.centre, maps.linear * factor[:, None, :], maps.second)
-
-
 def in_perspective(
     image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]
 ) -> LocalMap:
@@ -202,11 +184,11 @@ def in_perspective(
     (w·u) R² in the direction u, instead of at R = 1, 2, 3.
     """
     rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
-    level = sample(image, maps, rho.tolist(), ANGLES, ink)
-    u = _circle(ANGLES)
+    level = sample(image, maps, rho.tolist(), _PROFILE_ANGLES, ink)
+    u = _circle(_PROFILE_ANGLES)
     # away from the ends of an arc, whose corners blur rounds
     ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
-    ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
+    ring &= np.roll(ring, 1, axis=1) & np.roll(ring, -1, axis=1)
     normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
     for radius, rising in ((1.0, False), (RING_INNER, True), (RING_OUTER, False)):
         window = np.abs(rho - radius) < _PROFILE_REACH
@@ -239,18 +221,11 @@ def in_perspective(
 
 
 RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
-_BLURS_PX = (0.8, 1.4)
-_LARGEST_SHIFT = 0.2  # radii, of a ring against its disc, by perspective and distortion
+_BLUR_PX = 1.0  # with which a code is drawn
 # Largest RMS of the samples against the drawn code, in levels; less for large targets, whose edges
 # are a smaller part of the ring.
 _MISFIT = 0.13
 _MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
-
-
-def allowed_misfit(maps: LocalMap) -> Array:
-    """Return the largest misfit (n,), in levels, with which a ring around each disc is accepted."""
-    allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
-    return np.minimum(allowed, _MISFIT)
 
 
 def ring_misfit(
@@ -260,7 +235,7 @@ def ring_misfit(
     which: NDArray[np.int64],
     within: Array,
 ) -> Array:
-    """Return the RMS (n,) of samples against the ring that was read, drawn with one of two blurs.
+    """Return the RMS (n,) of samples against the ring that was read, drawn with a usual blur.
 
     level (n, radii, angles): samples at `RADII`, 0 background, 1 ink; ones (n, bits): the code that
     was read; which, within (n, angles): the segment of each angle, and its place in it, 0 to 1.
@@ -278,43 +253,12 @@ def ring_misfit(
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
     across, side = px.astype(np.float32), (angle * along).astype(np.float32)
     rho = np.array(RADII, dtype=np.float32)[:, None]
-    misfit = np.full(len(level), np.inf)
-    for blur in _BLURS_PX:
-        left = np.nonzero(misfit > allowed_misfit(maps))[0]
-        if len(left) == 0:
-            break
-        scale = (across[left] / np.float32(blur))[:, None]
-        drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
-        drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
-        drawn -= np.float32(1)
-        drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
-        misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))
-    return misfit
-
-
-def _rms_after_shift(level: Single, drawn: Single) -> Array:
-    """Return the RMS (n,) of level minus drawn (n, radii, angles), fitted by shift, turn, scale."""
-    n = len(level)
-    radii = np.array(RADII, dtype=np.float32)
-    rho, (cosine, sine) = radii[:, None], _circle(ANGLES).astype(np.float32)
-    outwards = np.gradient(drawn, radii, axis=1)
-    around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
-    around *= np.float32(ANGLES / (4 * np.pi))
-    design = np.stack(
-        [
-            outwards * cosine - around * sine / rho,
-            outwards * sine + around * cosine / rho,
-            around,
-            outwards * rho,
-        ],
-        axis=1,
-    ).reshape(n, 4, -1)
-    residual = (level - drawn).reshape(n, -1)
-    normal = design @ np.swapaxes(design, 1, 2) + 1e-3 * np.eye(4, dtype=np.float32)
-    shift = np.linalg.solve(normal, (design @ residual[..., None]))[..., 0]
-    shift = np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)
-    left = residual - (shift[:, None] @ design)[:, 0]
-    rms: Array = np.sqrt(np.mean(left * left, axis=1))
+    scale = (across / np.float32(_BLUR_PX))[:, None]
+    drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
+    drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
+    drawn -= np.float32(1)
+    drawn *= normal_cdf(rho * (side / np.float32(_BLUR_PX))[:, None])
+    rms: Array = np.sqrt(np.mean((level - drawn) ** 2, axis=(1, 2), dtype=float))
     return rms
 
 
@@ -332,28 +276,17 @@ _MISFIT_OF_FEW = 0.06
 
 
 def read_codes(
-    image: NDArray[np.uint8],
-    candidates: LocalMap,
-    polarity: int,
-    wanted: tuple[Collection[tuple[int, int]], float] = ((), inf),
+    image: NDArray[np.uint8], candidates: LocalMap, polarity: int
 ) -> dict[tuple[int, int], int]:
     """Read the ring codes around discs; return the candidate's index of each code (bits, number).
 
     polarity: -1 dark on light, 1 light on dark. Both families are read, since a ring of one may be
-    mistaken for one of the other. A code that is read twice is dropped, since one is wrong. wanted:
-    codes, and how many of them are enough; with fewer, discs without a code are read again in
-    perspective.
+    mistaken for one of the other. A code that is read twice is dropped, since one is wrong.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates, polarity)
     ink = gap, contrast
-    maps = sized(image, candidates.select(rows), ink)
-    found = _read(image, maps, ink)
     # Seen from near and obliquely, a large ring is eccentric to its disc by pixels.
-    left = np.nonzero(found[:, 0] == 0)[0]
-    codes, enough = wanted
-    if len(left) and sum(tuple(c) in codes for c in found.tolist()) < enough:
-        grey = gap[left], contrast[left]
-        found[left] = _read(image, in_perspective(image, maps.select(left), grey), grey)
+    found = _read(image, in_perspective(image, candidates.select(rows), ink), ink)
     read = [(bits, number) for bits, number in found.tolist()]
     count = Counter(read)
     return {
@@ -457,7 +390,8 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
         misfit[rows] = ring_misfit(
             level[rows], maps.select(rows), ones[rows], which[rows], within[rows]
         )
-        misfit[misfit > allowed_misfit(maps)] = np.inf
+        allowed = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
+        misfit[misfit > np.minimum(allowed, _MISFIT)] = np.inf
         one_arc = np.sum(ones != np.roll(ones, 1, axis=1), axis=1) == 2
         misfit[(one_arc | (ones.sum(axis=1) <= 2)) & (misfit > _MISFIT_OF_FEW)] = np.inf
     return codes, misfit
@@ -494,7 +428,7 @@ def find_coded(
         enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
         for scale, polarity in SEARCHES if image.shape[1] > _LARGE_WIDTH else SEARCHES[2:]:
             candidates = find_circles(grey, scale, polarity)
-            codes = read_codes(grey, candidates, polarity, (row_of, enough))
+            codes = read_codes(grey, candidates, polarity)
             ours = {row_of[code]: place for code, place in codes.items() if code in row_of}
             foreign = foreign or len(ours) < len(codes)
             for row, place in _circles_by_marker(grey, candidates, named):

@@ -10,7 +10,7 @@ import pytest
 from tests.analysis.test_thermal_model import for_fit, simulated
 from tests.blind.world import lagged
 from tests.discovery.test_movement import trembling
-from thermocald.discovery.entries import find_tied_constants, find_trade_off, lagging_thermometer
+from thermocald.discovery.entries import find_tied_constants, lagging_thermometer
 from thermocald.discovery.result import discover_series
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Node, say_together
@@ -45,17 +45,13 @@ def saturating(fitter, middle, width):
     return fitted(fitter, Node("saturation", (T,), (middle, width)))
 
 
-def test_two_equal_lags_are_said_by_their_sum(lagging):
-    found = find_trade_off(lagging, twice_lagging(lagging, 30.0, 30.0), 0)
+def test_two_equal_lags_are_known_only_together(lagging):
+    found = find_tied_constants(lagging, twice_lagging(lagging, 30.0, 30.0), 0)
 
-    document, sentence = found
-    assert document["sum"] == pytest.approx(60.0)
-    assert 0.0 < document["sd"] < 5.0
-    assert "not separable, their sum is 60" in sentence
-
-
-def test_a_short_and_a_long_lag_are_separate(lagging):
-    assert find_trade_off(lagging, twice_lagging(lagging, 20.0, 150.0), 0) is None
+    assert say_together(found) == (
+        "tau, tau_2 and the size are best known together, as they correlate by 1.0000"
+    )
+    assert find_tied_constants(lagging, twice_lagging(lagging, 20.0, 150.0), 0) is None
 
 
 def test_a_constant_that_is_not_determined_is_said_so():

@@ -12,7 +12,6 @@ from thermocald.discovery.entries import (
     EffectFound,
     estimate_term,
     find_tied_constants,
-    find_trade_off,
 )
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined
@@ -185,15 +184,12 @@ def describe_proposal(
     number = len(proposal.best.terms) - 1
     term = proposal.best.terms[number]
     estimates = estimate_term(fit, number, x.fitter.series[0])
-    trade_off = None
     tied = find_tied_constants(x.fitter, fit, number)
     if tied and tied["exchanged"]:  # the inverse holds their sds with the others held, so none
         estimates = {
             k: {**v, "sd": None} if k in tied["parameters"] or k.startswith("a_") else v
             for k, v in estimates.items()
         }
-    else:
-        trade_off = find_trade_off(x.fitter, fit, number)
     sentence = catalogue.get(term.effect).sentence(estimates)
     evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
     by_m1, by_m2 = proposal.closed
@@ -212,10 +208,7 @@ def describe_proposal(
         },
         "absolute_test": jsonable(x.adequacy),
     }
-    if trade_off is not None:
-        evidence["not_separable"], clause = trade_off
-        sentence += clause
-    elif tied:
+    if tied:
         evidence["not_separable"] = tied
         sentence += f"; {say_together(tied)}"
     return replace(

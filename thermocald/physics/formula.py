@@ -474,6 +474,8 @@ def known_together(
     steps = np.diag([*own, *[1.0] * 2 * P])  # linear in sizes and rates
     J = np.array([np.array(course(x + d)) - np.array(course(x - d)) for d in steps])
     J /= 2.0 * steps.sum(axis=1)[:, None, None]
+    if not J[:L].any():  # constants of a lag, which do not matter at a steady temperature
+        return out
     variance = np.einsum("iwp,ij,jwp->wp", J, covariance, J)
     sds = np.sqrt(np.maximum(variance, 0.0))
     for row, (what, per) in enumerate((("slope", "K"), ("curvature", "K2"))):

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from thermocald.physics.shapes import Outlines, gaussian_kernel, outlines, project, surface_normals
+from thermocald.physics.shapes import Shape, gaussian_kernel, outlines, project, surface_normals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -178,15 +178,15 @@ class Scene:
         self.look = look or Look()
         self._normals = surface_normals(field)
         self._facing: NDArray[np.bool_] | None = None
-        self._outlines: Outlines | None = None
+        self._outlines: list[Shape] = []
 
-    def _shapes(self, centre: Array) -> Outlines | None:
+    def _shapes(self, centre: Array) -> list[Shape]:
         """Return the outlines seen from a point (3,) mm; its side sets the sense of ring codes."""
         facing = np.sum(self._normals * (centre - self.field.points), axis=1) > 0
         if self._facing is None or not np.array_equal(facing, self._facing):
             self._facing = facing
             normals = np.where(facing[:, None], self._normals, -self._normals)
-            self._outlines = outlines(self.field, normals)
+            self._outlines = list(outlines(self.field, normals))
         return self._outlines
 
     def render(
@@ -224,37 +224,31 @@ class Scene:
         self, canvas: NDArray[np.int16], iop: Array, eop: Array, points: Array, blur_factor: float
     ) -> None:
         shapes = self._shapes(eop[3:6])
-        if shapes is None:
+        if not shapes:
             return
-        image = project(self.sensor, iop, eop, shapes.vertices(points))
-        begins = np.flatnonzero(np.diff(shapes.shape, prepend=-1))
-        low = np.minimum.reduceat(image, begins)
-        high = np.maximum.reduceat(image, begins)
-        towards = eop[3:6] - points[shapes.centre]
-        seen = np.sum(towards * shapes.normal, axis=1) > 0
-        with np.errstate(invalid="ignore"):
-            edge = np.array([self.sensor.width, self.sensor.height])
-            seen &= np.all((high > -0.5) & (low < edge - 0.5), axis=1)
-            # a shape larger than the image, behind or beside the camera, would need a huge window
-            seen &= np.all(high - low < edge, axis=1)
-        zero = np.zeros(1)
+        vertices = [shape.vertices(points) for shape in shapes]
+        projected = project(self.sensor, iop, eop, np.concatenate(vertices))
+        images = np.split(projected, np.cumsum([len(v) for v in vertices])[:-1])
+        zero, edge = np.zeros(1), np.array([self.sensor.width, self.sensor.height])
         kernel = gaussian_kernel(_FINER * self.look.blur_px * blur_factor)
         kernel = (np.concatenate([kernel, zero]) + np.concatenate([zero, kernel])) / _FINER
         margin = len(kernel) // (2 * _FINER) + 1
         depth = np.float32((self.look.paper_dn - self.look.ink_dn) * _FRACTION / 2)
         gain = _compute_gain(self.sensor, self.look.vignetting)
-        ends = np.append(begins[1:], len(image))
-        for k in np.flatnonzero(seen):
-            corner = np.floor(low[k] + 0.5).astype(np.int64) - margin
-            size = np.floor(high[k] + 0.5).astype(np.int64) + margin + 2 - corner
-            # a pixel is [i, i+1) after the shift by half a pixel
-            own, origin = slice(begins[k], ends[k]), corner - 0.5
-            a, b = image[own] - origin, image[shapes.following[own]] - origin
-            steps = coverage_steps(a, b, shapes.sign[own], *size.tolist())
+        for shape, image in zip(shapes, images, strict=True):
+            low, high = image.min(axis=0), image.max(axis=0)
+            in_front = np.sum((eop[3:6] - points[shape.targets[0]]) * shape.normal) > 0
+            inside = np.all((high > -0.5) & (low < edge - 0.5))
+            # a shape larger than the image, behind or beside the camera, would need a huge window
+            if not (in_front and inside and np.all(high - low < edge)):
+                continue
+            corner = np.floor(low + 0.5).astype(np.int64) - margin
+            size = np.floor(high + 0.5).astype(np.int64) + margin + 2 - corner
+            a = image - (corner - 0.5)  # a pixel is [i, i+1) after the shift by half a pixel
+            steps = coverage_steps(a, a[shape.following], shape.sign, *size.tolist())
             covered = average(fill(average(steps.astype(np.float32), kernel, 0)), kernel, 1)
             (left, top), (x0, y0) = corner.tolist(), np.maximum(corner, 0).tolist()
             x1, y1 = np.minimum(corner + size, edge).tolist()
-            if y0 < y1 and x0 < x1:
-                ink = covered[y0 - top : y1 - top, x0 - left : x1 - left]
-                taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
-                canvas[y0:y1, x0:x1] -= taken + taken
+            ink = covered[y0 - top : y1 - top, x0 - left : x1 - left]
+            taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
+            canvas[y0:y1, x0:x1] -= taken + taken

@@ -521,4 +521,3 @@ def _misfit_table(d: Discovery) -> Table:
             "significance in σ": lambda r: number(r["significance_sigmas"], 1),
         },
     )
-

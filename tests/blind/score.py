@@ -133,18 +133,18 @@ def run(
 
 
 def _show(part: str, o: Outcome) -> None:
-    case = o.case
-    for name, pull in o.pulls.items():
-        if abs(pull) > 3:
-            print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: {name} wrong by "
-                  f"{pull:.1f} sd", flush=True)  # fmt: skip
+    """Print what is wrong with an outcome."""
+    wrong = [f"{name} wrong by {p:.1f} sd" for name, p in o.pulls.items() if abs(p) > 3]
     if o.gap_closed is not None and o.gap_closed < 0.9:
-        print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: gap closed by "
-              f"{o.gap_closed:.2f}", flush=True)  # fmt: skip
+        wrong.append(f"gap closed by {o.gap_closed:.2f}")
     if not o.right:
-        print(f"  {part} seed {case.seed} hidden {'+'.join(case.effects) or 'none'}: "
-              f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
-              f"left {o.misfit_px:.4f} px", flush=True)  # fmt: skip
+        wrong.append(
+            f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
+            f"left {o.misfit_px:.4f} px"
+        )
+    if wrong:
+        hidden = "+".join(o.case.effects) or "none"
+        print(f"  {part} seed {o.case.seed} {hidden}: {'; '.join(wrong)}", flush=True)
 
 
 def main() -> None:

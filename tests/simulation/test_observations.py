@@ -14,7 +14,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import CameraDevice, Measuring, Programme
 from thermocald.physics.heat import Course, SimulatedThermometer
 from thermocald.physics.model import ModelEffect
-from thermocald.physics.presets import PRESETS, preset_simulation
+from thermocald.physics.presets import preset_simulation
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.reader import read_recording
@@ -128,12 +128,6 @@ def test_a_view_without_targets_is_refused():
 
 def run(*arguments):
     return answer("simulate", *arguments)
-
-
-def test_the_list_as_a_document():
-    listed = json.loads(run("--list", "--json", "-").stdout)
-    assert {one["preset"] for one in listed["presets"]} == set(PRESETS)
-    assert len(listed["effects"]) == 20
 
 
 def test_preset_to_recording_and_json(tmp_path):

@@ -331,13 +331,7 @@ def _gap_table(d: Discovery) -> Table:
         for stage in d.stages
         for name, gap in zip(_names(d), stage.gaps, strict=True)
     ]
-    outside, inside = d.cross_validation
     note = "With noise alone, reduced χ² is 1."
-    if math.isfinite(outside):
-        note += (
-            " On blocks of M1 left out of the fit, χ² of the parameters per degree of freedom is "
-            f"{outside:.3f}; with these blocks in the fit it is {inside:.3f}."
-        )
     if d.stages[0].verify is None:
         note += " No M2 was given: the constants are not verified."
     return Table.of(

@@ -71,8 +71,8 @@ def test_a_foreign_thermometer_is_said_by_its_label(name, label):
 
 def test_a_thermometer_that_is_stuck_is_as_if_there_were_none(evidence_of):
     """Neither a second source of heat nor a cause of noise."""
-    (e,), _ = evidence_of("thermal_lag", epochs=50, with_m2=False)
-    stuck = np.full(50, 21.0)
+    (e,), _ = evidence_of("thermal_lag", epochs=30, with_m2=False)
+    stuck = np.full(30, 21.0)
     source = replace(e.source, readings={**e.source.readings, "board_temperature": stuck})
 
     found = discover_series([reduce_series(source)])
@@ -142,7 +142,7 @@ def test_a_mount_that_bends_is_no_lag_of_the_thermometer():
 
 def test_a_slow_thermometer_is_offered_beside_a_negative_delay(evidence_of):
     """A lag of 12 s of the thermometer itself looks like a pure delay of as much."""
-    (series,), _ = evidence_of(seed=2, epochs=100, with_m2=False)
+    (series,), _ = evidence_of(seed=2, epochs=60, with_m2=False)
     source = series.source
     fine = np.arange(source.reading_times[0], source.reading_times[-1])
     name, warm = next(iter(source.readings.items()))

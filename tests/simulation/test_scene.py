@@ -39,7 +39,7 @@ def outline_centroid(field, normals, row, sensor, iop, eop):
     u = np.cross(normal, [0.3, 0.5, 0.8])
     u /= np.linalg.norm(u)
     v = np.cross(normal, u)
-    a = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[:, None]
+    a = np.linspace(0, 2 * np.pi, 400, endpoint=False)[:, None]
     circle = field.points[row] + field.diameters[row] / 2 * (np.cos(a) * u + np.sin(a) * v)
     x, y = project(sensor, iop, eop, circle).T
     cross = x * np.roll(y, -1) - np.roll(x, -1) * y

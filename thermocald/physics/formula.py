@@ -48,6 +48,7 @@ _COLUMN = "column"
 _LONGEST = 300  # characters of a formula
 _DEEPEST = 8
 _OFFSET_C = "degC"
+_OWN_UNITS = {"time_constant": "s", "phase": "rad", "exponent": "1"}  # else that of the input
 _TOGETHER = 0.99  # correlation from which constants are determined only jointly
 _ON_THE_CURVE = 41  # temperatures
 
@@ -193,10 +194,8 @@ class Node:
 
     def unit_of(self, constant: Constant) -> str:
         """Return the unit of one of the operator's constants."""
-        if constant.role == "time_constant":
-            return "s"
-        if not constant.same_unit:
-            return "rad" if constant.role == "phase" else "1"
+        if constant.role in _OWN_UNITS:
+            return _OWN_UNITS[constant.role]
         if constant.role == "threshold" and self.inputs[0].is_celsius:
             return _OFFSET_C
         return unit_text(self.inputs[0].unit())

@@ -265,14 +265,12 @@ _LONG = 1500
 class Constant:
     """A constant of an operator.
 
-    name: the usual one; role: its meaning; positive: whether it is above 0; same_unit: whether it
-    has the unit of the operator's input.
+    name: the usual one; role: its meaning; positive: whether it is above 0.
     """
 
     name: str
     role: Role
     positive: bool
-    same_unit: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,7 +365,7 @@ def _peak_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_arra
 _A = Constant("a", "threshold", False)
 _K = Constant("k", "threshold", False)
 _W = Constant("w", "scale", True)
-_TAU = Constant("tau", "time_constant", True, same_unit=False)
+_TAU = Constant("tau", "time_constant", True)
 
 
 OPERATORS: dict[str, Operator] = {
@@ -376,7 +374,7 @@ OPERATORS: dict[str, Operator] = {
     "above": Operator(1, (_K,), "({0} − {1})₊", lambda x, k: np.maximum(x - k, 0.0),
                       lambda x, k: ((x > k).astype(float),)),
     "power": Operator(
-        1, (Constant("p", "exponent", True, same_unit=False),), "[{0}]^({1})",
+        1, (Constant("p", "exponent", True),), "[{0}]^({1})",
         lambda x, p: np.asarray(np.maximum(x, 0.0) ** p),
         # a root is vertical at 0: its slope is limited to that at a reading's error
         lambda x, p: (p * np.maximum(x, 1e-2) ** (p - 1.0) * (x > 0),), powers=0,
@@ -398,7 +396,7 @@ OPERATORS: dict[str, Operator] = {
         lambda x, w: (np.exp(np.clip(x / w, -300.0, 300.0)) / w,), powers=0,
     ),
     "wave": Operator(
-        1, (Constant("P", "scale", True), Constant("phase", "phase", False, same_unit=False)),
+        1, (Constant("P", "scale", True), Constant("phase", "phase", False)),
         "sin(2π · {0} / {1} + {2})", lambda x, P, phase: np.sin(2 * np.pi * x / P + phase),
         lambda x, P, phase: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phase),), powers=0,
     ),

@@ -134,9 +134,7 @@ def test_preset_to_recording_and_json(tmp_path):
     result = run("--preset", "nexus5-cold", "--out", tmp_path / "r", "--seed", 5, "--json", "-",
                  "--model-out", tmp_path / "m.yaml")  # fmt: skip
     assert result.exit_code == 0
-    summary = json.loads(result.stdout)
-    assert summary["epochs"] == 150
-    assert round(summary["drift"]["principal_point_px"]) == 16
+    assert round(json.loads(result.stdout)["drift"]["principal_point_px"]) == 16
     recording = read_recording(tmp_path / "r")
     expected = next(preset_simulation("nexus5-cold", seed=5).observations())
     np.testing.assert_allclose(recording.epochs[0].observations.points, expected.points, atol=1e-5)

@@ -19,7 +19,7 @@ PAIRS = [("permanent_set", "self_heating"), ("thermal_lag", "hysteresis"), ("cre
 LIMITS = [Limits(40.0, 1.5, 0.8), Limits(60.0, 4.0, 0.3), Limits(40.0, 1.5, 0.8)]
 
 
-@pytest.mark.parametrize(("pair", "limits"), zip(PAIRS, LIMITS, strict=True))
+@pytest.mark.parametrize(("pair", "limits"), [*zip(PAIRS, LIMITS, strict=True)])
 def test_programmes_stay_within_the_limits(pair, limits):
     for found in rank_experiments(*pair, limits, Body(), 150, 10.0):
         holds = [h for _, h in found.steps if h is not None]

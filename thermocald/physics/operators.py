@@ -55,9 +55,9 @@ def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def _interpolate(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return the left knot and the polygon's value at times (E,), both (E,)."""
+    """Return the left knot (E,) and the value (…, E) of polygons (…, K) at times (E,)."""
     left, right, share = _edges(knots, at)
-    return left, values[left] * (1.0 - share) + values[right] * share
+    return left, values[..., left] * (1.0 - share) + values[..., right] * share
 
 
 def interpolation_matrix(
@@ -298,12 +298,12 @@ class Operator:
 
 
 def _integral(knots: Array, values: Array, at: Array) -> Array:
-    steps = 0.5 * np.diff(knots) * (values[1:] + values[:-1])
-    total = np.append(0.0, np.cumsum(steps))
-    left, now = _interpolate(knots, values, at)
-    elapsed = np.clip(at - knots[left], 0.0, None)
-    whole: Array = total[left] + 0.5 * elapsed * (values[left] + now)
-    return whole - float(np.interp(0.0, knots, total))
+    v = values.T  # (K,), or (m, K) of several polygons
+    steps = 0.5 * np.diff(knots) * (v[..., 1:] + v[..., :-1])
+    total = np.concatenate([0.0 * v[..., :1], np.cumsum(steps, axis=-1)], axis=-1)
+    left, now = _interpolate(knots, v, at)
+    whole = total[..., left] + 0.5 * np.maximum(at - knots[left], 0.0) * (v[..., left] + now)
+    return np.asarray(whole - _interpolate(knots, total, np.zeros(1))[1]).T
 
 
 def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
@@ -312,17 +312,7 @@ def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # no
     n = len(knots)
     if n > _LONG or n < 2:
         return csr_array((len(at), n))
-    h = np.diff(knots)
-    whole = np.zeros((n, n))
-    inside = np.tri(n, n - 1, -1) * h / 2.0
-    whole[:, :-1] += inside
-    whole[:, 1:] += inside
-    left, right, share = _edges(knots, at)
-    weights = whole[left]
-    rows = np.arange(len(at))
-    weights[rows, left] += h[left] * share * (1.0 - share / 2.0)
-    weights[rows, right] += h[left] * share**2 / 2.0
-    return csr_array(weights - interpolation_matrix(knots, np.zeros(1)) @ whole)
+    return csr_array(_integral(knots, np.eye(n), at))
 
 
 def _change(knots: Array, values: Array, at: Array) -> Array:

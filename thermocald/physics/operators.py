@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-_DECAYED = 1e-6  # weight of an earlier reading from which it is left out
+_DECAYED = 1e-7
+_LAG_CUT = 14.0  # time constants after which a reading's weight in a lag is left out
 
 
 def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -106,7 +107,7 @@ def decayed_sums(kept: Array, driven: Array) -> Array:
 
 
 def _decay_matrix(kept: Array) -> csr_array:
-    """Return the matrix (K, K) of `decayed_sums`, without weights below 1e-6."""
+    """Return the matrix (K, K) of `decayed_sums`, without weights below 1e-7."""
     from scipy.sparse import diags_array, eye_array
 
     n = len(kept) + 1
@@ -146,16 +147,19 @@ def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
 
 
 def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:  # noqa: ARG001
-    """Return the matrix (E, K) of `lag`."""
-    from scipy.sparse import diags_array, eye_array
+    """Return the matrix (E, K) of `lag`, without weights older than 14 tau (below 1e-6)."""
+    from scipy.sparse import csr_array, diags_array, eye_array
 
     a, old, new = _lag_weights(knots, tau)
     driven = diags_array([np.append(1.0, new), old], offsets=[0, -1])
     left, right, decayed, rise = _lag_within(knots, tau, at)
     own, states = eye_array(len(knots)).tocsr(), (_decay_matrix(a) @ driven).tocsr()
     parts = ((1.0 - decayed - rise, own[left]), (decayed, states[left]), (rise, own[right]))
-    matrix: csr_array = sum(diags_array(weight) @ rows for weight, rows in parts)
-    return matrix
+    whole = sum(diags_array(weight) @ rows for weight, rows in parts).tocoo()
+    first = np.searchsorted(knots, knots[left] - _LAG_CUT * tau) - 1
+    kept = whole.col >= first[whole.row]
+    place = whole.row[kept], whole.col[kept]
+    return csr_array((whole.data[kept], place), shape=whole.shape)
 
 
 def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:

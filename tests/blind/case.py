@@ -21,7 +21,7 @@ CAMERAS = {
 }
 
 
-@dataclass
+@dataclass(frozen=True)
 class Case:
     """A recording to generate."""
 

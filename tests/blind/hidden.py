@@ -10,6 +10,8 @@ import numpy as np
 from tests.blind.case import CAMERAS, OUTSIDE, Case
 from tests.blind.world import backlash, delayed, image, lagged
 
+T0 = 20.0
+
 
 @dataclass
 class Camera:
@@ -18,7 +20,6 @@ class Camera:
     sensor: tuple[int, int, float]
     base: np.ndarray
     rates: np.ndarray  # (16,) per K
-    T0: float
     effects: list[dict] = field(default_factory=list)
 
 
@@ -52,7 +53,7 @@ def make_camera(rng: np.random.Generator, case: Case) -> tuple[str, Camera]:
     rates[0] = rng.choice([-1, 1]) * c * rng.uniform(4e-5, 1.5e-4)
     way = rng.uniform(0, 2 * np.pi)
     rates[1:3] = rng.uniform(0.25, 0.9) * pitch * np.array([np.cos(way), np.sin(way)])
-    return name, Camera((width, height, pitch), base, rates, 20.0)
+    return name, Camera((width, height, pitch), base, rates)
 
 
 def _direction(rng: np.random.Generator, camera: Camera) -> np.ndarray:
@@ -126,6 +127,22 @@ def fresh(rng: np.random.Generator, e: dict, first: bool, seconds: int) -> dict:
     return f
 
 
+# the course of an effect, from its constants, temperature, time, climate, and what was not recorded
+COURSES: dict[str, Callable[..., np.ndarray]] = {
+    "nonlinear_expansion": lambda e, T, *_: (T - T0) ** 2 / 100.0,
+    "softening": lambda e, T, *_: np.maximum(T - e["T_k"], 0),
+    "thermal_gradient": lambda e, T, *_: np.gradient(T) * 100,
+    "permanent_set": lambda e, T, *_: np.maximum.accumulate(T),
+    "self_heating": lambda e, T, t, *_: 1 - np.exp(-t / e["tau"]),
+    "creep": lambda e, T, t, *_: t / 1000,
+    "slip": lambda e, T, t, *_: (t >= e["time"]).astype(float) * e["happens"],
+    "cyclic_interference": lambda e, T, t, *_: np.sin(2 * np.pi * t / e["P"] + e["phase"]),
+    "second_heat_source": lambda e, T, t, climate_, _: climate_[e["channel"]],
+    "mount_motion": lambda e, T, *_: lagged(T, e["tau"]) - T0,
+    OUTSIDE: lambda *known: known[-1],
+}
+
+
 def true_parameters(
     camera: Camera,
     effects: list[dict],
@@ -154,40 +171,15 @@ def true_parameters(
     moved = []
     for e in effects:
         name, size = e["effect"], e["size"]
-        course = None
-        if name == "nonlinear_expansion":
-            course = (T - camera.T0) ** 2 / 100.0
-        elif name == "softening":
-            course = np.maximum(T - e["T_k"], 0)
-        elif name == "thermal_gradient":
-            course = np.gradient(T) * 100
-        elif name == "permanent_set":
-            course = np.maximum.accumulate(T)
-        elif name == "self_heating":
-            course = 1 - np.exp(-t / e["tau"])
-        elif name == "creep":
-            course = t / 1000
-        elif name == "slip":
-            course = (t >= e["time"]).astype(float) * e["happens"]
-        elif name == "cyclic_interference":
-            course = np.sin(2 * np.pi * t / e["P"] + e["phase"])
-        elif name == "second_heat_source":
-            course = climate_[e["channel"]]
-        elif name in ("housing_tilt", "radial_distortion_drift", "decentering_drift",
-                      "affinity_drift"):  # fmt: skip
-            course = T - camera.T0
-        elif name == "mount_motion":
-            course = lagged(T, e["tau"]) - camera.T0
-        elif name == OUTSIDE:
-            course = unknown
+        if "along" in e:
+            course = COURSES.get(name, lambda _, T, *__: T - T0)(e, T, t, climate_, unknown)
+            extra += size * course[:, None] * e["along"]
         elif name == "test_field_expansion":
-            scale += size * (T - camera.T0)[:, None] * e["axes"]
+            scale += size * (T - T0)[:, None] * e["axes"]
         elif name == "defocus":
             noise = noise * (1 + size * np.clip(T - e["coldest"], 0, None) * 0.02)
         elif name == "target_displacement" and e["happens"]:
             moved.append((e["targets"], size * np.asarray(e["vector"]), e["time"]))
-        if course is not None and "along" in e:
-            extra += size * course[:, None] * e["along"]
 
     def at(v: np.ndarray) -> np.ndarray:
         return np.interp(frames, t, v)
@@ -195,7 +187,7 @@ def true_parameters(
     p = np.tile(camera.base, (len(frames), 1))
     p[:, 10:] = eop
     p += offsets
-    p += at(drive - camera.T0)[:, None] * camera.rates
+    p += at(drive - T0)[:, None] * camera.rates
     p += np.stack(
         [at(extra[:, j]) if extra[:, j].any() else np.zeros(len(frames)) for j in range(16)], 1
     )

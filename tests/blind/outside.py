@@ -1,6 +1,6 @@
 """Influences outside the catalogue, on an axis of one second; shares no code with thermocald.
 
-RECORDED influences are functions of recorded quantities; UNRECORDED ones have an unrecorded cause.
+Most are functions of recorded quantities; "smooth" and "random_walk" have an unrecorded cause.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ def _humidity(rng: np.random.Generator, seconds: int) -> np.ndarray:
 
 def _recorded(rng: np.random.Generator, ranges: list[tuple[float, float]]) -> dict[str, Callable]:
     low, high = max(r[0] for r in ranges), min(r[1] for r in ranges)
-    bottom = min(r[0] for r in ranges)
     k = low + rng.uniform(0.35, 0.65) * (high - low)
     w = rng.uniform(0.12, 0.3) * (high - low)
     tau, second, r = rng.uniform(50, 120), rng.uniform(80, 250), rng.uniform(0.6, 2.0)
@@ -45,23 +44,11 @@ def _recorded(rng: np.random.Generator, ranges: list[tuple[float, float]]) -> di
         "switch": lambda T, B, t: (k < T).astype(float),
         "play_of_lag": lambda T, B, t: backlash(lagged(T, tau), r),
         "fading_peak": lambda T, B, t: _leaking(T, 2 * second),
-        "root": lambda T, B, t: np.sqrt(np.clip(T - bottom, 0, None)),
         "time_times_T": lambda T, B, t: t * T,
-        "exponential": lambda T, B, t: np.exp(T / 9.0),
-        "board_square": lambda T, B, t: (B - B[0]) ** 2,
-        "lag_of_board": lambda T, B, t: lagged(B, second),
-        "lag_of_threshold": lambda T, B, t: lagged(np.clip(T - k, 0, None), second),
-        "minimum": lambda T, B, t: np.minimum.accumulate(T),
-        "difference_square": lambda T, B, t: (T - lagged(T, second)) ** 2,
-        "arrhenius": lambda T, B, t: np.cumsum(np.exp((T - 30.0) / 6.0)),
-        "ratio": lambda T, B, t: B / T,
-        "rate_times_T": lambda T, B, t: np.gradient(T) * T,
     }
 
 
-RECORDED = tuple(_recorded(np.random.default_rng(0), [(0.0, 1.0)]))
-HUMID = ("lag_of_humidity", "humidity_times_T")
-UNRECORDED = ("smooth", "random_walk", "humidity", "cosine", "bumps")
+HUMID = ("lag_of_humidity",)
 
 
 def trajectories(
@@ -79,19 +66,10 @@ def trajectories(
             out.append(known[kind](T, B, t))
         elif kind == "lag_of_humidity":
             out.append(lagged(h, 120.0))
-        elif kind == "humidity_times_T":
-            out.append(h * T)
         elif kind == "smooth":
             out.append(smooth_unknown(rng, seconds))
         elif kind == "random_walk":
             out.append(lagged(np.cumsum(rng.normal(size=seconds)), 20.0))
-        elif kind == "humidity":
-            out.append(_humidity(rng, seconds))
-        elif kind == "cosine":
-            out.append(np.cos(2 * np.pi * t / rng.uniform(500, 1500) + rng.uniform(0, 6.3)))
-        elif kind == "bumps":
-            at = rng.uniform(0.1, 0.9, 3) * seconds
-            out.append(np.sum(np.exp(-0.5 * ((t[:, None] - at) / 90.0) ** 2), axis=1))
         else:
             raise SystemExit(f"no such influence: {kind}")
     return out, humid

@@ -1,6 +1,6 @@
 """Score the discovery on blind recordings: confusion matrix, parameters, gap, power.
 
-    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--store FILE.jsonl]
+    python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--store FILE]
         [--write FILE.md]
 
 Runs `discover_series`, the function of the command, in memory.
@@ -9,11 +9,10 @@ Runs `discover_series`, the function of the command, in memory.
 from __future__ import annotations
 
 import argparse
-import json
 import os
+import pickle
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
 
@@ -117,69 +116,35 @@ MORE_SEEDS = {"none": 5, "none2": 5}
 
 
 def run(
-    part: str,
-    seeds: Iterable[int],
-    show: bool = False,
-    store: Path | None = None,
-    done_only: bool = False,
+    part: str, seeds: Iterable[int], show: bool = False, store: Path | None = None
 ) -> list[Outcome]:
-    """Score all cases of a part; outcomes in `store` (JSON lines) are read instead.
-
-    done_only: skip cases that are not in the store.
-    """
-    done = stored(store)
+    """Score all cases of a part, but for those whose outcomes the file `store` holds."""
+    done = pickle.loads(store.read_bytes()) if store and store.exists() else {}
     outcomes = []
     for case in cases(part, seeds):
-        key = _key(case)
-        if key in done:
-            outcomes.append(done[key])
-            continue
-        if done_only:
-            continue
-        o = judge(case)
-        outcomes.append(o)
-        if store is not None:
-            with store.open("a") as f:
-                f.write(json.dumps(asdict(o)) + "\n")
-        if show:
-            _show(part, o)
+        if case not in done:
+            done[case] = judge(case)
+            if store:
+                store.write_bytes(pickle.dumps(done))
+            if show:
+                _show(part, done[case])
+        outcomes.append(done[case])
     return outcomes
 
 
-def stored(store: Path | None) -> dict[str, Outcome]:
-    """Return stored outcomes by case."""
-    out: dict[str, Outcome] = {}
-    if store is None or not store.exists():
-        return out
-    for line in store.read_text().splitlines():
-        row = json.loads(line)
-        case = row.pop("case")
-        case["effects"] = tuple(case["effects"])
-        if case["programmes"]:
-            case["programmes"] = tuple(case["programmes"])
-        row["found"], row["listed"] = tuple(row["found"]), tuple(row["listed"])
-        o = Outcome(Case(**case), **row)
-        out[_key(o.case)] = o
-    return out
-
-
-def _key(case: Case) -> str:
-    return json.dumps(asdict(case), sort_keys=True)
-
-
 def _show(part: str, o: Outcome) -> None:
-    case = o.case
-    for name, pull in o.pulls.items():
-        if abs(pull) > 3:
-            print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: {name} wrong by "
-                  f"{pull:.1f} sd", flush=True)  # fmt: skip
+    """Print what is wrong with an outcome."""
+    wrong = [f"{name} wrong by {p:.1f} sd" for name, p in o.pulls.items() if abs(p) > 3]
     if o.gap_closed is not None and o.gap_closed < 0.9:
-        print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: gap closed by "
-              f"{o.gap_closed:.2f}", flush=True)  # fmt: skip
+        wrong.append(f"gap closed by {o.gap_closed:.2f}")
     if not o.right:
-        print(f"  {part} seed {case.seed} hidden {'+'.join(case.effects) or 'none'}: "
-              f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
-              f"left {o.misfit_px:.4f} px", flush=True)  # fmt: skip
+        wrong.append(
+            f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
+            f"left {o.misfit_px:.4f} px"
+        )
+    if wrong:
+        hidden = "+".join(o.case.effects) or "none"
+        print(f"  {part} seed {o.case.seed} {hidden}: {'; '.join(wrong)}", flush=True)
 
 
 def main() -> None:
@@ -187,23 +152,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--part", action="append")
-    parser.add_argument(
-        "--store", type=Path, help="JSON lines of outcomes; an interrupted run is resumed"
-    )
-    parser.add_argument("--done", action="store_true", help="only outcomes in the store")
+    parser.add_argument("--store", type=Path, help="outcomes; an interrupted run is resumed")
     parser.add_argument("--write", type=Path)
     a = parser.parse_args()
-    seeds = range(a.first, a.first + a.seeds)
     found: dict[str, list[Outcome]] = {}
     for part in a.part or PARTS:
-        own = range(a.first, a.first + a.seeds * MORE_SEEDS.get(part, 1))
-        found[part] = run(part, own, show=True, store=a.store, done_only=a.done)
-        if not found[part]:
-            del found[part]
-            continue
+        seeds = range(a.first, a.first + a.seeds * MORE_SEEDS.get(part, 1))
+        found[part] = run(part, seeds, show=True, store=a.store)
         print(row(part, found[part]), flush=True)
     if a.write:
-        write(a.write, found, seeds, a.done)
+        write(a.write, found)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -100,59 +100,12 @@ def _interval(share: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.minimum(middle - half, share), np.maximum(middle + half, share)
 
 
-REAL = "## Real corners"
-
-
-def write(
-    path: Path, found: dict[str, list[Outcome]], seeds: Sequence[int], partly: bool = False
-) -> None:
-    """Write the page of the documentation and its figure; partly: not all cases were run."""
-    note = "Not all of its cases have been run yet: the table says how many.\n" if partly else ""
+def write(path: Path, found: dict[str, list[Outcome]]) -> None:
+    """Write the tables of the documentation's page anew, and its figure."""
     power_figure(found, path.with_name(FIGURE))
-    parts = "\n".join(row(p, o) for p, o in found.items())
-    before = path.read_text(encoding="utf-8") if path.exists() else ""
-    kept = before[before.index(REAL) :] if REAL in before else ""  # scored by another command
-    path.write_text(
-        f"""# How well discovery names hidden effects
-
-After this page you know how often a name that `discover` gives is right, and from what strength
-on. The recordings come from a generator that shares no code with the program; their seeds were not
-used while it was made.
-
-```bash
-{_command(found, seeds)}
-```
-
-writes this page, on one core; with `--store FILE` it can be interrupted and resumed. {note}
-
-The number in a part's name is the strength of the effect: the RMS of the image residuals that the
-fitted base model leaves, px. `hard`: irregular cadence, gaps, wrong coordinates, correlated noise,
-people walking by, another heating programme in M2. `none2`: twice the thermometer's noise. `lists`:
-the share in which alternatives that the data cannot exclude are listed too.
-
-{HEAD}
-{parts}
-
-## Power
-
-![Share of single effects named against their strength in px]({FIGURE})
-
-Bars: 68 % confidence limits of the share.
-
-## Wrong names
-
-All other effects were named correctly, at every strength.
-
-{confusion(found)}
-
-{kept}""".rstrip()
-        + "\n",
-        encoding="utf-8",
-    )
-
-
-def _command(found: dict[str, list[Outcome]], seeds: Sequence[int]) -> str:
-    return (
-        f"python -m tests.blind.score --first {seeds[0]} --seeds {len(seeds)} "
-        "--write docs/reference/discovery-confusion.md"
-    )
+    parts = "\n".join([HEAD, *(row(p, o) for p, o in found.items())])
+    text = path.read_text(encoding="utf-8")
+    for table in (parts, confusion(found)):
+        head = re.escape(table.partition("\n")[0])
+        text = re.sub(rf"{head}(\n\|.*)*", lambda _, table=table: table, text)
+    path.write_text(text, encoding="utf-8")

@@ -57,7 +57,7 @@ def test_everything_is_written(recordings, found):
     assert document["model"] == str(model)
     assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
     page = report.read_text().replace("\u00a0", " ")
-    assert page.count("<figure") == 6
+    assert page.count("<figure") == 5
     assert "Could noise do this?" in page
     assert "≤ 1/120" in page
     assert "UTC, 60 epochs." in page

@@ -41,7 +41,7 @@ def test_a_board_that_moves_is_reported_and_the_cameras_effect_is_named(evidence
 
 @pytest.mark.parametrize("effects", [(), pytest.param(("softening",), marks=pytest.mark.slow)])
 def test_a_target_that_wanders_is_reported_and_no_displacement(evidence_of, effects):
-    evidence, _ = evidence_of(*effects, px=0.1, seed=2, field_motion="wander")
+    evidence, _ = evidence_of(*effects, px=0.1, seed=2, epochs=60, field_motion="wander")
 
     found = discover_series(evidence)
 

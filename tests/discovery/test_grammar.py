@@ -107,12 +107,6 @@ def test_condensed_evidence_is_the_likelihood(above):
     assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T is in the base
 
 
-def test_surrogates_are_as_strong_as_the_misfit(above):
-    few = condense(above.fitter, above.base.fit, BASE)
-    power = np.sum(few.surrogates(40, np.random.default_rng(0)) ** 2, axis=0)
-    assert 0.1 < np.median(power) / few.power < 10
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", TEN)
 def test_ten_kinds_of_outside_effects_are_described(kind):

@@ -16,10 +16,10 @@ from thermocald.discovery.experiment import (
 from thermocald.errors import ConfigurationError, DataError, UsageError
 
 PAIRS = [("permanent_set", "self_heating"), ("thermal_lag", "hysteresis"), ("creep", "slip")]
+LIMITS = [Limits(40.0, 1.5, 0.8), Limits(60.0, 4.0, 0.3), Limits(40.0, 1.5, 0.8)]
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-@pytest.mark.parametrize("limits", [Limits(40.0, 1.5, 0.8), Limits(60.0, 4.0, 0.3)])
+@pytest.mark.parametrize(("pair", "limits"), [*zip(PAIRS, LIMITS, strict=True)])
 def test_programmes_stay_within_the_limits(pair, limits):
     for found in rank_experiments(*pair, limits, Body(), 150, 10.0):
         holds = [h for _, h in found.steps if h is not None]
@@ -33,9 +33,9 @@ def test_programmes_stay_within_the_limits(pair, limits):
 
 def test_what_separates_is_preferred():
     """Heating twice separates a permanent set from a warm-up; one long hold does not."""
-    order = [e.name for e in rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
+    ranked = rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)
+    order, sigmas = [e.name for e in ranked], [e.sigmas for e in ranked]
     assert order.index("two equal cycles") < order.index("one long hold")
-    sigmas = [e.sigmas for e in rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
     assert sigmas == sorted(sigmas, reverse=True)
     assert sigmas[0] > 3 * sigmas[-1]
 
@@ -65,8 +65,7 @@ def test_two_effects_are_separated_by_a_recording(evidence_of):
 
 def test_nothing_is_separated_where_neither_is(evidence_of):
     evidence, _ = evidence_of(seed=23, with_m2=False, epochs=60)
-    found = compare_effects(evidence, "creep", "permanent_set")
-    assert not found.separated
+    assert not compare_effects(evidence, "creep", "permanent_set").separated
 
 
 @pytest.mark.parametrize(

@@ -26,24 +26,53 @@ def trajectory(t):
     return 21 + up - down
 
 
-def read(seed):
-    """Return times, which are uneven, and readings with noise and quantisation."""
+def read(seed, step=0.0625):
+    """Return times, which are uneven, and readings with noise, in steps K."""
     rng = np.random.default_rng(seed)
     t = 10.0 * np.arange(180) + rng.uniform(-1, 1, 180)
     raw = trajectory(t) + rng.normal(0, 0.04, 180)
-    return t, np.round(raw / 0.0625) * 0.0625
+    return t, np.round(raw / step) * step if step else raw
 
 
-@pytest.fixture
-def readings():
-    return read(1)
+@pytest.mark.parametrize(
+    ("step", "resolution", "accuracy"), [(0.0625, 0.0625, 0.08), (0.0, None, 0.03)]
+)
+def test_noise_is_seen_through_a_warm_up(step, resolution, accuracy):
+    """The one estimate for study, fit and discovery is right to its accuracy, with steps too.
+
+    Of 177 third differences each is known to 12 %; kinks raise it slightly.
+    """
+    true = np.hypot(0.04, step / np.sqrt(12))
+    found = []
+    for seed in range(150):
+        t, y = read(seed, step)
+        t[7] = np.nan  # no reading
+        found.append(estimate_reading_noise(t, y, resolution))
+    assert np.mean(found) == pytest.approx(true, rel=accuracy)
+    constant = estimate_reading_noise(10.0 * np.arange(100), np.full(100, 21.0625), 0.0625)
+    assert constant == pytest.approx(0.0625 / np.sqrt(12))
 
 
-def test_noise_with_quantisation():
-    true = np.hypot(0.04, 0.0625 / np.sqrt(12))
-    noises = [estimate_reading_noise(*read(seed), 0.0625) for seed in range(40)]
-    # 177 correlated third differences: 12 % each, so 2 % for the mean; kinks raise it slightly
-    assert np.mean(noises) == pytest.approx(true, rel=0.08)
+def test_a_smooth_course_is_closer_than_readings_and_uncertain_where_one_is_missing():
+    t, y = read(1)
+    y[50] = np.nan
+    none = np.zeros(len(t), bool)
+    c = smooth_channel(t, y, ~none, none, none, 0.0625)
+    assert np.std(c.trajectory - trajectory(t)) < 0.7 * np.nanstd(y - trajectory(t))
+    assert (c.trajectory + c.deviation)[51:] == pytest.approx(y[51:])
+    assert c.deviation[50] == 0.0
+    assert c.sd[50] > 2 * c.sd[100]
+
+
+@pytest.mark.parametrize(("step", "near", "most"), [(10.0, 12, 15), (30.0, 20, 8)])
+def test_kinks_between_readings_get_a_latent_instant(step, near, most):
+    """At 30 s every interval after a lamp's switch bends by more than noise; switches stand out."""
+    t = np.arange(0.0, 1800.0, step)
+    noise = np.random.default_rng(2).normal(0, 0.04, len(t))
+    latent, _ = find_times_between(t, trajectory(t) + noise, None)
+    assert np.min(np.abs(latent - 200)) < near
+    assert np.min(np.abs(latent - 805)) < near
+    assert len(latent) < most
 
 
 def test_a_coarse_thermometer_is_read_where_it_changes():
@@ -57,68 +86,6 @@ def test_a_coarse_thermometer_is_read_where_it_changes():
     assert find_step(np.round(y), 0.0625) == 1.0
     assert find_step(y, None) < 0.07
     assert find_passages(t, y, 0.0625) is None
-
-
-def test_a_step_is_not_better_than_itself():
-    noise = estimate_reading_noise(10.0 * np.arange(100), np.full(100, 21.0625), 0.0625)
-    assert noise == pytest.approx(0.0625 / np.sqrt(12))
-
-
-def test_kinks_get_a_latent_instant(readings):
-    t, y = readings
-    latent, curved = find_times_between(t, y, 0.0625)
-    assert np.min(np.abs(latent - 805)) < 12
-    assert len(latent) < 15
-    assert not len(curved)  # frequent readings need no curve
-
-
-def smoothed(t, y):
-    """Smooth readings as of an instrument that is unknown between two of them."""
-    none = np.zeros(len(t), bool)
-    return smooth_channel(t, y, ~none, none, none, 0.0625)
-
-
-def test_course_is_closer_than_readings(readings):
-    t, y = readings
-    c = smoothed(t, y)
-    assert np.std(c.trajectory - trajectory(t)) < 0.7 * np.std(y - trajectory(t))
-    assert c.trajectory + c.deviation == pytest.approx(y)
-
-
-def test_a_missing_reading_is_uncertain(readings):
-    t, y = readings
-    y = y.copy()
-    y[50] = np.nan
-    c = smoothed(t, y)
-    assert c.deviation[50] == 0.0
-    assert c.sd[50] > 2 * c.sd[100]
-
-
-def test_noise_is_seen_through_a_warm_up():
-    """The one estimate for study, fit and discovery is right to its accuracy of 3 %."""
-    rng = np.random.default_rng(4)
-    t = 10.0 * np.arange(150)
-    warm = 25 + 12 * (1 - np.exp(-t / 400.0))
-    noisy = [warm + 0.05 * rng.standard_normal(150) for _ in range(200)]
-    found = [estimate_reading_noise(t, readings, None) for readings in noisy]
-    assert np.mean(found) == pytest.approx(0.05, rel=0.03)
-
-
-def test_a_reading_without_a_time_is_no_reading():
-    t = 10.0 * np.arange(400)
-    y = np.random.default_rng(0).normal(20, 0.05, 400)
-    t[7] = np.nan
-    assert estimate_reading_noise(t, y, None) == pytest.approx(0.05, rel=0.2)
-
-
-def test_kinks_between_sparse_readings_are_found():
-    """At 30 s every interval after a lamp's switch bends by more than noise; switches stand out."""
-    rng = np.random.default_rng(2)
-    t = 30.0 * np.arange(60)
-    latent, _ = find_times_between(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
-    assert np.min(np.abs(latent - 200)) < 20
-    assert np.min(np.abs(latent - 805)) < 20
-    assert len(latent) < 8
 
 
 def test_the_noise_of_twenty_readings_with_two_kinks():

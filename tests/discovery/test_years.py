@@ -116,7 +116,7 @@ def recorded():
     return whole, ObservationGrid(points, weights)
 
 
-def test_rows_are_weighted_means(recorded):
+def test_rows_are_weighted_means_without_gross_errors_and_short_where_it_is_fast(recorded):
     whole, grid = recorded
     out = condensed(whole, InBlocks(grid, 911), most=500)
     assert out.counts.sum() == E
@@ -131,6 +131,11 @@ def test_rows_are_weighted_means(recorded):
     assert out.frame_times[row] == pytest.approx(whole.frame_times[part].mean())
     noise = out.noises["temperature"] * np.sqrt(out.counts)
     np.testing.assert_allclose(noise, 0.03, rtol=0.1)
+    row = int(np.searchsorted(out.numbers, 4002, side="right")) - 1
+    fine = np.nanmedian(grid.points[4001 - 100 : 4001 + 100, 3], axis=0)
+    np.testing.assert_allclose(out.grid.points[row, 3], fine, atol=0.1)
+    fast = (out.frame_times > 20 * 3600) & (out.frame_times < 21 * 3600)
+    assert np.mean(out.counts[fast]) * 2 < np.median(out.counts[~fast])
 
 
 def test_the_blocks_that_are_read_do_not_matter(recorded):
@@ -139,21 +144,6 @@ def test_the_blocks_that_are_read_do_not_matter(recorded):
     # except for points at the limit of gross errors
     assert np.mean(np.abs(one.grid.points - other.grid.points) > 1e-9) < 0.002
     np.testing.assert_array_equal(one.counts, other.counts)
-
-
-def test_a_gross_error_is_left_out(recorded):
-    whole, grid = recorded
-    out = condensed(whole, InBlocks(grid, 911), most=300)
-    row = int(np.searchsorted(out.numbers, 4002, side="right")) - 1
-    fine = np.nanmedian(grid.points[4001 - 100 : 4001 + 100, 3], axis=0)
-    np.testing.assert_allclose(out.grid.points[row, 3], fine, atol=0.1)
-
-
-def test_what_is_fast_keeps_short_rows(recorded):
-    whole, grid = recorded
-    out = condensed(whole, InBlocks(grid, 911), most=500)
-    fast = (out.frame_times > 20 * 3600) & (out.frame_times < 21 * 3600)
-    assert np.mean(out.counts[fast]) * 2 < np.median(out.counts[~fast])
 
 
 NAMES = ("c", "x0", "y0")

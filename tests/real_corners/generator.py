@@ -98,7 +98,7 @@ def generate(case: RealCase) -> tuple[list[RealSeries], dict]:
     pitch = head["pixel_pitch"]
     sensor = (head["width"], head["height"], pitch)
     base = np.array(_POSES[case.camera])
-    camera = Camera(sensor, base, np.zeros(16), 20.0)
+    camera = Camera(sensor, base, np.zeros(16))
     camera.rates[0] = rng.choice([-1, 1]) * base[0] * rng.uniform(4e-5, 1.5e-4)
     way = rng.uniform(0, 2 * np.pi)
     camera.rates[1:3] = rng.uniform(0.25, 0.9) * pitch * np.array([np.cos(way), np.sin(way)])

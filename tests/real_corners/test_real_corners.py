@@ -43,12 +43,6 @@ def test_boards_hidden_at_times_do_not_bias_the_camera(still):
 
 
 @pytest.mark.slow
-def test_an_effect_is_named_in_spite_of_a_moving_mount():
-    """A second one is the golden `real-lag`."""
-    assert judge(RealCase("aviary-cam1", ("softening",), 1)).right_or_listed
-
-
-@pytest.mark.slow
 def test_a_wandering_mount_is_no_effect():
     found = [judge(RealCase("aviary-cam0", (), seed)) for seed in (52, 58, 61)]
 

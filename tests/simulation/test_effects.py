@@ -10,7 +10,6 @@ import pytest
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
     PARAMETER_NAMES,
     InteriorOrientation,
     Sensor,
@@ -295,32 +294,27 @@ def test_the_covariance_equals_differences(distortion):
     names = ("interior.c", "interior.A1", "rates.c", "nonlinear_expansion.c",
              "radial_distortion_drift.A1")  # fmt: skip
     scales = np.array([1e-2, 1e-4, 1e-4, 1e-6, 1e-6])
-    roots = np.diag(scales)
-    known = replace(
-        base, covariance_names=names, covariance=tuple(map(tuple, (roots @ roots).tolist()))
-    )
     T = base.T0 + 15.0
 
-    def at(m):
+    def cameras(m):
         camera = ThermalCamera(m)
-        return camera.at(T).values, camera.along([0.0, 10.0], [T, T])[1].values
+        return camera.at(T), camera.along([0.0, 10.0], [T, T])[1]
 
-    J = np.zeros((2, len(IOP_NAMES), len(names)))
-    for k, name in enumerate(names):
-        sides = []
-        for step in (1e-3 * scales[k], -1e-3 * scales[k]):
-            if name.startswith("interior"):
-                key = name.removeprefix("interior.")
-                changed = INTERIOR.with_values(**{key: getattr(INTERIOR, key) + step})
-                sides.append(replace(base, interior=changed))
-            else:
-                sides.append(base.with_values({name: base.value(name) + step}))
-        one, other = at(sides[0]), at(sides[1])
-        J[:, :, k] = (np.array(one) - np.array(other)) / (2e-3 * scales[k])
-    camera = ThermalCamera(known)
-    found = camera.at(T).covariance, camera.along([0.0, 10.0], [T, T])[1].covariance
-    for covariance, j in zip(found, J, strict=True):
-        expected = j @ roots @ roots @ j.T
+    def moved(name, step):
+        value = base.value(name) + step
+        if name.startswith("interior"):
+            key = name.removeprefix("interior.")
+            m = replace(base, interior=INTERIOR.with_values(**{key: value}))
+        else:
+            m = base.with_values({name: value})
+        return np.array([camera.values for camera in cameras(m)])
+
+    sides = [(moved(n, 1e-3 * s), moved(n, -1e-3 * s)) for n, s in zip(names, scales, strict=True)]
+    J = np.stack([one - other for one, other in sides], axis=-1) / (2e-3 * scales)
+    covariance = tuple(map(tuple, np.diag(scales**2).tolist()))
+    known = replace(base, covariance_names=names, covariance=covariance)
+    for camera, j in zip(cameras(known), J, strict=True):
+        expected = j * scales**2 @ j.T
         size = np.sqrt(np.maximum(np.diag(expected), 1e-30))
-        np.testing.assert_allclose(covariance / np.outer(size, size),
-                                   expected / np.outer(size, size), atol=2e-5)  # fmt: skip
+        scale = np.outer(size, size)
+        np.testing.assert_allclose(camera.covariance / scale, expected / scale, atol=2e-5)

@@ -191,6 +191,9 @@ def test_an_undetermined_constant_is_rounded():
     far = {k: {"value": 3783.7, "sd": None, "unit": "degC"}, w: width}
     assert "38.00 ± 0.11 °C" in effect.sentence({"a_c": {}, **near})
     assert "tanh((T − about 3.8e+03 °C) / about 2.9e+02 K)" in effect.sentence({"a_c": {}, **far})
+    vague = {"value": 120.0, "sd": 3.1e4, "unit": "s"}
+    said = catalogue.get("lag(temperature, tau)").sentence({"tau": vague, "a_c": vague})
+    assert "about 120 s" in said
 
 
 def test_slope_and_curvature_of_correlated_constants_have_true_sds():

@@ -41,12 +41,6 @@ def eigen_solution(t, T0, forcing):
     return steady + (np.exp(np.outer(t, rate)) * free) @ vectors.T
 
 
-def test_two_bodies_step():
-    T = two_bodies().solve(TIMES, [22.0, 80.0], {"b": Course.constant(2.0)}, AIR)
-    expected = 22 + eigen_solution(TIMES, np.array([0.0, 58.0]), np.array([0.0, 2.0 / 20]))
-    np.testing.assert_allclose(np.stack([T["a"], T["b"]], axis=1), expected, rtol=0, atol=1e-9)
-
-
 def test_two_bodies_ramp():
     """The derivative of the response to a ramp is the response to a step."""
     ramp = {"ambient": Course.polygon([0.0, 1500.0], [0.0, 1500.0 * 0.02])}

@@ -14,7 +14,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import CameraDevice, Measuring, Programme
 from thermocald.physics.heat import Course, SimulatedThermometer
 from thermocald.physics.model import ModelEffect
-from thermocald.physics.presets import PRESETS, preset_simulation
+from thermocald.physics.presets import preset_simulation
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.reader import read_recording
@@ -130,19 +130,11 @@ def run(*arguments):
     return answer("simulate", *arguments)
 
 
-def test_the_list_as_a_document():
-    listed = json.loads(run("--list", "--json", "-").stdout)
-    assert {one["preset"] for one in listed["presets"]} == set(PRESETS)
-    assert len(listed["effects"]) == 20
-
-
 def test_preset_to_recording_and_json(tmp_path):
     result = run("--preset", "nexus5-cold", "--out", tmp_path / "r", "--seed", 5, "--json", "-",
                  "--model-out", tmp_path / "m.yaml")  # fmt: skip
     assert result.exit_code == 0
-    summary = json.loads(result.stdout)
-    assert summary["epochs"] == 150
-    assert round(summary["drift"]["principal_point_px"]) == 16
+    assert round(json.loads(result.stdout)["drift"]["principal_point_px"]) == 16
     recording = read_recording(tmp_path / "r")
     expected = next(preset_simulation("nexus5-cold", seed=5).observations())
     np.testing.assert_allclose(recording.epochs[0].observations.points, expected.points, atol=1e-5)

@@ -54,6 +54,5 @@ CLOSED, CLOSED_BACK, CLOSED_ALONE = 0.8, 0.5, 0.95
 # -- statements --------------------------------------------------------------------------------
 
 SHIFT_OR_TILT = 18.5  # quantile 0.999 of χ² with the four coefficients of shift and tilt
-LOOSE = 0.5  # sd over value above which a time constant is not determined: 2 sd
 NAMED_SHARE = 0.95  # share of an unnamed movement that the named parameters must explain
 NAMED_WORTH = 0.02  # share of it that one more of them must add

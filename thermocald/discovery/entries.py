@@ -6,9 +6,6 @@ recording separates them: with both in the model along the effect's trajectory, 
 and by how much better one of them explains the image.
 
 Source: canonical correlations, Hotelling (1936), Biometrika 28, 321-377.
-
-Trade-offs. Two lags of the same size have the same effect to first order. The data then determine
-only their sum, as well as a single lag, and hardly each of them.
 """
 
 from __future__ import annotations
@@ -28,7 +25,6 @@ from thermocald.physics.model import ModelEffect
 from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.scan import normals_of_term
-from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
@@ -203,36 +199,6 @@ def compare_shift_and_tilt(
     return document, "" if separable else sentence
 
 
-def find_trade_off(
-    fitter: HypothesisFitter, fit: Fit, number: int
-) -> tuple[dict[str, Any], str] | None:
-    """Find two time constants of a term that M1 does not separate; None if it does.
-
-    Returns the evidence and a clause for the statement. The standard deviation of their sum is that
-    of the first with the second held.
-    """
-    term, K = fit.terms[number], len(fit.coefficients)
-    loose = []
-    for place, (owner, name) in enumerate(fit.searched, K):
-        value = float(dict(fit.terms[owner].nonlinear)[name])
-        sd = float(np.sqrt(fit.covariance[place, place]))
-        is_time = owner == number and term.kind.nonlinear[name].unit == "s"
-        if is_time and not sd <= criteria.LOOSE * abs(value):
-            loose.append((place, name, value))
-    if len(loose) != 2:
-        return None
-    (one, first, a), (two, second, b) = loose
-    A, _, _ = fitter.normal_equations(fit, only=[0])
-    kept = np.delete(np.arange(len(A)), two)
-    Q = inverse_of_determined(A[np.ix_(kept, kept)])
-    row = kept.tolist().index(one)
-    total = _make_estimate(a + b, np.sqrt(Q[row, row]), "s")
-    document = {
-        "parameters": [first, second], "sum": total["value"], "sd": total["sd"], "unit": "s"
-    }  # fmt: skip
-    return document, f"; the time constants are not separable, their sum is {say_estimate(total)}"
-
-
 def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict[str, Any] | None:
     """Find the constants of a formula that trade off against its size or each other in M1.
 
@@ -263,12 +229,10 @@ def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict
             ):
                 exchanged.append(name)
     for block in (own, base):
+        known = coefficients_of(fit, [block], e.scale)
         for p in own.parameters:
-            row = np.zeros(len(A))
-            if p in block.parameters:
-                row[block.start + block.parameters.index(p)] = 1.0 / e.scale[COLUMNS.index(p)]
+            values[f"{p} {block.term}"], row = known.get(p, (0.0, np.zeros(len(A))))
             rows.append(row)
-            values[f"{p} {block.term}"] = float(row[: len(fit.coefficients)] @ fit.coefficients)
     R, mean = np.array(rows), float(e.history.temperature().mean())
     covariance = R @ inverse_of_determined(A) @ R.T
     return known_together(

@@ -233,7 +233,7 @@ def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) ->
     w = cleaned.weights[..., 0]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     v = np.where(np.abs(v - np.nanmedian(v, axis=0)).max(axis=2, keepdims=True) < 1e6, v, np.nan)
-    firsts = np.array([_find_best_step(v[:, k]) for k in range(len(rows))])
+    firsts = np.array([jumps[row][0] for row in rows.tolist()])
     groups: list[list[int]] = []
     for k in np.argsort(firsts):
         if groups and firsts[k] - firsts[groups[-1][-1]] <= 1:
@@ -267,19 +267,3 @@ def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) ->
             )
         )
     return out
-
-
-def _find_best_step(v: Array) -> int:
-    """Find the first epoch after a target's step in v (E, 2) px; gross errors are clipped."""
-    there = np.isfinite(v[:, 0])
-    x = np.where(there[:, None], v, 0.0)
-    spread = np.nanmedian(np.abs(np.diff(v[there], axis=0))) * 6 + 1e-9
-    low, high = np.nanpercentile(v[there], [3, 97], axis=0)
-    x = np.clip(x, low - spread, high + spread) * there[:, None]
-    n0 = np.cumsum(there)[:-1].astype(float)
-    n1 = there.sum() - n0
-    s = np.cumsum(x, axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        d = (s[-1] - s[:-1]) / n1[:, None] - s[:-1] / n0[:, None]
-        gain = np.nan_to_num(np.sum(d**2, axis=1) * n0 * n1)
-    return int(np.argmax(gain)) + 1

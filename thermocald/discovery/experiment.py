@@ -315,9 +315,7 @@ def _trajectories(name: str, history: History) -> list[Array]:
     if effect.is_drive:
         T = history.temperature()
         return [(effect.drive(history, **t) - T)[:, None] for t in trials]
-    if effect.kind == "signal":
-        return [effect.signal(history, **t) for t in trials]
-    return [(history.temperature() - history.T0)[:, None] for _ in trials]
+    return [effect.signal(history, **t) for t in trials]
 
 
 def _values(parameter: Parameter, history: History) -> Array:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.discovery.criteria import MARGIN
 from thermocald.physics.formula import TIME, Evaluator, Node
 from thermocald.physics.history import History
 from thermocald.physics.operators import OPERATORS
@@ -319,13 +320,10 @@ class Found:
 class FormulaSearch:
     """A search for formulas of the quantities that some series recorded."""
 
-    def __init__(
-        self, evidence: Condensed, margin: float, before: FormulaSearch | None = None
-    ) -> None:
+    def __init__(self, evidence: Condensed, before: FormulaSearch | None = None) -> None:
         """Evaluate the library; before: a search in the same series with other covariances, of
         which only the best formulas are tried again.
         """
-        self.margin = margin
         self.evidence = evidence
         if before is None:
             self.library = Library(evidence.histories)
@@ -422,7 +420,7 @@ class FormulaSearch:
                 steps = 0.25 * steps
         n = np.log(self.evidence.epochs)
         penalty = (len(self.evidence.root) + len(x)) * n + 2 * np.log(max(self.tried, 1))
-        return Found(at(x), gain, float(penalty + self.margin), self._rank(at(x), gain))
+        return Found(at(x), gain, float(penalty + MARGIN), self._rank(at(x), gain))
 
     def _newton(self, trajectory: Array, slopes: Array) -> Array:
         """Return the step of the constants (n,), in the units of `slopes` (rows, n)."""

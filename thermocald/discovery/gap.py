@@ -64,11 +64,9 @@ def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
             model = next(b for b in fit.blocks if b.term == block.term and b.series == 0)
             pair = x[model.start : model.stop].reshape(2, -1)
             _, s, v = np.linalg.svd(pair, full_matrices=False)
-            amplitude = s[0] * v[0]
             angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
-            trial = np.stack(
-                [np.outer(np.cos(angles), amplitude), np.outer(np.sin(angles), amplitude)], axis=1
-            ).reshape(len(angles), -1)
+            sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            trial = np.kron(sides, s[0] * v[0])
             cost = np.einsum("ai,ij,aj->a", trial, A, trial) - 2 * trial @ right
             x[own] = trial[int(np.argmin(cost))]
         else:

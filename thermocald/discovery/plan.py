@@ -113,8 +113,7 @@ def set_ups(
     for seed in range(seeds):
         simulation = given_simulation(preset, model, None, field, programme, seed, "plan")
         if preset is not None:  # only for its camera, without the preset's effects
-            bare = simulation.model.without(*(e.name for e in simulation.model.effects))
-            simulation = replace(simulation, model=bare)
+            simulation = replace(simulation, model=replace(simulation.model, effects=()))
         out.append((_record(simulation), simulation))
     return out
 

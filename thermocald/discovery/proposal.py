@@ -77,7 +77,7 @@ def propose(
     fitter = HypothesisFitter(series)
     fit = fitter.fit(x.base.terms, x.base.fit.coefficients)
     base = replace(x.base, fit=fit, fitter=fitter)
-    search = FormulaSearch(condense(fitter, base.fit, moving), criteria.MARGIN)
+    search = FormulaSearch(condense(fitter, base.fit, moving))
     test = SurrogateTest(
         *search.surrogates(criteria.FORMULA_SURROGATES, np.random.default_rng(_SEED))
     )
@@ -89,7 +89,7 @@ def propose(
         before = best
         if turn:
             here = condense(fitter, base.fit, moving, best.fit.weightings)
-            search = FormulaSearch(here, criteria.MARGIN, search)
+            search = FormulaSearch(here, search)
         _fit_formulas(base, moving, search.best(further=turn > 0), tried)
         best = min([base, *tried.values()], key=by_score)
         if best.score > before.score - criteria.MARGIN or all(

@@ -36,7 +36,6 @@ from thermocald.discovery.unnamed import (
     describe_unnamed,
     say_contradiction,
 )
-from thermocald.discovery.validation import cross_validation
 from thermocald.numbers import enumerated
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
@@ -140,7 +139,6 @@ class Discovery:
     examination: Examination
     base_fit: Fit
     final_fit: Fit
-    cross_validation: tuple[float, float]
     doubts: tuple[str, ...] = ()
     estimated: tuple[HypothesisFitter, Fit] | None = None
 
@@ -233,10 +231,9 @@ def discover_series(
         stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
         assert estimated is not None
         found.append(_describe_effect(x, fits[-1], estimated[1], k))
-    blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(
-        verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks, estimated=estimated
+        verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], estimated=estimated
     )
 
 
@@ -420,8 +417,7 @@ def _conclude_unexplained(
         )
         entry = replace(described, statement=statement, evidence=evidence)
     entry = replace(entry, alternatives=[*entry.alternatives, *resembling])
-    nan = float("nan")
-    return Discovery("unexplained", (entry,), tuple(stages), x, *fits, (nan, nan))
+    return Discovery("unexplained", (entry,), tuple(stages), x, *fits)
 
 
 def build_model(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:

@@ -12,7 +12,6 @@ from thermocald.discovery.entries import (
     EffectFound,
     estimate_term,
     find_tied_constants,
-    find_trade_off,
 )
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined
@@ -53,16 +52,8 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     u, s, _ = np.linalg.svd(rest @ root, full_matrices=False)
     course_px = u[:, 0] * s[0]
-    T = e.history.temperature()  # at all epochs, while the rows may be blocks of epochs
-    recorded: dict[str, Array] = {
-        e.history.reference: e.averaged(T),
-        "rate of temperature": e.averaged(_rate(T, e.history.times)),
-        "time": e.times,
-        "sigma0": e.sigma0,
-    }
-    for name in e.history.readings:
-        if name != e.history.reference:
-            recorded[name] = e.averaged(e.history.temperature(name))
+    rate, channels = _recorded(e)
+    recorded = {**channels, "rate of temperature": rate, "time": e.times, "sigma0": e.sigma0}
     correlation = {
         name: float(np.corrcoef(course_px, values)[0, 1])
         for name, values in recorded.items()
@@ -185,15 +176,12 @@ def describe_proposal(
     number = len(proposal.best.terms) - 1
     term = proposal.best.terms[number]
     estimates = estimate_term(fit, number, x.fitter.series[0])
-    trade_off = None
     tied = find_tied_constants(x.fitter, fit, number)
     if tied and tied["exchanged"]:  # the inverse holds their sds with the others held, so none
         estimates = {
             k: {**v, "sd": None} if k in tied["parameters"] or k.startswith("a_") else v
             for k, v in estimates.items()
         }
-    else:
-        trade_off = find_trade_off(x.fitter, fit, number)
     sentence = catalogue.get(term.effect).sentence(estimates)
     evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
     by_m1, by_m2 = proposal.closed
@@ -212,10 +200,7 @@ def describe_proposal(
         },
         "absolute_test": jsonable(x.adequacy),
     }
-    if trade_off is not None:
-        evidence["not_separable"], clause = trade_off
-        sentence += clause
-    elif tied:
+    if tied:
         evidence["not_separable"] = tied
         sentence += f"; {say_together(tied)}"
     return replace(
@@ -260,15 +245,13 @@ def describe_misfit(x: Examination) -> dict[str, Any]:
 
     total = x.base_adequacy[0]
     rows.append(("all slow trajectories in all parameters", total.misfit_px, total.significance))
-    T = e.history.temperature()  # at all epochs, while the rows may be blocks of epochs
-    trajectories: dict[str, Array] = {
-        "time": e.times - e.times.mean(),
+    T, (rate, channels) = e.history.temperature(), _recorded(e)
+    trajectories = {
+        "time": e.times,
         "temperature, bent": e.averaged((T - T.mean()) ** 2),
-        "rate of temperature": e.averaged(_rate(T, e.history.times)),
+        "rate of temperature": rate,
+        **{f"channel {n}": v for n, v in channels.items() if n != e.history.reference},
     }
-    for name in e.history.readings:
-        if name != e.history.reference:
-            trajectories[f"channel {name}"] = e.averaged(e.history.temperature(name))
     for name, trajectory in trajectories.items():
         add(name, (trajectory - trajectory.mean())[:, None], total.directions)
     for column in COLUMNS:
@@ -296,22 +279,23 @@ def _test_noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
 
 def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
     """Return the RMS of a free camera's residuals in units of the noise, on a grid of 3 × 3."""
-    place = e.at.predicted
-    row = np.clip((3 * place[:, 1] / e.source.sensor.height).astype(float), 0, 2.99)
-    column = np.clip((3 * place[:, 0] / e.source.sensor.width).astype(float), 0, 2.99)
+    size = np.array([e.source.sensor.width, e.source.sensor.height])
+    place = np.clip(np.nan_to_num(3 * e.at.predicted / size), 0, 2).astype(int)
     out = []
-    for i in range(3):
-        for j in range(3):
-            inside = (np.floor(row) == i) & (np.floor(column) == j)
-            v = e.residuals[:, inside]
-            v = v[np.isfinite(v)]
-            if len(v):
-                ratio = float(np.sqrt(np.mean(v**2)) / e.sigma_px)
-                out.append({"row": i, "column": j, "noise_ratio": ratio})
+    for i, j in np.ndindex(3, 3):
+        v = e.residuals[:, (place == (j, i)).all(axis=1)]
+        if np.isfinite(v).any():
+            ratio = float(np.sqrt(np.nanmean(v**2)) / e.sigma_px)
+            out.append({"row": i, "column": j, "noise_ratio": ratio})
     return out
 
 
-def _rate(T: Array, times: Array) -> Array:
-    """Return the rate (E,) of a temperature, K/s; several epochs may have the same time."""
-    distinct, first = np.unique(times, return_index=True)
-    return np.asarray(np.interp(times, distinct, np.gradient(T[first], distinct)))
+def _recorded(e: ReducedSeries) -> tuple[Array, dict[str, Array]]:
+    """Return the reference's rate K/s and all temperatures °C, by name, at the rows of a series.
+
+    The rows may be blocks of epochs, and several epochs may have the same time.
+    """
+    h = e.history
+    times, first = np.unique(h.times, return_index=True)
+    rate = np.interp(h.times, times, np.gradient(h.temperature()[first], times))
+    return e.averaged(rate), {n: e.averaged(h.temperature(n)) for n in h.readings}

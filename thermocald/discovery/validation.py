@@ -47,38 +47,28 @@ BLOCKS = 6
 _PRIOR = 1e-6  # share of a coefficient's information, in case the other blocks hold none
 
 
-def _predict_blocks(
-    fitter: HypothesisFitter, fit: Fit, series: Sequence[int]
-) -> tuple[Array, Array]:
-    """Return χ² and -2 log likelihood (blocks,) of each block, predicted from the others.
+def _predict_blocks(fitter: HypothesisFitter, fit: Fit) -> Array:
+    """Return -2 log likelihood (blocks,) of each block, predicted from the others.
 
-    series: those that take part. Non-linear parameters are held. The prediction includes the
-    coefficients' uncertainty, so that a step within the block, which the others cannot predict,
-    does not count against its cause.
+    Non-linear parameters are held. The prediction includes the coefficients' uncertainty, so that a
+    step within the block, which the others cannot predict, does not count against its cause.
     """
-    chi2, objective = np.zeros(BLOCKS), np.zeros(BLOCKS)
+    objective = np.zeros(BLOCKS)
     for k in range(BLOCKS):
         masks = []
         for e in fitter.series:
             edges = np.linspace(0, len(e.times), BLOCKS + 1).astype(int)
             place = np.arange(len(e.times))
             masks.append((place >= edges[k]) & (place < edges[k + 1]))
-        trained = _keep_epochs(fitter, [~m for m in masks]).fit(
-            fit.terms, fit.coefficients, 1, series
-        )
-        tested = _keep_epochs(fitter, masks).fit(fit.terms, fit.coefficients, 1, series)
-        whole = np.diag(fit.normals(series)[0])
-        own = np.where(whole > 0, _PRIOR * whole, 1.0)  # 1 for a series that takes no part
-        known = trained.normals(series)[0] + np.diag(own)
-        B, c = tested.normals(series)
+        trained = _keep_epochs(fitter, [~m for m in masks]).fit(fit.terms, fit.coefficients, 1)
+        tested = _keep_epochs(fitter, masks).fit(fit.terms, fit.coefficients, 1)
+        known = trained.normals()[0] + np.diag(_PRIOR * np.diag(fit.normals()[0]))
+        B, c = tested.normals()
         g = c - B @ trained.coefficients
         both = np.linalg.slogdet(known + B)[1] - np.linalg.slogdet(known)[1]
-        for s in series:
-            chi2[k] += tested.chi2_of(s, trained.coefficients)
-            objective[k] += tested.weightings[s].logdet
-        chi2[k] -= float(g @ np.linalg.solve(known + B, g))
-        objective[k] += chi2[k] + both
-    return chi2, objective
+        chi2 = sum(tested.chi2_of(s, trained.coefficients) for s in range(len(masks)))
+        objective[k] = chi2 - float(g @ np.linalg.solve(known + B, g)) + both + tested.logdet
+    return objective
 
 
 def measure_block_gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> list[Array]:
@@ -86,12 +76,11 @@ def measure_block_gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> li
 
     A gain is in -2 log likelihood, of all series, relative to the other effects fitted without it.
     """
-    every = range(len(fitter.series))
-    whole = _predict_blocks(fitter, fit, every)[1]
+    whole = _predict_blocks(fitter, fit)
     out = []
     for i in range(kept, len(fit.terms)):
         fewer = fitter.fit(fit.terms[:i] + fit.terms[i + 1 :])
-        out.append(_predict_blocks(fitter, fitter.refine(fewer), every)[1] - whole)
+        out.append(_predict_blocks(fitter, fitter.refine(fewer)) - whole)
     return out
 
 
@@ -101,14 +90,6 @@ def is_confirmed(gain: Array) -> bool:
     return total > 0 and float(gain.min()) > -(
         criteria.BLOCK_WORSE + criteria.BLOCK_WORSE_SHARE * total
     )
-
-
-def cross_validation(fitter: HypothesisFitter, fit: Fit) -> tuple[float, float]:
-    """Return χ² per degree of freedom in blocks of M1 predicted from the others, and in M1."""
-    e = fitter.series[0]
-    outside = float(_predict_blocks(fitter, fit, [0])[0].sum())
-    free = e.rank * float((e.n > 0).sum())
-    return outside / max(free - BLOCKS * e.rank, 1.0), fit.chi2_of(0) / max(free - e.rank, 1.0)
 
 
 def _keep_epochs(fitter: HypothesisFitter, masks: Sequence[NDArray[np.bool_]]) -> HypothesisFitter:

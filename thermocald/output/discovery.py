@@ -27,9 +27,8 @@ from thermocald.figures import (
     label_axes,
     legend_above,
     new_drawing,
-    tick_text,
 )
-from thermocald.numbers import enumerated, parameter_label, plain, shortened, with_sd
+from thermocald.numbers import enumerated, parameter_label, shortened, with_sd
 from thermocald.photogrammetry.linalg import best_level
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
@@ -44,6 +43,11 @@ if TYPE_CHECKING:
 
 _BASE, _FOUND = PALETTE[1], PALETTE[0]
 _AT_NOISE = 1.1  # times the noise: a misfit up to this counts as noise
+_ADVICE = {
+    "effects_found": "Write the model with --model-out and correct measurements with it.",
+    "adequate": "See which effects this set-up would reveal: thermocald discover --plan.",
+    "unexplained": "Also record possible causes (light, current, a second temperature).",
+}
 
 
 def report_html(discovery: Discovery, title: str) -> str:
@@ -68,8 +72,7 @@ def _answer(d: Discovery) -> Answer:
     before, after = d.stages[0], d.stages[-1]
     temperatures, noise = _temperatures(d), d.examination.fitter.series[0].sigma_px
     by_gap = sorted(d.effects_with_gaps(), key=lambda e: e[2].rms_px - e[1].rms_px)
-    closing = [e for e, _, _ in by_gap]
-    if closing:
+    if closing := [e for e, _, _ in by_gap]:
         sentence = as_sentence(_statement(closing[0]))
     elif mount_lines(d.examination):
         sentence = as_sentence(say_adequate(d.examination))
@@ -113,23 +116,16 @@ def _next_steps(d: Discovery) -> tuple[str, ...]:
     ]
     if d.stages[0].verify is None:
         steps.append("Record a second series (M2) and give it with --verify, as the proof.")
-    if d.verdict == "effects_found":
-        steps.append("Write the model with --model-out and correct measurements with it.")
-    if d.verdict == "adequate":
-        steps.append("See which effects this set-up would reveal: thermocald discover --plan.")
-    if d.verdict == "unexplained":
-        steps.append("Also record possible causes (light, current, a second temperature).")
-    return tuple(steps)
+    return (*steps, _ADVICE[d.verdict])
 
 
 def _not_covered(d: Discovery) -> tuple[str, ...]:
-    limits = [
-        f"Temperatures other than those{_temperatures(d)}, and changes faster than those measured."
-    ]
-    if d.stages[0].verify is None:
-        limits.append("Whether the constants hold on another day: no M2 was given.")
-    limits.append("Effects that move the image by less than its noise: they are not detected.")
-    return tuple(limits)
+    alone = "Whether the constants hold on another day: no M2 was given."
+    return (
+        f"Temperatures other than those{_temperatures(d)}, and changes faster than those measured.",
+        *([alone] if d.stages[0].verify is None else []),
+        "Effects that move the image by less than its noise: they are not detected.",
+    )
 
 
 def _names(d: Discovery) -> list[str]:
@@ -162,8 +158,7 @@ def _sections(d: Discovery) -> list[Section]:
         Section(
             "Misfit of the base model, in numbers",
             ("The misfit on M1, against everything that was recorded.",),
-            (_misfit_matrix(d),),
-            (_misfit_table(d),),
+            tables=(_misfit_table(d),),
             folded=True,
         ),
     ]
@@ -243,8 +238,7 @@ def _movement(d: Discovery) -> Figure:
     size, U = np.linalg.eigh(N)
     keep = size > 1e-6 * size.max()
     drawn = []
-    fits = (d.base_fit,) if d.final_fit is d.base_fit else (d.base_fit, d.final_fit)
-    for fit in fits:
+    for fit in dict.fromkeys((d.base_fit, d.final_fit)):
         r = _without_level(e, e.values - fit.parameters(0))
         _, s, v = np.linalg.svd((r @ U) * np.sqrt(np.maximum(size, 0.0)), full_matrices=False)
         pattern = U[:, keep] @ (v[0][keep] / np.sqrt(size[keep])) * s[0] / np.sqrt(len(r))
@@ -337,13 +331,7 @@ def _gap_table(d: Discovery) -> Table:
         for stage in d.stages
         for name, gap in zip(_names(d), stage.gaps, strict=True)
     ]
-    outside, inside = d.cross_validation
     note = "With noise alone, reduced χ² is 1."
-    if math.isfinite(outside):
-        note += (
-            " On blocks of M1 left out of the fit, χ² of the parameters per degree of freedom is "
-            f"{outside:.3f}; with these blocks in the fit it is {inside:.3f}."
-        )
     if d.stages[0].verify is None:
         note += " No M2 was given: the constants are not verified."
     return Table.of(
@@ -526,27 +514,4 @@ def _misfit_table(d: Discovery) -> Table:
             "size in px RMS": lambda r: number(r["rms_px"], 4),
             "significance in σ": lambda r: number(r["significance_sigmas"], 1),
         },
-    )
-
-
-def _misfit_matrix(d: Discovery) -> Figure:
-    """Draw the misfit of the base model, in σ: slow trajectories by parameter combination."""
-    a = d.examination.base_adequacy[0]
-    scores = np.maximum(np.abs(a.scores[:, ::-1]), 1e-3)
-    with drawing_style():
-        drawing = new_drawing(5.0, 3.0)
-        axis = drawing.subplots()
-        image = axis.pcolormesh(scores, cmap="magma_r", norm="log")
-        axis.grid(visible=False)
-        label_axes(axis, "parameter combination, best first (number)",
-                   "half-waves over M1 (number)")  # fmt: skip
-        bar = drawing.colorbar(image, ax=axis)
-        bar.set_label("|misfit| in σ")
-        bar.ax.yaxis.set_major_formatter(lambda value, _: tick_text(value))
-    return Figure(
-        "misfit-matrix",
-        "Misfit of the base model",
-        "Slow trajectories that the base model does not explain: at most "
-        f"{plain(float(scores.max()), digits=3)} σ.",
-        drawing=drawing,
     )

@@ -40,7 +40,7 @@ Boundaries other than `ambient` are listed under `boundaries: {chamber: …}`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import TYPE_CHECKING
 
 from thermocald.files import QuantityReader, read_yaml
@@ -57,7 +57,7 @@ from thermocald.physics.heat import (
 from thermocald.physics.scene import Look
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
 
@@ -121,23 +121,24 @@ def read_programme(path: Path) -> Programme:
     )
 
 
-def _group(top: QuantityReader, key: str, known: Sequence[str]) -> QuantityReader:
-    """Return a reader of the mapping at a key, empty if absent; only known keys are allowed."""
+def _group(top: QuantityReader, key: str, known: Iterable[str] | None = None) -> QuantityReader:
+    """Return a reader of the mapping at a key, empty if absent; `known`: the keys allowed."""
     group = top.inner(key) if top.mapping.get(key) is not None else QuantityReader(key, {})
-    group.only(known)
+    group.only(group.mapping if known is None else known)
     return group
 
 
 def _read_courses(
     top: QuantityReader, key: str, unit: str, duration: float, folder: Path
 ) -> dict[str, Course]:
-    if top.mapping.get(key) is None:
-        return {}
-    group = top.inner(key)
+    group = _group(top, key)
     return {str(name): read_course(group, name, unit, duration, folder) for name in group.mapping}
 
 
 CAMERA_FORMAT = "thermocald-camera/1"
+# unit and highest value, in the order of `Look`
+_LOOK = {"paper": ("DN", 255.0), "ink": ("DN", 255.0), "blur": ("px", 30.0), "noise": ("DN", 60.0),
+         "vignetting": ("1", 1.0)}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +223,7 @@ def read_camera_device(path: Path) -> CameraDevice:
         raise top.fail("thermometers", "is empty; give at least one thermometer")
     where = _group(top, "exterior", EOP_NAMES)
     measuring = _group(top, "measuring", ("sigma", "missed", "gross", "gross_size"))
-    look = _group(top, "look", ("paper", "ink", "blur", "noise", "vignetting"))
-    usual, seen = Measuring(), Look()
+    usual, look = Measuring(), _group(top, "look", _LOOK)
     return CameraDevice(
         top.text("name", "camera"),
         Sensor.read(top),
@@ -240,10 +240,9 @@ def read_camera_device(path: Path) -> CameraDevice:
             measuring.number("gross_size", "px", usual.gross_size, low=0.0),
         ),
         Look(
-            look.number("paper", "DN", seen.paper_dn, low=0.0, high=255.0),
-            look.number("ink", "DN", seen.ink_dn, low=0.0, high=255.0),
-            look.number("blur", "px", seen.blur_px, low=0.0, high=30.0),
-            look.number("noise", "DN", seen.noise_dn, low=0.0, high=60.0),
-            look.number("vignetting", "1", seen.vignetting, low=0.0, high=1.0),
+            *(
+                look.number(name, unit, seen, low=0.0, high=most)
+                for (name, (unit, most)), seen in zip(_LOOK.items(), astuple(Look()), strict=True)
+            )
         ),
     )

@@ -17,6 +17,7 @@ so is written in model files and commands like any other effect:
 from __future__ import annotations
 
 import ast
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,7 @@ _COLUMN = "column"
 _LONGEST = 300  # characters of a formula
 _DEEPEST = 8
 _OFFSET_C = "degC"
+_OWN_UNITS = {"time_constant": "s", "phase": "rad", "exponent": "1"}  # else that of the input
 _TOGETHER = 0.99  # correlation from which constants are determined only jointly
 _ON_THE_CURVE = 41  # temperatures
 
@@ -192,10 +194,8 @@ class Node:
 
     def unit_of(self, constant: Constant) -> str:
         """Return the unit of one of the operator's constants."""
-        if constant.role == "time_constant":
-            return "s"
-        if not constant.same_unit:
-            return "rad" if constant.role == "phase" else "1"
+        if constant.role in _OWN_UNITS:
+            return _OWN_UNITS[constant.role]
         if constant.role == "threshold" and self.inputs[0].is_celsius:
             return _OFFSET_C
         return unit_text(self.inputs[0].unit())
@@ -282,15 +282,13 @@ def _parse_node(tree: ast.expr, text: str, depth: int) -> Node:
 def _parse_constant(tree: ast.expr, text: str) -> str | float:
     if isinstance(tree, ast.Name):
         return tree.id
-    sign = 1.0
-    if isinstance(tree, ast.UnaryOp) and isinstance(tree.op, ast.USub):
-        tree, sign = tree.operand, -1.0
-    number = tree.value if isinstance(tree, ast.Constant) else None
-    if isinstance(number, bool) or not isinstance(number, int | float):
-        raise ConfigurationError(
-            f"formula {text!r}: {ast.unparse(tree)!r} is neither a number nor a name"
-        )
-    return sign * float(number)
+    with suppress(ValueError):
+        number = ast.literal_eval(tree)
+        if type(number) in (int, float):
+            return float(number)
+    raise ConfigurationError(
+        f"formula {text!r}: {ast.unparse(tree)!r} is neither a number nor a name"
+    )
 
 
 class Evaluator:
@@ -456,36 +454,35 @@ def known_together(
     low, mean, high = temperatures
     T = np.linspace(low, high, _ON_THE_CURVE)
     parabola = np.linalg.pinv(np.vander(T - mean, 3, increasing=True))[1:] * [[1.0], [2.0]]
-    effect, constants = OfFormula(text), dict(zip(names, x[:L].tolist(), strict=False))
+    effect = OfFormula(text)
 
-    def shape(**changed: float) -> Array | None:
-        f = parse(text).bound({**constants, **changed}).steady(T)
-        return None if f is None else np.asarray(parabola @ f)
+    def course(x: Array) -> Array | None:  # slope and curvature (2, P)
+        f = effect.node.bound(dict(zip(names, x.tolist(), strict=True))).steady(T)
+        if f is None:
+            return None
+        return np.outer(parabola @ f, x[L : L + P]) + [[1.0], [0.0]] * x[L + P :]
 
     r_most = 1.0 if exchanged else min(float(most.max()), 1.0)
     out: dict[str, Any] = {
         "parameters": tied, "exchanged": bool(exchanged), "correlation": r_most
     }  # fmt: skip
-    at = shape()
+    at = course(x)
     if at is None:
         return out
-    by = np.zeros((2, L))
-    for i, (name, value) in enumerate(constants.items()):
-        step = effect.nonlinear[name].difference_step(value)
-        either = shape(**{name: value + step}), shape(**{name: value - step})
-        by[:, i] = np.diff(np.array(either)[::-1], axis=0)[0] / (2.0 * step)
-    sizes = dict(zip(moved, x[L : L + P].tolist(), strict=True))
-    for row, what in enumerate(("slope", "curvature")):
-        J = np.zeros((P, len(x)))
-        J[:, :L] = np.outer(x[L : L + P], by[row])
-        J[:, L : L + P] = at[row] * np.eye(P)
-        J[:, L + P :] = np.eye(P) * (row == 0)
-        sds = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)).tolist()
+    own = [effect.nonlinear[n].difference_step(v) for n, v in zip(names[:L], x, strict=False)]
+    steps = np.diag([*own, *[1.0] * 2 * P])  # linear in sizes and rates
+    J = np.array([np.array(course(x + d)) - np.array(course(x - d)) for d in steps])
+    J /= 2.0 * steps.sum(axis=1)[:, None, None]
+    if not J[:L].any():  # constants of a lag, which do not matter at a steady temperature
+        return out
+    variance = np.einsum("iwp,ij,jwp->wp", J, covariance, J)
+    sds = np.sqrt(np.maximum(variance, 0.0))
+    for row, (what, per) in enumerate((("slope", "K"), ("curvature", "K2"))):
         out[what] = {
             p: {
-                "value": float(sizes[p] * at[row] + (0 if row else x[L + P + j])),
-                "sd": sds[j],
-                "unit": f"{PARAMETER_UNITS[p]}/{('K', 'K2')[row]}",
+                "value": float(at[row, j]),
+                "sd": float(sds[row, j]),
+                "unit": f"{PARAMETER_UNITS[p]}/{per}",
             }
             for j, p in enumerate(moved)
         }

@@ -327,7 +327,7 @@ def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float
     phi1 = np.where(small, 1.0 - x / 2 + x * x / 6, -np.expm1(-safe) / safe)
     phi2 = np.where(small, 0.5 - x / 6 + x * x / 24, (safe + np.expm1(-safe)) / safe**2)
     driven = np.append(start, h * (phi1 * begin[:-1] + phi2 * (end[1:] - begin[:-1])))
-    return decayed_sums(np.exp(-x), driven[:, None])[:, 0]
+    return decayed_sums(np.exp(-x), driven)
 
 
 def read_network(reader: QuantityReader) -> HeatNetwork:

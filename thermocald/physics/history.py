@@ -76,13 +76,6 @@ class History:
     T0: float
     columns: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        if self.reference not in self.readings:
-            raise DataError(
-                f"there is no temperature column {self.reference!r}; there are: "
-                f"{', '.join(self.readings) or 'none'}"
-            )
-
     def at(self, times: ArrayLike) -> Self:
         """Return the history with other times."""
         return replace(self, times=np.asarray(times, dtype=float))
@@ -101,7 +94,7 @@ class History:
             if name not in self.readings:
                 raise DataError(
                     f"there is no temperature column {name!r}; there are: "
-                    f"{', '.join(self.readings)}"
+                    f"{', '.join(self.readings) or 'none'}"
                 )
             self._polygons[name] = _lay_polygon(self.reading_times, self.readings[name], self.times)
         return self._polygons[name]

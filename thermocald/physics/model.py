@@ -216,11 +216,6 @@ class ThermalModel:
         """Return the next version of the model, with a further effect."""
         return replace(self, effects=(*self.effects, effect), version=self.version + 1)
 
-    def without(self, *names: str) -> ThermalModel:
-        """Return the next version of the model, without the named effects."""
-        kept = tuple(e for e in self.effects if e.name not in names)
-        return replace(self, effects=kept, version=self.version + 1)
-
     @property
     def misses_an_effect(self) -> bool:
         """Whether the fit found that an effect is missing; the standard deviations are then void.

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
+_DECAYED = 1e-7
 _LAG_CUT = 14.0  # time constants after which a reading's weight in a lag is left out
 
 
@@ -55,9 +56,9 @@ def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def _interpolate(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return the left knot and the polygon's value at times (E,), both (E,)."""
+    """Return the left knot (E,) and the value (…, E) of polygons (…, K) at times (E,)."""
     left, right, share = _edges(knots, at)
-    return left, values[left] * (1.0 - share) + values[right] * share
+    return left, values[..., left] * (1.0 - share) + values[..., right] * share
 
 
 def interpolation_matrix(
@@ -97,77 +98,68 @@ def _lag_weights(knots: Array, tau: float) -> tuple[Array, Array, Array]:
 
 
 def decayed_sums(kept: Array, driven: Array) -> Array:
-    """Return s (K, m) with s₀ = driven₀, s₊ = kept s + driven₊; kept (K-1,), driven (K, m)."""
+    """Return s (K,) with s₀ = driven₀, s₊ = kept s + driven₊; kept (K-1,), driven (K,)."""
     from scipy.linalg.lapack import dtbtrs
 
     band = np.ones((2, len(driven)), order="F")
     band[1, :-1] = -kept
-    return np.asarray(dtbtrs(band, driven, uplo="L", diag="U")[0])
+    return np.asarray(dtbtrs(band, driven[:, None], uplo="L", diag="U")[0])[:, 0]
+
+
+def _decay_matrix(kept: Array) -> csr_array:
+    """Return the matrix (K, K) of `decayed_sums`, without weights below 1e-7."""
+    from scipy.sparse import diags_array, eye_array
+
+    n = len(kept) + 1
+    total, step = eye_array(n).tocsr(), diags_array([kept], offsets=[-1], shape=(n, n)).tocsr()
+    while step.nnz:  # Σ stepⁱ, with twice as many powers in every turn
+        total = total + step @ total
+        step = step @ step
+        step.data[step.data < _DECAYED] = 0.0
+        step.eliminate_zeros()
+    return total
+
+
+def _lag_within(
+    knots: Array, tau: float, at: Array
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    """Return the left and right knots of times (E,), and the weights of the response there.
+
+    These are the decay of the state at the left knot, and the response to a rise by 1 on the way.
+    """
+    left, right, share = _edges(knots, at)
+    edge = (knots[right] - knots[left]) / tau
+    decayed = np.exp(-share * edge)
+    return left, right, decayed, (share * edge - 1.0 + decayed) / np.where(edge > 0, edge, 1.0)
 
 
 def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
     """Pass a polygon through a first-order lag: `tau` L' = T - L, L = T at the first knot.
 
-    knots (K,) s, values (K,) or (K, m), at (E,) s; returns (E,) or (E, m).
+    knots (K,) s, values (K,), at (E,) s; returns (E,).
     """
-    v = np.asarray(values, dtype=float)
-    columns = v.reshape(len(v), -1)
-    state = columns
-    if len(knots) > 1:
-        a, old, new = _lag_weights(knots, tau)
-        driven = columns.copy()
-        driven[1:] = old[:, None] * columns[:-1] + new[:, None] * columns[1:]
-        state = decayed_sums(a, driven)
-    left, right, share = _edges(knots, at)
-    elapsed = share * (knots[right] - knots[left]) / tau
-    edge = (knots[right] - knots[left]) / tau
-    slope = (columns[right] - columns[left]) / np.where(edge > 0, edge, 1.0)[:, None]
-    decayed = np.exp(-elapsed)[:, None]
-    result = (
-        columns[left] * (1.0 - decayed)
-        + state[left] * decayed
-        + slope * (elapsed[:, None] - 1.0 + decayed)
-    )
-    return np.asarray(result.reshape(len(at), *v.shape[1:]))
+    a, old, new = _lag_weights(knots, tau)
+    driven = np.append(values[:1], old * values[:-1] + new * values[1:])
+    state = decayed_sums(a, driven)
+    left, right, decayed, rise = _lag_within(knots, tau, at)
+    start = values[left]
+    return np.asarray(start + (state[left] - start) * decayed + (values[right] - start) * rise)
 
 
 def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:  # noqa: ARG001
     """Return the matrix (E, K) of `lag`, without weights older than 14 tau (below 1e-6)."""
-    from scipy.sparse import csr_array
+    from scipy.sparse import csr_array, diags_array, eye_array
 
-    n = len(knots)
-    if n == 1:
-        return interpolation_matrix(knots, at)
-    _, old, new = _lag_weights(knots, tau)
-    left, right, share = _edges(knots, at)
-    # state k = Σ_j<k D_kj+1 (old_j T_j + new_j T_j+1) + D_k0 T_0, with D_kj = exp(-(t_k - t_j)/τ)
-    first = np.maximum(np.searchsorted(knots, knots[left] - _LAG_CUT * tau) - 1, 0)
-    counts = left - first + 1
-    rows = np.repeat(np.arange(len(at)), counts)
-    offset = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    columns = np.repeat(first, counts) + offset
-    gone = np.exp(-(knots[left][rows] - knots[columns]) / tau)
-    weight = np.where(columns == 0, 1.0, np.append(0.0, new)[columns]) * gone
-    inner = columns < left[rows]
-    following = np.minimum(columns + 1, n - 1)
-    weight[inner] += old[columns[inner]] * np.exp(
-        -(knots[left][rows] - knots[following])[inner] / tau
-    )
-    elapsed = share * (knots[right] - knots[left]) / tau
-    edge = (knots[right] - knots[left]) / tau
-    decayed = np.exp(-elapsed)
-    rise = (elapsed - 1.0 + decayed) / np.where(edge > 0, edge, 1.0)
-    frames = np.arange(len(at))
-    return csr_array(
-        (
-            np.concatenate([weight * decayed[rows], 1.0 - decayed - rise, rise]),
-            (
-                np.concatenate([rows, frames, frames]),
-                np.concatenate([columns, left, right]),
-            ),
-        ),
-        shape=(len(at), n),
-    )
+    a, old, new = _lag_weights(knots, tau)
+    driven = diags_array([np.append(1.0, new), old], offsets=[0, -1])
+    left, right, decayed, rise = _lag_within(knots, tau, at)
+    own, states = eye_array(len(knots)).tocsr(), (_decay_matrix(a) @ driven).tocsr()
+    parts = ((1.0 - decayed - rise, own[left]), (decayed, states[left]), (rise, own[right]))
+    whole = sum(diags_array(weight) @ rows for weight, rows in parts).tocoo()
+    first = np.searchsorted(knots, knots[left] - _LAG_CUT * tau) - 1
+    kept = whole.col >= first[whole.row]
+    place = whole.row[kept], whole.col[kept]
+    return csr_array((whole.data[kept], place), shape=whole.shape)
 
 
 def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
@@ -277,14 +269,12 @@ _LONG = 1500
 class Constant:
     """A constant of an operator.
 
-    name: the usual one; role: its meaning; positive: whether it is above 0; same_unit: whether it
-    has the unit of the operator's input.
+    name: the usual one; role: its meaning; positive: whether it is above 0.
     """
 
     name: str
     role: Role
     positive: bool
-    same_unit: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,13 +302,12 @@ class Operator:
 
 
 def _integral(knots: Array, values: Array, at: Array) -> Array:
-    steps = 0.5 * np.diff(knots) * (values[1:] + values[:-1])
-    total = np.append(0.0, np.cumsum(steps))
-    left, _, _ = _edges(knots, at)
-    elapsed = np.clip(at - knots[left], 0.0, None)
-    now = np.interp(at, knots, values)
-    whole: Array = total[left] + 0.5 * elapsed * (values[left] + now)
-    return whole - float(np.interp(0.0, knots, total))
+    v = values.T  # (K,), or (m, K) of several polygons
+    steps = 0.5 * np.diff(knots) * (v[..., 1:] + v[..., :-1])
+    total = np.concatenate([0.0 * v[..., :1], np.cumsum(steps, axis=-1)], axis=-1)
+    left, now = _interpolate(knots, v, at)
+    whole = total[..., left] + 0.5 * np.maximum(at - knots[left], 0.0) * (v[..., left] + now)
+    return np.asarray(whole - _interpolate(knots, total, np.zeros(1))[1]).T
 
 
 def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
@@ -327,17 +316,7 @@ def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # no
     n = len(knots)
     if n > _LONG or n < 2:
         return csr_array((len(at), n))
-    h = np.diff(knots)
-    whole = np.zeros((n, n))
-    inside = np.tri(n, n - 1, -1) * h / 2.0
-    whole[:, :-1] += inside
-    whole[:, 1:] += inside
-    left, right, share = _edges(knots, at)
-    weights = whole[left]
-    rows = np.arange(len(at))
-    weights[rows, left] += h[left] * share * (1.0 - share / 2.0)
-    weights[rows, right] += h[left] * share**2 / 2.0
-    return csr_array(weights - interpolation_matrix(knots, np.zeros(1)) @ whole)
+    return csr_array(_integral(knots, np.eye(n), at))
 
 
 def _change(knots: Array, values: Array, at: Array) -> Array:
@@ -361,40 +340,26 @@ def _peak(knots: Array, values: Array, tau: float, at: Array) -> Array:
     states = [float(values[0])]
     for v, d in zip(values[1:].tolist(), decay.tolist(), strict=True):
         states.append(max(v, v + (states[-1] - v) * d))
-    now = np.interp(at, knots, values)
-    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 1)
+    left, now = _interpolate(knots, values, at)
     gone = np.exp(-np.clip(at - knots[left], 0.0, None) / tau)
     return np.asarray(np.maximum(now, now + (np.array(states)[left] - now) * gone))
 
 
 def _peak_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:
     """Return ∂ peak / ∂ values: 1 where the input is the peak, else a lag's since the peak."""
-    from scipy.sparse import csr_array
+    from scipy.sparse import diags_array
 
-    n = len(knots)
-    decay = np.append(0.0, np.exp(-np.diff(knots) / tau))
     held = _peak(knots, values, tau, knots) > values
-    rows, columns, weights = [], [], []
-    first = 0
-    for i in range(n):
-        if not held[i]:
-            first = i
-        gone = np.append(np.cumprod(decay[i:first:-1])[::-1], 1.0)
-        share = gone * np.append(1.0, 1.0 - decay[first + 1 : i + 1])
-        kept = share > 1e-6
-        columns.append(np.arange(first, i + 1)[kept])
-        rows.append(np.full(int(kept.sum()), i))
-        weights.append(share[kept])
-    at_knots = csr_array(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)
-    )
-    return interpolation_matrix(knots, at) @ at_knots
+    kept = np.where(held[1:], np.exp(-np.diff(knots) / tau), 0.0)
+    own = diags_array(np.append(1.0, 1.0 - kept))
+    matrix: csr_array = interpolation_matrix(knots, at) @ _decay_matrix(kept) @ own
+    return matrix
 
 
 _A = Constant("a", "threshold", False)
 _K = Constant("k", "threshold", False)
 _W = Constant("w", "scale", True)
-_TAU = Constant("tau", "time_constant", True, same_unit=False)
+_TAU = Constant("tau", "time_constant", True)
 
 
 OPERATORS: dict[str, Operator] = {
@@ -403,7 +368,7 @@ OPERATORS: dict[str, Operator] = {
     "above": Operator(1, (_K,), "({0} − {1})₊", lambda x, k: np.maximum(x - k, 0.0),
                       lambda x, k: ((x > k).astype(float),)),
     "power": Operator(
-        1, (Constant("p", "exponent", True, same_unit=False),), "[{0}]^({1})",
+        1, (Constant("p", "exponent", True),), "[{0}]^({1})",
         lambda x, p: np.asarray(np.maximum(x, 0.0) ** p),
         # a root is vertical at 0: its slope is limited to that at a reading's error
         lambda x, p: (p * np.maximum(x, 1e-2) ** (p - 1.0) * (x > 0),), powers=0,
@@ -425,7 +390,7 @@ OPERATORS: dict[str, Operator] = {
         lambda x, w: (np.exp(np.clip(x / w, -300.0, 300.0)) / w,), powers=0,
     ),
     "wave": Operator(
-        1, (Constant("P", "scale", True), Constant("phase", "phase", False, same_unit=False)),
+        1, (Constant("P", "scale", True), Constant("phase", "phase", False)),
         "sin(2π · {0} / {1} + {2})", lambda x, P, phase: np.sin(2 * np.pi * x / P + phase),
         lambda x, P, phase: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phase),), powers=0,
     ),

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.effect import Effect
 
@@ -135,26 +134,6 @@ PRESETS: Mapping[str, Preset] = {
 """The presets, by name."""
 
 
-def _make_programme(preset: Preset, loss: float, series: str) -> Programme:
-    """Return the programme that heats by a lamp or from the board; loss: W/K to the air."""
-    duration = (_EPOCHS - 1) * _INTERVAL_S
-    ambient = preset.begin_degc if preset.lamp else 23.0
-    power = loss * (preset.end_degc - ambient)
-    if preset.lamp:
-        sources = {"housing": Course.steps([0.0, _HEATED_S, duration + 60.0], [power, 0.0])}
-    else:
-        sources = {"board": Course.constant(power)}
-    return Programme(
-        preset.name,
-        _EPOCHS,
-        _INTERVAL_S,
-        {"ambient": Course.constant(ambient)},
-        sources,
-        series,
-        initial=preset.begin_degc,
-    )
-
-
 def preset_simulation(
     name: str, seed: int = 0, series: str = "M1", field: TestField | None = None
 ) -> Simulation:
@@ -175,7 +154,18 @@ def preset_simulation(
     )
     network = HeatNetwork({"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4}, links)
     device = CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
-    programme = _make_programme(preset, loss, series)
+    ambient = preset.begin_degc if preset.lamp else 23.0
+    power = loss * (preset.end_degc - ambient)
+    lamp = Course.steps([0.0, _HEATED_S, _EPOCHS * _INTERVAL_S + 50.0], [power, 0.0])
+    programme = Programme(
+        preset.name,
+        _EPOCHS,
+        _INTERVAL_S,
+        {"ambient": Course.constant(ambient)},
+        {"housing": lamp} if preset.lamp else {"board": Course.constant(power)},
+        series,
+        initial=preset.begin_degc,
+    )
     test_field = corner_field() if field is None else field
     bare = ThermalModel(
         preset.camera,
@@ -191,27 +181,25 @@ def preset_simulation(
     warming = float(np.max(np.abs(course - course[0])))
     angle = np.deg2rad(preset.direction_deg)
     way = preset.drift_px * preset.sensor.pixel_pitch * np.array([np.cos(angle), np.sin(angle)])
-    x0, y0 = (float(v) for v in way * (1.0 - preset.set_share) / warming)
-    model = replace(
-        bare,
-        rates={"c": preset.drift_c_mm / warming, "x0": x0, "y0": y0},
-        effects=tuple(_make_effects(preset, way, warming)),
-    )
-    return Simulation(model, device, test_field, programme, seed)
-
-
-def _make_effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
-    x0, y0 = (way * preset.set_share / warming).tolist()
+    x0, y0 = (way / warming).tolist()
+    stays, returns = preset.set_share, 1.0 - preset.set_share
     a1, b1, b2 = (change / warming for change in preset.distortion_drift)
     wanted: list[tuple[Callable[[Effect], bool], dict[str, float]]] = [
-        (lambda e: e.irreversible, {"x0": x0, "y0": y0}),
+        (lambda e: e.irreversible, {"x0": stays * x0, "y0": stays * y0}),
         (lambda e: e.usual == ("A1",), {"A1": a1}),
         (lambda e: e.usual == ("B1", "B2"), {"B1": b1, "B2": b2}),
         (lambda e: e.seen_in == "noise", {"factor": (preset.noise_ratio - 1.0) / warming}),
     ]
-    return [
-        ModelEffect(catalogue.find(one).name, sizes) for one, sizes in wanted if any(sizes.values())
-    ]
+    model = replace(
+        bare,
+        rates={"c": preset.drift_c_mm / warming, "x0": returns * x0, "y0": returns * y0},
+        effects=tuple(
+            ModelEffect(catalogue.find(one).name, sizes)
+            for one, sizes in wanted
+            if any(sizes.values())
+        ),
+    )
+    return Simulation(model, device, test_field, programme, seed)
 
 
 def given_simulation(

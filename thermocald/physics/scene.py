@@ -15,7 +15,7 @@ Source: blur, vignetting and noise as in Luhmann, T. et al. (2014): Close-Range 
 The area coverage is the share of each half pixel, a cell, inside polygons. Every edge is cut at the
 cells' borders. A piece inside a cell adds the area to its right to this cell, and its height to all
 cells further right, which one running sum along the rows turns into coverage. Nothing is sampled.
-Many polygons are filled at once, each in its own window.
+Each shape is filled in a window of its own.
 
 Source: the signed-area accumulation of scan converters, e.g. FreeType's smooth rasteriser.
 """
@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from thermocald.physics.shapes import Outlines, gaussian_kernel, outlines, project, surface_normals
+from thermocald.physics.shapes import Shape, gaussian_kernel, outlines, project, surface_normals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,40 +42,7 @@ if TYPE_CHECKING:
 
     Integers = NDArray[np.int64]
 
-_WIDTH_STEP = 16
 _FINER = 2  # cells in a pixel, along both axes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Windows:
-    """Windows of one width around shapes, stacked one below the other.
-
-    members (k,): the shapes; left, top, height (k,) px: of the windows in the image; row (k,): the
-    first row of each in the stack; width px; rows: height of the stack.
-    """
-
-    members: Integers
-    left: Integers
-    top: Integers
-    height: Integers
-    row: Integers
-    width: int
-    rows: int
-
-
-def windows_around(low: Array, high: Array, margin: int) -> list[Windows]:
-    """Lay windows around shapes with bounds low, high (n, 2) px and a margin px; group by width."""
-    first = np.floor(low + 0.5).astype(np.int64) - margin
-    last = np.floor(high + 0.5).astype(np.int64) + margin + 1
-    width = -(-(last[:, 0] - first[:, 0] + 1) // _WIDTH_STEP) * _WIDTH_STEP
-    result = []
-    for w in np.unique(width):
-        members = np.flatnonzero(width == w)
-        height = last[members, 1] - first[members, 1] + 1
-        row = np.cumsum(height) - height
-        left, top = first[members].T
-        result.append(Windows(members, left, top, height, row, int(w), int(height.sum())))
-    return result
 
 
 def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, Integers]:
@@ -104,27 +71,25 @@ def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, I
     return new_a, new_b, cell, edge
 
 
-def coverage_steps(a: Array, b: Array, sign: Array, shape: Integers, windows: Windows) -> Array:
-    """Return the signed coverage of the cell to the left minus that of each cell, (rows, width).
+def coverage_steps(a: Array, b: Array, sign: Array, width: int, height: int) -> Array:
+    """Return the signed coverage of the cell to the left minus that of each cell (2 h, 2 w).
 
-    The cells are half pixels of the windows. a, b (e, 2) px: the polygons' edges; sign (e,): +1 for
-    polygons to be added, which run clockwise in the image (y down); shape (e,): each edge's member
-    of `windows`.
+    The cells are half pixels of a window of width × height px. a, b (e, 2) px from its corner: the
+    polygons' edges; sign (e,): +1 for polygons to be added, which run clockwise in the image (y
+    down).
     """
-    # a pixel is [i, i+1) after the shift by half a pixel
-    origin = np.stack([windows.left, windows.top - windows.row], axis=1)[shape] - 0.5
-    a1, b1, cy, edge1 = _cut_edges(_FINER * (a - origin), _FINER * (b - origin), 1)
+    a1, b1, cy, edge1 = _cut_edges(_FINER * a, _FINER * b, 1)
     a2, b2, cx, edge2 = _cut_edges(a1, b1, 0)
     dy = (b2[:, 1] - a2[:, 1]) * sign[edge1[edge2]]
     right = 0.5 * (a2[:, 0] + b2[:, 0]) - cx
     # the row is that of the first cut: rounding in the second one cannot change it
-    rows, width = _FINER * windows.rows, _FINER * windows.width
-    cell = cy[edge2] * width + cx
+    rows, columns = _FINER * height, _FINER * width
+    cell = cy[edge2] * columns + cx
     area = (
-        np.bincount(cell, dy * (1.0 - right), rows * width)
-        + np.bincount(cell + 1, dy * right, rows * width + 1)[:-1]
+        np.bincount(cell, dy * (1.0 - right), rows * columns)
+        + np.bincount(cell + 1, dy * right, rows * columns + 1)[:-1]
     )
-    return area.reshape(rows, width).astype(np.float64, copy=False)
+    return area.reshape(rows, columns).astype(np.float64, copy=False)
 
 
 def fill(steps: Array | NDArray[np.float32]) -> NDArray[np.float32]:
@@ -213,15 +178,15 @@ class Scene:
         self.look = look or Look()
         self._normals = surface_normals(field)
         self._facing: NDArray[np.bool_] | None = None
-        self._outlines: Outlines | None = None
+        self._outlines: list[Shape] = []
 
-    def _shapes(self, centre: Array) -> Outlines | None:
+    def _shapes(self, centre: Array) -> list[Shape]:
         """Return the outlines seen from a point (3,) mm; its side sets the sense of ring codes."""
         facing = np.sum(self._normals * (centre - self.field.points), axis=1) > 0
         if self._facing is None or not np.array_equal(facing, self._facing):
             self._facing = facing
             normals = np.where(facing[:, None], self._normals, -self._normals)
-            self._outlines = outlines(self.field, normals)
+            self._outlines = list(outlines(self.field, normals))
         return self._outlines
 
     def render(
@@ -259,46 +224,31 @@ class Scene:
         self, canvas: NDArray[np.int16], iop: Array, eop: Array, points: Array, blur_factor: float
     ) -> None:
         shapes = self._shapes(eop[3:6])
-        if shapes is None:
+        if not shapes:
             return
-        image = project(self.sensor, iop, eop, shapes.vertices(points))
-        count = len(shapes.centre)
-        begins = np.flatnonzero(np.diff(shapes.shape, prepend=-1))
-        low = np.minimum.reduceat(image, begins)
-        high = np.maximum.reduceat(image, begins)
-        towards = eop[3:6] - points[shapes.centre]
-        seen = np.sum(towards * shapes.normal, axis=1) > 0
-        with np.errstate(invalid="ignore"):
-            edge = np.array([self.sensor.width, self.sensor.height])
-            seen &= np.all((high > -0.5) & (low < edge - 0.5), axis=1)
-            # a shape larger than the image, behind or beside the camera, would need a huge window
-            seen &= np.all(high - low < edge, axis=1)
-        if not seen.any():
-            return
-        rank = np.cumsum(seen) - 1
-        edges = seen[shapes.shape]
-        a, b = image[edges], image[shapes.following[edges]]
-        member = rank[shapes.shape[edges]]
-        sign = shapes.sign[edges]
-        ends = np.zeros(1)
+        vertices = [shape.vertices(points) for shape in shapes]
+        projected = project(self.sensor, iop, eop, np.concatenate(vertices))
+        images = np.split(projected, np.cumsum([len(v) for v in vertices])[:-1])
+        zero, edge = np.zeros(1), np.array([self.sensor.width, self.sensor.height])
         kernel = gaussian_kernel(_FINER * self.look.blur_px * blur_factor)
-        kernel = (np.concatenate([kernel, ends]) + np.concatenate([ends, kernel])) / _FINER
+        kernel = (np.concatenate([kernel, zero]) + np.concatenate([zero, kernel])) / _FINER
         margin = len(kernel) // (2 * _FINER) + 1
         depth = np.float32((self.look.paper_dn - self.look.ink_dn) * _FRACTION / 2)
         gain = _compute_gain(self.sensor, self.look.vignetting)
-        place = np.empty(count, dtype=np.int64)
-        for windows in windows_around(low[seen], high[seen], margin):
-            place[:] = -1
-            place[windows.members] = np.arange(len(windows.members))
-            mine = place[member] >= 0
-            steps = coverage_steps(a[mine], b[mine], sign[mine], place[member[mine]], windows)
-            stack = average(fill(average(steps.astype(np.float32), kernel, 0)), kernel, 1)
-            for row, left, top, height in zip(
-                windows.row, windows.left, windows.top, windows.height, strict=True
-            ):
-                y0, y1 = max(0, top), min(self.sensor.height, top + height)
-                x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
-                if y0 < y1 and x0 < x1:
-                    ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
-                    taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
-                    canvas[y0:y1, x0:x1] -= taken + taken
+        for shape, image in zip(shapes, images, strict=True):
+            low, high = image.min(axis=0), image.max(axis=0)
+            in_front = np.sum((eop[3:6] - points[shape.targets[0]]) * shape.normal) > 0
+            inside = np.all((high > -0.5) & (low < edge - 0.5))
+            # a shape larger than the image, behind or beside the camera, would need a huge window
+            if not (in_front and inside and np.all(high - low < edge)):
+                continue
+            corner = np.floor(low + 0.5).astype(np.int64) - margin
+            size = np.floor(high + 0.5).astype(np.int64) + margin + 2 - corner
+            a = image - (corner - 0.5)  # a pixel is [i, i+1) after the shift by half a pixel
+            steps = coverage_steps(a, a[shape.following], shape.sign, *size.tolist())
+            covered = average(fill(average(steps.astype(np.float32), kernel, 0)), kernel, 1)
+            (left, top), (x0, y0) = corner.tolist(), np.maximum(corner, 0).tolist()
+            x1, y1 = np.minimum(corner + size, edge).tolist()
+            ink = covered[y0 - top : y1 - top, x0 - left : x1 - left]
+            taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
+            canvas[y0:y1, x0:x1] -= taken + taken

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
 
     Integers = NDArray[np.int64]
-    _Polygon = tuple[float, list[int], Array, Array]  # sign, rows, weights (k, 4), offset (k, 3)
+    _Polygon = tuple[float, Array, Array]  # sign, weights (k, 4), offset (k, 3)
 
 # π/2 in two parts: multiples of the first are exact for the angles that occur
 _HALF_PI_HIGH = 1.5707963267341256
@@ -110,29 +110,39 @@ _NEIGHBOURS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outlines:
-    """The polygons of all targets, as vertices that move with the targets.
+class Shape:
+    """The outline of a disc or a marker: polygons in its plane that move with its targets.
 
-    A vertex is Σ weights × points[rows] + offset. rows (v, 4), weights (v, 4), offset (v, 3) mm;
-    following (v,): the next vertex of the same polygon; sign (v,): +1 for ink, -1 for paper in it;
-    shape (v,): the vertex's target or marker; centre (s,), normal (s, 3): of each shape a target's
-    row, and the normal of its plane.
+    A vertex is weights × points of the targets + offset. targets: four rows of the test field, the
+    first of which tells where the shape is; normal (3,): of the plane, towards the viewer; weights
+    (v, 4), offset (v, 3) mm; following (v,): the next vertex of the same polygon; sign (v,): +1 for
+    ink, -1 for paper in it.
     """
 
-    rows: Integers
+    targets: list[int]
+    normal: Array
     weights: Array
     offset: Array
     following: Integers
     sign: Array
-    shape: Integers
-    centre: Integers
-    normal: Array
+
+    @classmethod
+    def of(cls, targets: list[int], normal: Array, polygons: Sequence[_Polygon]) -> Shape:
+        """Return the shape of polygons."""
+        sign, weights, offset = zip(*polygons, strict=True)
+        sizes = np.array([len(w) for w in weights])
+        following = np.arange(sizes.sum()) + 1
+        following[np.cumsum(sizes) - 1] -= sizes
+        return cls(
+            targets, normal, np.concatenate(weights), np.concatenate(offset), following,
+            np.repeat(np.array(sign), sizes),
+        )  # fmt: skip
 
     def vertices(self, points: Array) -> Array:
         """Return the vertices (v, 3) mm for targets at points (n, 3) mm."""
         p = self.offset.copy()
-        for k in range(4):
-            p += self.weights[:, k : k + 1] * points[self.rows[:, k]]
+        for k, target in enumerate(self.targets):
+            p += self.weights[:, k : k + 1] * points[target]
         return p
 
 
@@ -217,40 +227,11 @@ def _lay_box(x0: int, y0: int, x1: int, y1: int) -> Array:
     return np.concatenate(sides)
 
 
-def outlines(field: TestField, normals: Array) -> Outlines | None:
-    """Return the outlines of the targets; normals (n, 3) point at the viewer.
+def outlines(field: TestField, normals: Array) -> Iterator[Shape]:
+    """Yield the outline of each disc, and then of each marker; normals (n, 3) point at the viewer.
 
-    Circles without a diameter and markers without all four corners are left out; None if no target
-    remains.
+    Circles without a diameter and markers without all four corners are left out.
     """
-    centre: list[int] = []
-    normal: list[Array] = []
-    drawn: list[tuple[Any, ...]] = []
-    for row, up, polygons in _shapes(field, normals):
-        drawn += [(len(centre), *polygon) for polygon in polygons]
-        centre.append(row)
-        normal.append(up)
-    if not drawn:
-        return None
-    shape, sign, rows, weights, offset = zip(*drawn, strict=True)
-    sizes = np.array([len(w) for w in weights])
-    first = np.cumsum(sizes) - sizes
-    following = np.arange(sizes.sum()) + 1
-    following[first + sizes - 1] = first
-    return Outlines(
-        np.repeat(np.array(rows), sizes, axis=0),
-        np.concatenate(weights),
-        np.concatenate(offset),
-        following,
-        np.repeat(np.array(sign), sizes),
-        np.repeat(np.array(shape), sizes),
-        np.array(centre),
-        np.array(normal),
-    )
-
-
-def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list[_Polygon]]]:
-    """Yield the row, the normal and the polygons of each disc, and then of each marker."""
     markers: dict[tuple[str, int], dict[int, int]] = {}
     for i, (kind, code) in enumerate(zip(field.kinds, field.codes, strict=True)):
         if kind == "marker_corner":
@@ -265,11 +246,11 @@ def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list
             right = np.cross(helper, up)
             right = right / np.sqrt(right[0] * right[0] + right[1] * right[1] + right[2] * right[2])
             down = -np.cross(up, right)
-            yield i, up, [
-                (1.0, [i] * 4, np.tile([1.0, 0.0, 0.0, 0.0], (len(p), 1)),
-                 p[:, :1] * right + p[:, 1:] * down)
+            polygons = [
+                (1.0, np.eye(4)[[0] * len(p)], p[:, :1] * right + p[:, 1:] * down)
                 for p in _disc_polygons(float(field.diameters[i]), code)
-            ]  # fmt: skip
+            ]
+            yield Shape.of([i] * 4, up, polygons)
     for (dictionary, marker), corners in markers.items():
         if len(corners) == 4:
             order = [corners[k] for k in range(4)]
@@ -277,7 +258,7 @@ def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list
             for sign, polygon in _marker_polygons(dictionary, marker):
                 u, v = polygon.T
                 weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
-                polygons.append((sign, order, weights, np.zeros((len(u), 3))))
+                polygons.append((sign, weights, np.zeros((len(u), 3))))
             a, b, _, d = field.points[order]
             # corners run clockwise for the viewer, so that right × down points away from the viewer
-            yield order[0], -np.cross(b - a, d - a), polygons
+            yield Shape.of(order, -np.cross(b - a, d - a), polygons)

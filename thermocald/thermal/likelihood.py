@@ -245,44 +245,43 @@ class ReadingErrorTerm:
     """The effect of a thermometer's error on the camera.
 
     direction (P,): px per unit of the trajectory; operator (E, R): ∂ trajectory / ∂ independent
-    errors of the channel (`ReducedSeries.states`); unresolved (E,): standard deviation of the
-    trajectory, in its unit, where the temperature bends between two readings; None if the operator
-    covers that.
+    errors of the channel (`ReducedSeries.states`).
     """
 
     direction: Array
     operator: Array
     channel: str
-    unresolved: Array | None = None
 
 
 def add_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> list[ReadingErrorTerm]:
     """Add a term; terms with the same operator are merged, their directions added."""
     for i, old in enumerate(terms):
         alike = old.channel == new.channel and old.operator.shape == new.operator.shape
-        plain = old.unresolved is None and new.unresolved is None
-        if alike and plain and np.array_equal(old.operator, new.operator):
+        if alike and np.array_equal(old.operator, new.operator):
             both = replace(old, direction=old.direction + new.direction)
             return [*terms[:i], both, *terms[i + 1 :]]
     return [*terms, new]
 
 
 def prepare(
-    evidence: ReducedSeries, carried: list[ReadingErrorTerm], thermometer_factor: float = 1.0
+    evidence: ReducedSeries,
+    carried: list[ReadingErrorTerm],
+    bends: list[tuple[Array, Array]],
+    thermometer_factor: float,
 ) -> Weighting:
     """Return the weighting of a series by image noise, movement, and thermometers' errors.
 
-    carried: the propagation of the thermometers' errors; thermometer_factor: multiplies the
-    standard deviations of the readings.
+    carried: the propagation of the thermometers' errors; bends: of each trajectory its direction
+    (P,) and its sd (E,), in its unit, where the temperature bends between two readings;
+    thermometer_factor: multiplies the standard deviations of the readings.
     """
     from scipy.linalg import cholesky
 
     sums = sum_series(evidence)
     # an error that no reading resolves is noise of single epochs
-    for c in carried:
-        if c.unresolved is not None and c.unresolved.any():
-            bent = np.flatnonzero(c.unresolved)
-            sums = sums.blurred(c.unresolved[bent, None, None] * c.direction[:, None], bent)
+    for direction, sd in bends:
+        if len(bent := np.flatnonzero(sd)):
+            sums = sums.blurred(sd[bent, None, None] * direction[:, None], bent)
     E, P = sums.b.shape
     S = start = len(sums.right)
     errors = []
@@ -293,23 +292,21 @@ def prepare(
             errors.append((operator, at, direction, sums.N @ direction))
             start = at.stop
     moving = slice(S, start)
-    touched = _find_touched(sums.N, carried)
     places: dict[str, slice] = {}
-    sds, deviations = [np.ones(start - S)], {}
+    sds = [np.ones(start - S)]
     for name in dict.fromkeys(c.channel for c in carried):
-        sd = evidence.state_sd(name)[touched[name]] * thermometer_factor
+        sd = evidence.state_sd(name) * thermometer_factor
         places[name] = slice(start, start + len(sd))
-        deviations[name] = evidence.state_deviation(name)[touched[name]]
         sds.append(sd)
         start += len(sd)
     whole = np.concatenate(sds)
     # the readings' deviation from the smooth trajectory, propagated to the camera
     shift = np.zeros((E, P))
     for item in carried:
-        operator = item.operator[:, touched[item.channel]]
-        shift += np.outer(operator @ deviations[item.channel], item.direction)
+        deviation = item.operator @ evidence.state_deviation(item.channel)
+        shift += np.outer(deviation, item.direction)
         dN = sums.N @ item.direction
-        errors.append((operator, places[item.channel], item.direction, dN))
+        errors.append((item.operator, places[item.channel], item.direction, dN))
     moved = np.einsum("epq,eq->ep", sums.N, shift)
     yy = sums.yy - 2 * float(np.sum(shift * sums.b)) + float(np.sum(shift * moved))
     b = sums.b - moved
@@ -351,21 +348,6 @@ def whiten(factor: Array, right: Array, transposed: bool = False) -> Array:
         factor, right, lower=True, trans=int(transposed), check_finite=False
     )
     return out
-
-
-def _find_touched(
-    N: Array, carried: list[ReadingErrorTerm]
-) -> dict[str, NDArray[np.int64] | slice]:
-    """Return the errors of each channel that reach an epoch with weight; others have no effect."""
-    seen = N.any(axis=(1, 2))
-    if seen.all():
-        return {c.channel: slice(None) for c in carried}
-    reached: dict[str, NDArray[np.bool_]] = {}
-    for c in carried:
-        before = reached.get(c.channel, np.zeros(c.operator.shape[1], dtype=bool))
-        reached[c.channel] = np.logical_or(before, np.any(c.operator[seen] != 0.0, axis=0))
-    # at least one, even if no epoch has any weight
-    return {name: np.flatnonzero(r) if r.any() else slice(1) for name, r in reached.items()}
 
 
 def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> None:

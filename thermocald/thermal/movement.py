@@ -254,8 +254,6 @@ def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
     second = np.diff(np.eye(len(e.times)), 2, axis=0)
     carried = np.zeros((W.shape[1], W.shape[1]))
     for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
-        if operator is None:
-            continue
         jump = (second @ operator) * e.state_sd(channel)
         share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         carried += np.mean(np.sum(jump**2, axis=1)) * np.outer(share, share)
@@ -341,8 +339,6 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
         z = fast @ (_subtract_fit(fitter, fit, s) @ W)
         M = z.T @ z / len(fast)  # the unit matrix if there is image noise only
         for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, s):
-            if operator is None:
-                continue
             carried = fast @ operator
             noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
             # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit

@@ -7,8 +7,7 @@ Whatever is constant over the series has no information about heat. One offset p
 errors of the field's coordinates) is eliminated together with the cameras, so that a target that is
 hidden now and then is not mistaken for a drift.
 
-Gross errors are detected in time: a target leaps away from its own neighbours. The series is
-processed in parts, so that a long one needs no more memory than its points.
+Gross errors are detected in time: a target leaps away from its own neighbours.
 
 The series is linearised at one camera, adjusted to its mean image. The partial derivatives of the
 normal equations refer to this camera, so that its errors become errors of the rates; it is as
@@ -50,7 +49,7 @@ from thermocald.thermal.series import ReducedSeries, SeriesInput, scaled_basis, 
 from thermocald.thermal.thermometer import Thermometer, thermometers
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -113,34 +112,21 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
 
 
 _HALF = 2  # neighbours on either side
-_PART = 2048  # epochs at a time
 _LAGS = 20  # epochs, of autocorrelations
 _ITERATIONS = 60  # of conjugate gradients
 
 
-def _parts(epochs: int) -> Iterator[slice]:
-    return (slice(k, min(k + _PART, epochs)) for k in range(0, epochs, _PART))
+def running_median(values: Array, half: int, *, itself: bool = True) -> Array:
+    """Return the running median over 2 half + 1 epochs, along the first axis, ignoring NaN.
 
-
-def _take_running_median(
-    values: Array, part: slice, mask: Mask | None = None, *, itself: bool = True
-) -> Array:
-    """Return the running median over five epochs (e, T, 2) of a part, ignoring NaN.
-
-    mask (E, T): points to ignore; itself: whether the epoch itself is among the five.
+    itself: whether the epoch itself is among them.
     """
-    first, last = max(part.start - _HALF, 0), min(part.stop + _HALF, len(values))
-    near = values[first:last]
-    if mask is not None:
-        near = np.where(mask[first:last, :, None], np.nan, near)
-    before, after = part.start - first, last - part.stop
-    padded = np.pad(near, ((_HALF - before, _HALF - after), (0, 0), (0, 0)),
-                    constant_values=np.nan)  # fmt: skip
-    width, n = 2 * _HALF + 1, part.stop - part.start
-    return _take_median([padded[k : k + n] for k in range(width) if itself or k != _HALF], 0)
+    padded = np.pad(values, ((half, half), (0, 0), (0, 0)), constant_values=np.nan)
+    near = [padded[k : k + len(values)] for k in range(2 * half + 1) if itself or k != half]
+    return take_median(near, 0)
 
 
-def _take_median(values: ArrayLike, axis: int) -> Array:
+def take_median(values: ArrayLike, axis: int) -> Array:
     """Return the median along an axis, ignoring NaN; NaN where all values are."""
     ordered = np.sort(values, axis=axis)  # NaN go to the end
     count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
@@ -155,15 +141,12 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
     This precedes any adjustment, in which a gross error of many pixels would mask itself and
     others.
     """
-    size, own = np.zeros(seen.shape), np.zeros(len(seen))
-    for part in _parts(len(seen)):
-        # Without the epoch itself: in a steady movement it would be its own median, and the usual
-        # deviation would be zero.
-        d = misclosure[part] - _take_running_median(misclosure, part, itself=False)
-        for k in range(2):
-            d[..., k] -= _take_median(d[..., k], 1)[:, None]  # the whole image may move
-        own[part] = MAD_TO_SD * _take_median(np.abs(d).reshape(len(d), -1), 1)
-        size[part] = np.max(np.abs(np.nan_to_num(d)), axis=2)
+    # without the epoch itself: in a steady movement it would be its own median, and the usual
+    # deviation would be zero
+    d = misclosure - running_median(misclosure, _HALF, itself=False)
+    d -= take_median(d, 1)[:, None]  # the whole image may move
+    own = MAD_TO_SD * take_median(np.abs(d).reshape(len(d), -1), 1)
+    size = np.max(np.abs(np.nan_to_num(d)), axis=2)
     finite = own[np.isfinite(own)]
     level = float(np.median(finite)) if len(finite) else 0.0
     limit = criteria.SPIKE * np.fmax(np.nan_to_num(own), level)
@@ -176,17 +159,12 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
     bad: the points found so far, which are ignored. As noise may grow with heat, the limit is
     relative to the epoch's own spread, or to the series' if that is larger.
     """
-    size, own = np.zeros(seen.shape), np.zeros(len(seen))
-    good = seen & ~bad
-    normal = []
-    for part in _parts(len(seen)):
-        root = np.sqrt(weights[part, :, :2])
-        kept = np.where(good[part, :, None], np.abs(np.nan_to_num(v[part])) * root, np.nan)
-        own[part] = MAD_TO_SD * _take_median(kept.reshape(len(kept), -1), 1)
-        normal.append(kept[np.isfinite(kept)])
-        local = np.abs(np.nan_to_num(v[part] - _take_running_median(v, part, bad)))
-        size[part] = np.max(local * root, axis=2)
-    level = MAD_TO_SD * float(np.median(np.concatenate(normal)))
+    root = np.sqrt(weights[..., :2])
+    kept = np.where((seen & ~bad)[..., None], np.abs(np.nan_to_num(v)) * root, np.nan)
+    own = MAD_TO_SD * take_median(kept.reshape(len(kept), -1), 1)
+    around = running_median(np.where(bad[..., None], np.nan, v), _HALF)
+    size = np.max(np.abs(np.nan_to_num(v - around)) * root, axis=2)
+    level = MAD_TO_SD * float(np.median(kept[np.isfinite(kept)]))
     limit = criteria.GROSS * np.fmax(np.nan_to_num(own), level)
     return np.asarray(seen & (size > limit[:, None]))
 

@@ -23,7 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.linalg import best_level, explained, unit_diagonal
+from thermocald.photogrammetry.linalg import best_level, explained, scaled_solve
 from thermocald.physics.history import History
 from thermocald.physics.model import Distortion, distortion_along, follow_angle
 
@@ -357,8 +357,7 @@ def _remove_rates(evidence: ReducedSeries) -> Array:
     A[:P, P:] = A[P:, :P] = np.einsum("e,epq->pq", T, N)
     A[P:, P:] = np.einsum("e,epq->pq", T * T, N)
     c = np.concatenate([evidence.b.sum(axis=0), T @ evidence.b])
-    scaled, scale = unit_diagonal(A)
-    x = scale * np.linalg.lstsq(scaled, c * scale, rcond=1e-10)[0]
+    x = scaled_solve(A, c, 1e-10)
     return np.asarray(evidence.values - x[:P] - np.outer(T, x[P:]))
 
 
@@ -412,7 +411,6 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     b = np.add.reduceat(evidence.b, first, axis=0)
     values = solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
-    rank = float(np.sum(np.linalg.eigvalsh(N.sum(axis=0)) > 1e-9 * np.trace(N.sum(axis=0))))
     knots = next(iter(evidence.thermometers.values())).times
     inside = (knots >= evidence.history.times[0] - 30.0) & (
         knots <= evidence.history.times[-1] + 30.0
@@ -438,7 +436,7 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
         blocks=Blocks(
             average,
             pool,
-            rank * float((evidence.n > 0).sum() - (total > 0).sum()),
+            evidence.rank * float((evidence.n > 0).sum() - (total > 0).sum()),
             first,
         ),
         hidden=evidence.hidden.in_blocks(first) if evidence.hidden else None,

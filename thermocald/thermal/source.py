@@ -25,6 +25,7 @@ from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid, recut
 from thermocald.store.recording.reader import Recording
 from thermocald.thermal import criteria
+from thermocald.thermal.reduce import take_median
 from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.thermometer import estimate_reading_noise
 
@@ -220,20 +221,13 @@ def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.boo
         out[-short:] = _find_gross(p[-short:], seen[-short:], short)
     values = np.where(seen[..., None], p, np.nan)[:n]
     runs = values.reshape(-1, short, *p.shape[1:])
-    off = (runs - _take_lower_median(runs)).reshape(n, *p.shape[1:])
+    off = (runs - take_median(runs, 1)[:, None]).reshape(n, *p.shape[1:])
     # the whole image may move within a short mean
-    off = np.abs(off - _take_lower_median(off))
+    off = np.abs(off - take_median(off, 1)[:, None])
     known = np.isfinite(off)
     scale = float(mad_sd(off[known])) if known.any() else 0.0
     out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
     return out
-
-
-def _take_lower_median(values: Array) -> Array:
-    """Return the lower median over axis 1, which stays with length 1, ignoring NaN."""
-    ordered = np.sort(values, axis=1)  # NaN go to the end
-    count = np.isfinite(ordered).sum(axis=1, keepdims=True)
-    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=1)
 
 
 def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:

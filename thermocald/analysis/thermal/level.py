@@ -26,6 +26,7 @@ from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.normals import chunks, linearise
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
+from thermocald.thermal.reduce import running_median
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -141,7 +142,7 @@ def estimate_level(
 
 
 _GROSS = 6.0  # standard deviations from the neighbours in time
-_WINDOW = 9
+_NEIGHBOURS = 4  # epochs on either side
 _MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
@@ -170,12 +171,7 @@ def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     seen = (others.source.grid.weights[:, rows, 0] > 0) & (others.n > 0)[:, None]
     left[~seen] = np.nan
     sd = others.sigma_px
-    half = _WINDOW // 2
-    padded = np.pad(left, ((half, half), (0, 0), (0, 0)), constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, _WINDOW, axis=0)
-    some = np.isfinite(windows).any(axis=-1)
-    near = np.zeros(left.shape)
-    near[some] = np.nanmedian(windows[some], axis=-1)
+    near = np.nan_to_num(running_median(left, _NEIGHBOURS))
     seen &= (np.abs(np.nan_to_num(left - near)) < _GROSS * sd).all(axis=2)
     v = np.where(seen[..., None], left, 0.0)
     before = np.cumsum(seen, axis=0)[:-1].astype(float)

@@ -33,11 +33,11 @@ from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
     moved_model,
-    noise_share,
     predict_orientations,
     require_known,
     require_sd,
     steady_camera,
+    steady_parts,
     widened,
 )
 from thermocald.arrays import floats, seconds
@@ -49,13 +49,13 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
+from thermocald.physics.operators import interpolation_matrix
 from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.analysis.thermal.modelled_camera import SteadyCamera
     from thermocald.arrays import Array
     from thermocald.physics.model import ThermalModel
 
@@ -132,7 +132,7 @@ class ThermalCamera(Result):
 
         def at(t: float) -> tuple[Array, Array, Array]:
             alike = dict.fromkeys(self.channels, t)
-            return steady_camera(self.model, self.parameters, alike).at(t)
+            return steady_camera(self.model, self.parameters, alike, t)
 
         base, _, J0 = at(self.model.T0)
         values, _, J = zip(*map(at, T.tolist()), strict=True)
@@ -248,10 +248,6 @@ class ThermalCamera(Result):
         limits = next(iter(self.model.validity.values()), None)
         return None if limits is None else Validity(*limits)
 
-    @cached_property
-    def _steady(self) -> SteadyCamera:
-        return steady_camera(self.model, self.parameters, None)
-
     @property
     def channels(self) -> tuple[str, ...]:
         """The other thermometers that the model's effects follow."""
@@ -275,11 +271,9 @@ class ThermalCamera(Result):
         if math.isnan(T):
             raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
-        if channels is None:
-            values, slope, J = self._steady.at(T)
-        else:
+        if channels is not None:
             self._require_channels(channels)
-            values, slope, J = steady_camera(self.model, self.parameters, channels).at(T)
+        values, slope, J = steady_camera(self.model, self.parameters, channels, T)
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
@@ -342,12 +336,15 @@ class ThermalCamera(Result):
             history.temperature(), others, self.model.rate_vector, extrapolate
         )
         values, covariance = [], []
-        steady = None if relative_to is None else self._steady.at(relative_to)[2]
+        steady = None
+        if relative_to is not None:
+            steady = steady_camera(self.model, self.parameters, None, relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
             noise = None
             if temperature_sd:
-                noise = temperature_sd**2 * noise_share(t - begin, part.times)
+                shares = interpolation_matrix(t - begin, part.times).power(2).sum(axis=1)
+                noise = temperature_sd**2 * shares
             drive = self.model.drive(part)
             found = predict_orientations(
                 self.model, self.parameters, self.covariance, part, drive, noise, steady
@@ -396,15 +393,22 @@ class ThermalCamera(Result):
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
-    def steady_tables(self) -> tuple[tuple[Array, Array, Array], list[tuple[float, ...]]]:
+    def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
 
-        Three arrays (10,); of each knee the temperature °C and the ten parameters' change per
-        kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
+        Polynomials (3, 10); of each knee (11,) the temperature °C and the ten parameters' change
+        per kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        return self._steady.p, [(T, *rate.tolist()) for T, rate, _, _ in self._steady.knees]
+        powers = np.zeros((3, 10))
+        knees: dict[str, Array] = {}
+        for name, row, value, steady in steady_parts(self.model):
+            powers[:, row] += value * np.array(steady.powers)
+            if steady.knee is not None:
+                knee = np.array([steady.knee, *np.zeros(10)])
+                knees.setdefault(name.rpartition(".")[0], knee)[1 + row] += value
+        return powers, list(knees.values())
 
 
 def load_camera(path: Path | str) -> ThermalCamera:

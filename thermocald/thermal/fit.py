@@ -28,8 +28,7 @@ from thermocald.thermal.likelihood import (
     add_error_term,
     prepare,
 )
-from thermocald.thermal.scan import cosines
-from thermocald.thermal.series import ReducedSeries, unit_directions
+from thermocald.thermal.series import ReducedSeries, cosines, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -398,7 +397,6 @@ class HypothesisFitter:
                 A, g, _ = self.normal_equations(fit, only)
                 step = scaled_solve(A, g, _RIDGE)[len(fit.coefficients) :]
                 improved = False
-                tried: list[Term] = []
                 for damping in (1.0, 0.3, 0.1):
                     terms = list(fit.terms)
                     for (i, name), d in zip(searched, damping * step, strict=True):
@@ -408,9 +406,6 @@ class HypothesisFitter:
                         if parameter.role == "period":
                             value = min(value, max(old, longest))
                         terms[i] = terms[i].with_value(name, value)
-                    if terms == tried:  # all parameters are still at their bounds
-                        continue
-                    tried = terms
                     trial = self.fit(terms, fit.coefficients, 2, only)
                     gain = cost(fit) - cost(trial)
                     if gain > 0:

@@ -9,15 +9,18 @@ nor lagged thermometer noise is mistaken for an effect:
     S = N⁻¹ + J C Jᵀ,  J = Σ_k d_k ⊗ O_k,   S⁻¹ = N - N J (C⁻¹ + JᵀN J)⁻¹ JᵀN
 
 The level of every parameter belongs to the series and is eliminated here. The offsets of targets
-that are hidden for long and the mount's movement are integrated out with δ (`random_effects`).
+that are hidden for long (if these were fixed, a target that reappears would bias the camera) and
+the camera's slow movement on its mount (a random walk, possibly bounded, in the well-determined
+combinations of the camera's parameters) are random effects, which are integrated out with δ.
 Random shifts of single epochs, due to trembling or to a temperature between two readings, are part
 of the noise.
 
 All that is integrated out forms one triangular factor, which whitens trajectories: one by one if
 they are few, otherwise through the epochs, which all trajectories share.
 
-Source: Fuller (1987), Measurement Error Models, section 3.2; Rasmussen, Williams (2006), Gaussian
-Processes for Machine Learning, section 2.7 for marginalised linear terms.
+Source: Fuller (1987), Measurement Error Models, section 3.2; Patterson, Thompson (1971), Biometrika
+58, 545-554 (variance components); Rasmussen, Williams (2006), Gaussian Processes for Machine
+Learning, section 2.7 for marginalised linear terms.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from thermocald.photogrammetry.linalg import (
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.likelihood import whiten
-from thermocald.thermal.random_effects import Movement, waves
+from thermocald.thermal.series import Movement, waves
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

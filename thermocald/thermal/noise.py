@@ -34,8 +34,8 @@ from thermocald.photogrammetry.linalg import (
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import detect_tremble, weight_jumps_down
-from thermocald.thermal.scan import ORDERS, cosines
-from thermocald.thermal.series import ReducedSeries, in_blocks
+from thermocald.thermal.scan import ORDERS
+from thermocald.thermal.series import ReducedSeries, cosines, in_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

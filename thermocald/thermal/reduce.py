@@ -44,8 +44,13 @@ from thermocald.photogrammetry.series.normals import (
 )
 from thermocald.physics.history import History
 from thermocald.thermal import criteria
-from thermocald.thermal.random_effects import group_hidden_targets
-from thermocald.thermal.series import ReducedSeries, SeriesInput, scaled_basis, solve
+from thermocald.thermal.series import (
+    ReducedSeries,
+    SeriesInput,
+    group_hidden_targets,
+    scaled_basis,
+    solve,
+)
 from thermocald.thermal.thermometer import Thermometer, thermometers
 
 if TYPE_CHECKING:
@@ -313,15 +318,12 @@ def _reduce(
     seen = source.grid.observed
     bad = find_spikes(misclosure, seen)
     offsets = np.zeros((len(X), 2))
-    for turn in range(5):
+    for turn in range(6):
         w = source.grid.reject(bad).weights
         N = normal_matrices(w, A)
         offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
-        if turn >= 1:
+        if 1 <= turn < 5:
             bad = find_outliers(v, weights, seen, bad)
-    w = source.grid.reject(bad).weights
-    N = normal_matrices(w, A)
-    offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
     lPl = sums_of_squares(w, misclosure - offsets)
     yy = np.einsum("ek,ek->e", values, b)
     count = (seen & ~bad).sum(axis=1)

@@ -34,7 +34,7 @@ from thermocald.photogrammetry.linalg import (
 )
 from thermocald.thermal import criteria
 from thermocald.thermal.hypothesis import BASE, Candidate, Fit
-from thermocald.thermal.series import ReducedSeries, solve, unit_directions
+from thermocald.thermal.series import ReducedSeries, cosines, solve, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -258,14 +258,6 @@ class Adequacy:
     def adequate(self) -> bool:
         """Whether the misfit is insignificant or negligible."""
         return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX
-
-
-def cosines(times: Array, orders: int) -> Array:
-    """Return smooth trajectories (orders, E) over a series; order 1 is half a wave."""
-    u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
-    rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
-    rows -= rows.mean(axis=1, keepdims=True)
-    return rows
 
 
 def examine_all(fitter: HypothesisFitter, fit: Fit) -> tuple[Adequacy, ...]:

@@ -392,24 +392,18 @@ def extend(channel: Thermometer) -> Thermometer:
     edge = np.concatenate([np.arange(n), np.arange(n + K, n + K + m)])
     at = np.concatenate([np.full(n, n + k[0]), np.full(m, n + k[-1])])
     ends = csr_array((np.ones(n + m), (edge, at)), shape=(n + K + m, n + K + m))
-    ones = [csr_array(np.eye(size)) for size in (n, m)]
-    mixing = csr_array(block_diag([ones[0], channel.mixing, ones[1]]) + ends)
+    mixing = csr_array(block_diag([np.eye(n), channel.mixing, np.eye(m)]) + ends)
     rate = float(np.sqrt(np.mean(np.gradient(channel.trajectory[k], t[k]) ** 2)))
-    return Thermometer(
-        np.concatenate([before, t, after]),
-        np.concatenate([held, channel.trajectory, carried]),
-        np.concatenate([np.zeros(n), channel.deviation, np.zeros(m)]),
-        np.concatenate(
-            [
-                0.5 * abs(first) * (t[0] - before) + 0.1 * channel.noise,
-                channel.sd,
-                0.5 * (abs(last) + rate) * (after - t[-1]) + 0.1 * channel.noise,
-            ]
-        ),
-        mixing,
-        np.concatenate([np.zeros(n, dtype=bool), channel.real, np.zeros(m, dtype=bool)]),
-        channel.noise,
-        channel.coarse,
+    early = 0.5 * abs(first) * (t[0] - before) + 0.1 * channel.noise
+    late = 0.5 * (abs(last) + rate) * (after - t[-1]) + 0.1 * channel.noise
+    return replace(
+        channel,
+        times=np.concatenate([before, t, after]),
+        trajectory=np.concatenate([held, channel.trajectory, carried]),
+        deviation=np.pad(channel.deviation, (n, m)),
+        sd=np.concatenate([early, channel.sd, late]),
+        mixing=mixing,
+        real=np.pad(channel.real, (n, m)),
     )
 
 

@@ -203,13 +203,6 @@ def _step(model: ThermalModel, name: str) -> float:
     return _STEP * max(abs(model.value(name)), 1e-9)
 
 
-def widened(covariance: Array, variance: Array) -> Array:
-    """Return covariances (E, 10, 10) with the variances (E, 10) of a drift added."""
-    rows = np.arange(10)
-    covariance[:, rows, rows] += variance
-    return covariance
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Along:
     """The camera along a history; indexing gives a Camera.

@@ -16,13 +16,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.series.course import carried_by_c
-from thermocald.analysis.thermal.level import (
+from thermocald.analysis.thermal.prediction_test import (
     AFFINITY_SD,
     average_residuals,
     estimate_level,
+    image_partials,
     project_targets,
+    thermometer_noise,
 )
-from thermocald.analysis.thermal.prediction_test import image_partials, thermometer_noise
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -44,7 +45,7 @@ from thermocald.thermal.series import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.thermal.level import Moved
+    from thermocald.analysis.thermal.prediction_test import Moved
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Unknowns
@@ -178,9 +179,7 @@ def _effect(
     values = {**e.values, **dict.fromkeys((n for n in kind.linear if n in e.values), 0.0)}
     for name, value in (own or {}).items():
         if kind.nonlinear[name].role == "event":  # anywhere between two frames: take the middle
-            times = fitter.series[k].times
-            before = max(int(np.searchsorted(times, float(value) - 1e-6)) - 1, 0)
-            value = float(0.5 * (float(value) + times[before]))
+            _, value, _ = fitter.series[k].locate(float(value))
         values[name] = value
     for key in dict.fromkeys((*values, *kind.nonlinear, *kind.linear)):
         name = f"{e.name}.{key}"

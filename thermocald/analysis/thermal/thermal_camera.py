@@ -27,8 +27,7 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
-from thermocald.analysis.thermal.certificate import render_certificate
-from thermocald.analysis.thermal.model_text import model_lines
+from thermocald.analysis.thermal.certificate import model_lines, render_certificate
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
@@ -38,7 +37,6 @@ from thermocald.analysis.thermal.modelled_camera import (
     require_sd,
     steady_camera,
     steady_parts,
-    widened,
 )
 from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
@@ -278,10 +276,8 @@ class ThermalCamera(Result):
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        beyond = 0.0
-        if others or (self.validity is not None and self.validity.beyond(T)):
-            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
-            covariance += np.diag(drift)
+        (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+        covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
 
     def along(
@@ -351,12 +347,14 @@ class ThermalCamera(Result):
             )
             values.append(found[0])
             covariance.append(found[1])
+        Q = np.concatenate(covariance)
+        Q[:, range(10), range(10)] += drift
         return Along(
             self.model.sensor,
             instants,
             history.temperature(),
             np.concatenate(values),
-            widened(np.concatenate(covariance), drift),
+            Q,
             outside,
             self.model.camera,
         )
@@ -503,8 +501,8 @@ class LiveCamera:
         values, covariance = predict_orientations(
             model, thermal.parameters, thermal.covariance, history, drive, driven=driven
         )
-        C = widened(covariance, drift)[0]
-        self._now = Camera(model.sensor, row[0], values[0], C, float(beyond), model.camera)
+        Q = covariance[0] + np.diag(drift[0])
+        self._now = Camera(model.sensor, row[0], values[0], Q, float(beyond), model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:

@@ -22,8 +22,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.level import estimate_step, event_threshold
-from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
+from thermocald.analysis.thermal.prediction_test import (
+    NORMAL_95,
+    estimate_step,
+    event_threshold,
+    predicted_error,
+)
 from thermocald.analysis.thermal.result import build_camera
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError

@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -422,7 +423,15 @@ class GaugeCalibrator(EpochCalibrator):
             count = 0 if seen is None else len(seen)
             return self._without_pose(epoch, now, seen, f"{count} control points are seen ({why})")
         start = None if self.pose is None else self.pose.eop
-        result = self._resected(now, seen, start)
+        camera = now.camera
+        place = partial(
+            resect, self.sensor, camera.interior, camera.covariance, self.testfield, seen,
+            snooping_alpha=self._alpha,
+        )  # fmt: skip
+        result = place(start)
+        # the last pose is a bad start if the camera was turned by a large angle
+        if not result.ok and start is not None and len(seen) > _FEWEST and (again := place()).ok:
+            result = again
         if not result.ok:
             return self._without_pose(epoch, now, seen, f"{result.status}: {result.reason}")
         assert result.exterior is not None
@@ -434,20 +443,6 @@ class GaugeCalibrator(EpochCalibrator):
             self._watch(pose)
             self.pose = pose
         return replace(result, status="resected", reason="")
-
-    def _resected(
-        self, now: PredictedCamera, seen: Observations, start: ExteriorOrientation | None
-    ) -> Adjustment:
-        camera = now.camera
-        result = resect(
-            self.sensor, camera.interior, camera.covariance, self.testfield, seen, start,
-            self._alpha,
-        )  # fmt: skip
-        # the last pose is a bad start if the camera was turned by a large angle
-        if not result.ok and start is not None and len(seen) > _FEWEST:
-            again = self._resected(now, seen, None)
-            return again if again.ok else result
-        return result
 
     def _unposed(self, status: str, reason: str, now: PredictedCamera) -> Adjustment:
         camera = now.camera
@@ -520,24 +515,21 @@ class GaugeCalibrator(EpochCalibrator):
         scale = np.sqrt(np.diag(N))
         inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
         gain = inverse @ (A[:, EOP] / noise[:, None]).T
-        drift = gain @ A[:, IOP] @ self._change_root(before, after)
-        return Movement(now.time, gain @ moved, inverse + drift @ drift.T)
+        lever = gain @ A[:, IOP]
+        drift = lever @ self._change_covariance(before, after) @ lever.T
+        return Movement(now.time, gain @ moved, inverse + drift)
 
-    def _change_root(self, before: PredictedCamera, after: PredictedCamera) -> Array:
-        """Return a root (10, n) of the covariance of the camera's predicted change."""
+    def _change_covariance(self, before: PredictedCamera, after: PredictedCamera) -> Array:
+        """Return the covariance (10, 10) of the camera's predicted change."""
         change_k = after.camera.temperature - before.camera.temperature
         thermal = self.thermal
         rows = [k for k, n in enumerate(thermal.parameters) if n.startswith("rates.")]
         names = [IOP_NAMES.index(thermal.parameters[k].split(".")[1]) for k in rows]
-        block = thermal.covariance[np.ix_(rows, rows)] * change_k**2
-        root = np.zeros((10, len(rows) + 2))
-        if rows:
-            values, vectors = np.linalg.eigh(block)
-            root[names, : len(rows)] = vectors * np.sqrt(np.maximum(values, 0.0))
+        covariance = np.zeros((10, 10))
+        covariance[np.ix_(names, names)] = thermal.covariance[np.ix_(rows, rows)] * change_k**2
         unsure_k = math.hypot(before.temperature_sd, after.temperature_sd)
-        root[:, -2] = unsure_k * thermal.model.rate_vector
-        root[:, -1] = after.unknown - before.unknown
-        return root
+        rates, unknown = thermal.model.rate_vector, after.unknown - before.unknown
+        return covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
 
 
 class GaugeObserver:

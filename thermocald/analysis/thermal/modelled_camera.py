@@ -173,16 +173,17 @@ def predict_orientations(
             J[:, IOP_NAMES.index(key), i] = 1.0
         elif group == "rates":
             J[:, IOP_NAMES.index(key), i] = drive - model.T0
-        elif not catalogue.get(group).is_drive:
-            up, down = (moved_model(model, name, s).influence(group, history) for s in (1.0, -1.0))
-            J[:, :, i] = (up - down) / (2.0 * _step(model, name))
         else:
-            if driven is None:
-                up, down = (moved_model(model, name, s).drive(history) for s in (1.0, -1.0))
+            sides = {sign: moved_model(model, name, sign) for sign in (1.0, -1.0)}
+            if not catalogue.get(group).is_drive:
+                up, down = (side.influence(group, history) for side in sides.values())
             else:
-                up, down = driven[name, 1.0], driven[name, -1.0]
-            slope = (up - down) / (2.0 * _step(model, name))
-            J[:, :, i] = slope[:, None] * model.rate_vector
+                drives = [
+                    driven[name, sign] if driven else side.drive(history)
+                    for sign, side in sides.items()
+                ]
+                up, down = (moved[:, None] * model.rate_vector for moved in drives)
+            J[:, :, i] = (up - down) / (2.0 * _step(model, name))
     J = model.carried_derivatives(linear, J, names)
     if steady is not None:
         J -= steady

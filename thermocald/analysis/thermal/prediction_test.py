@@ -39,21 +39,15 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     project,
 )
-from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_solve
+from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.normals import chunks, linearise
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive_matrix
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import HypothesisFitter
-from thermocald.thermal.hypothesis import (
-    BASE,
-    Term,
-    make_candidate,
-    make_known_term,
-    targets_of,
-)
+from thermocald.thermal.hypothesis import Term, coefficients_of, targets_of
 from thermocald.thermal.reduce import running_median, without_targets
-from thermocald.thermal.scan import Scanner
+from thermocald.thermal.scan import event_threshold, make_term, without_chance_events
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
@@ -173,7 +167,6 @@ def estimate_level(
 
 _GROSS = 6.0  # standard deviations from the neighbours in time
 _NEIGHBOURS = 4  # epochs on either side
-_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,12 +216,6 @@ def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     return Moved(time, vectors[best], inverse_of_determined(N[best]))
 
 
-def event_threshold(series: ReducedSeries, coefficients: int) -> float:
-    """Return the χ² that an event has to explain, given its coefficients and the times tried."""
-    n = max(int((series.n > 0).sum()), 2)
-    return float((coefficients + 2) * np.log(n) + _MARGIN)
-
-
 _COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
 
 
@@ -249,97 +236,43 @@ def _weights(
     return np.concatenate([moved, weights[10:]])
 
 
-_ROUNDS = 3  # phases and events depend on each other
-
-
 def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     """Return the model with the phases and events of a series with the model's T₀ and reference."""
-    listed = {e.name: e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"}
-    own = [e for e in listed if Term(e).is_separate]
-    if not own:
+    listed = [e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"]
+    if not any(Term(e.name).is_separate for e in listed):
         return model
     fitter = HypothesisFitter([series])
-    for e in own:
-        if catalogue.get(e).is_event:
-            listed[e] = _without_event(listed[e])
-    for _ in range(_ROUNDS):
-        for name in own:
-            find = _fit_phase if catalogue.get(name).is_periodic else _find_event
-            listed[name] = find(fitter, model, listed, name)
-    return replace(model, effects=tuple(listed.get(e.name, e) for e in model.effects))
+    fit = fitter.fit(())
+    for effect in listed:
+        fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search=False)))
+    fit = fitter.fit(without_chance_events(fitter, fit))
+    own = {
+        term.effect: _own_values(model, series, fit, i)
+        for i, term in enumerate(fit.terms)
+        if term.is_separate
+    }
+    effects = (replace(e, values={**e.values, **own.get(e.name, {})}) for e in model.effects)
+    return replace(model, effects=tuple(effects))
 
 
-def _without_event(effect: ModelEffect) -> ModelEffect:
-    """Return an effect whose event did not happen."""
-    return replace(
-        effect, values={**effect.values, **dict.fromkeys(catalogue.get(effect.name).linear, 0.0)}
-    )
-
-
-def _known(
-    fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect]
-) -> tuple[Fit, Array]:
-    """Return a fit of some effects, and the model's coefficients of them, px-scaled."""
-    fit = fitter.fit([make_known_term(e.name, e.values, 1) for e in listed.values()])
-    scale = fitter.series[0].scale
-    x = fit.coefficients.copy()
-    for block in fit.blocks:
-        units = np.array([scale[COLUMNS.index(p)] for p in block.parameters])
-        if block.term < 0:
-            x[block.start : block.stop] = [model.rates.get(p, 0.0) for p in BASE] * units
-            continue
-        effect = listed[fit.terms[block.term].effect]
-        kind = catalogue.get(effect.name)
-        names = {kind.column(n): n for n in kind.linear}
-        weights = np.array([kind.weights(effect.values, names[p]) for p in block.parameters])
-        x[block.start : block.stop] = (weights * units[:, None]).T.ravel()
-    return fit, x
-
-
-def _fit_phase(
-    fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect], name: str
-) -> ModelEffect:
-    """Return a cycle with the phase that fits best and an unchanged amplitude."""
-    fit, x = _known(fitter, model, listed)
-    block = next(b for b in fit.blocks if b.term >= 0 and fit.terms[b.term].effect == name)
-    (whole, c, _), index = fit.reduced[0], fit.designs[0][2]
-    inside = (index >= block.start) & (index < block.stop)
-    A = whole[np.ix_(inside, inside)]
-    right = c[inside] - whole[np.ix_(inside, ~inside)] @ x[index[~inside]]
-    pair = x[block.start : block.stop].reshape(2, -1)
-    key = next(k for k in listed[name].values if k in catalogue.get(name).fresh)
-    phase = float(listed[name].values[key])
-    amplitude = pair[0] * np.cos(phase) + pair[1] * np.sin(phase)
-    angles = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
-    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    trial = (sides[:, :, None] * amplitude).reshape(len(angles), -1)
-    cost = np.einsum("ai,ij,aj->a", trial, A, trial) - 2.0 * trial @ right
-    best = float(angles[int(np.argmin(cost))])
-    return replace(listed[name], values={**listed[name].values, key: best})
-
-
-def _find_event(
-    fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect], name: str
-) -> ModelEffect:
-    """Return an event at the time where it explains most, or none if it is not significant."""
-    fit, x = _known(fitter, model, {n: e for n, e in listed.items() if n != name})
-    effect, kind = listed[name], catalogue.get(name)
-    linear = tuple(n for n in kind.linear if n in effect.values)
-    candidate = make_candidate(kind, linear, fitter.series)
-    C, V, index = fit.designs[0]
-    stack = Scanner(fitter).stack(candidate, 0, fit)
-    A, c, B = fit.weightings[0].scan(stack, candidate.directions, (C, V))
-    rest = c - B @ x[index]
-    heights = scaled_solve(A, rest, 1e-9)
-    gain = np.einsum("gi,gi->g", rest, heights)
-    best = int(np.argmax(gain))
-    series = fitter.series[0]
-    if gain[best] <= event_threshold(series, len(linear)):
-        return _without_event(effect)
-    units = series.scale[[COLUMNS.index(p) for p in candidate.parameters]]
-    values = dict(zip(linear, (heights[best] / units).tolist(), strict=True))
-    time = float(0.5 * (series.times[best] + series.times[best + 1]))
-    return replace(effect, values={**effect.values, **values, candidate.name: time})
+def _own_values(
+    model: ThermalModel, series: ReducedSeries, fit: Fit, number: int
+) -> dict[str, float]:
+    """Return the phase of a fitted cycle, or time and height of an event, 0 if there is none."""
+    term = fit.terms[number]
+    kind = term.kind
+    blocks = [b for b in fit.blocks if b.term == number]
+    found = coefficients_of(fit, blocks, series.scale)
+    columns = {n: kind.column(n) for n in kind.linear if kind.column(n) in found}
+    if not kind.is_periodic:
+        height = {n: found[column][0] for n, column in columns.items()}
+        times = dict(term.fresh[0] or ())
+        middle = {n: series.locate(float(time))[1] for n, time in times.items()}
+        return {**dict.fromkeys(kind.linear, 0.0), **height, **middle}
+    (key,) = kind.fresh
+    size = {n: found[c][0] * series.scale[COLUMNS.index(c)] ** 2 for n, c in columns.items()}
+    along = sum(v * model.value(f"{term.effect}.{n}") for n, v in size.items())
+    return {key: found["phase"][0] + (0.0 if along > 0.0 else float(np.pi))}
 
 
 NORMAL_95 = 1.959964  # standard deviations of a 95 % band

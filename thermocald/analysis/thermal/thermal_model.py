@@ -17,17 +17,12 @@ a user who did not calibrate, and is the prior for a camera measured at few temp
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.prediction_test import (
-    NORMAL_95,
-    estimate_step,
-    event_threshold,
-    predicted_error,
-)
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step, predicted_error
 from thermocald.analysis.thermal.result import build_camera
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
@@ -35,7 +30,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOri
 from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
-from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
+from thermocald.thermal.hypothesis import targets_of
 from thermocald.thermal.movement import add_jumps_to_noise
 from thermocald.thermal.noise import (
     calibrate_thermometers,
@@ -44,7 +39,7 @@ from thermocald.thermal.noise import (
     weight_slow_noise,
 )
 from thermocald.thermal.reduce import reweight, without_targets
-from thermocald.thermal.scan import Scanner, remove_curvature
+from thermocald.thermal.scan import make_term, remove_curvature, without_chance_events
 from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
@@ -156,54 +151,6 @@ def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> No
             raise DataError(
                 f"{e.name}: none of the targets {', '.join(moved) or '(none)'} is in the test field"
             )
-
-
-def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
-    """Return an effect as a term to add to a fitted hypothesis.
-
-    search: search its non-linear parameters over their whole range, except those in `fitter.held`;
-    the time of an event is always searched, in each series.
-    """
-    kind = catalogue.get(effect.name)
-    given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
-    names = BASE if kind.is_drive else given
-    text = {k: effect.values[k] for k, p in kind.nonlinear.items() if p.text and k in effect.values}
-    numbers = {
-        k: float(effect.values[k])
-        for k, p in kind.nonlinear.items()
-        if k in effect.values and not p.text and k not in kind.fresh
-    }
-    held = {k: v for k, v in numbers.items() if f"{effect.name}.{k}" in fitter.held}
-    candidate = make_candidate(kind, names, fitter.series, (*text.items(), *held.items()))
-    if kind.is_event:
-        found = Scanner(fitter).scan(candidate, fit)
-        fresh: list[tuple[tuple[str, Any], ...] | None] = []
-        for s, gains in enumerate(found.events):
-            best = int(np.argmax(gains))
-            least = event_threshold(fitter.series[s], found.coefficients)
-            time = float(fitter.series[s].times[best + 1])
-            fresh.append(((candidate.name, time),) if gains[best] > least else None)
-        return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
-    if search and candidate.name:
-        found = Scanner(fitter).scan(candidate, fit)
-        return candidate.term(float(candidate.grid[found.best]), len(fitter.series))
-    return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
-
-
-def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
-    """Return a fit's terms without events that explain no more than chance beside the others."""
-    terms = list(fit.terms)
-    for block in fit.blocks:
-        if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:
-            continue
-        place = slice(block.start, block.stop)
-        heights, cofactor = fit.coefficients[place], fit.covariance[place, place]
-        gain = float(heights @ np.linalg.solve(cofactor, heights))
-        if gain <= event_threshold(fitter.series[block.series], len(heights)):
-            fresh = list(terms[block.term].fresh)
-            fresh[block.series] = None
-            terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))
-    return tuple(terms)
 
 
 def fit_camera(

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import mad_sd
-from thermocald.photogrammetry.series.normals import spread_windows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
 
 _SMOOTHING = np.logspace(-1, 5, 19)
-_MOST_FOR_NOISE = 200_000  # readings, in a dozen runs
 _OFTEN_SHARP = 0.2  # share of sharp intervals above which a sharp bend need not be a kink
 _KINK = 1.5  # times the usual sharp bend, which a kink must then exceed
 _ALIKE = 0.75  # of the sharpest bend near it, which a kink must then reach
@@ -197,13 +195,8 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
 
     It is computed from third divided differences, as thermometers are not read at even intervals,
     clipped iteratively at 2.2 sigma, so that a switched lamp, which affects four of them, does not
-    count as noise. It is at least the error due to the resolution. Of very many readings, runs
-    spread over the series are used.
+    count as noise. It is at least the error due to the resolution.
     """
-    if len(readings) > _MOST_FOR_NOISE:
-        runs = spread_windows(len(readings), _MOST_FOR_NOISE)
-        times = np.concatenate([times[run] for run in runs])
-        readings = np.concatenate([readings[run] for run in runs])
     there = np.isfinite(readings) & np.isfinite(times)
     t, values = times[there], readings[there]
     floor = find_step(values, resolution) / np.sqrt(12.0)

@@ -40,7 +40,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.linalg import inverse_of_determined
-from thermocald.photogrammetry.series.normals import chunks, linearise
+from thermocald.photogrammetry.series.normals import linearise
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive_matrix
 from thermocald.physics.model import ModelEffect
@@ -77,29 +77,25 @@ def average_residuals(
     Also returns its weights (T, 2), and which targets (T,) the model moves; of these only the
     epochs before their movement count.
     """
-    T = len(series.source.field)
-    total, weight = np.zeros((T, 2)), np.zeros((T, 2))
-    moved = np.zeros(T, dtype=bool)
+    moved = np.zeros(len(series.source.field), dtype=bool)
     use = series.weights[..., :2]
     for rows, _, active in prediction.displacements:
         moved[rows] = True
         if active.any():
             use = use.copy()
             use[np.ix_(active, rows)] = 0.0
-    points = series.source.grid.points
-    for part in chunks(*points.shape[:2]):
-        w = use[part]
-        left = np.where(w > 0, points[part] - project_targets(series, prediction, part), 0.0)
-        total += np.einsum("etc,etc->tc", w, left)
-        weight += w.sum(axis=0)
+    left = series.source.grid.points - project_targets(series, prediction)
+    total = np.einsum("etc,etc->tc", use, np.where(use > 0, left, 0.0))
+    weight = use.sum(axis=0)
     return total / np.where(weight > 0, weight, 1.0), weight, moved
 
 
-def project_targets(series: ReducedSeries, prediction: Prediction, part: slice) -> Array:
-    """Return the model's image points (e, T, 2) px of some epochs."""
-    still = series.source.field.points
-    points = prediction.points(still, part) if prediction.moves_points else still
-    return project(series.source.sensor, prediction.iop[part], prediction.eop[part], points)
+def project_targets(series: ReducedSeries, prediction: Prediction) -> Array:
+    """Return the model's image points (E, T, 2) px."""
+    points = series.source.field.points
+    if prediction.moves_points:
+        points = prediction.points(points, slice(None))
+    return project(series.source.sensor, prediction.iop, prediction.eop, points)
 
 
 def estimate_level(
@@ -316,8 +312,7 @@ def predicted_error(
     mean, _, _ = average_residuals(series, prediction)
     weights = series.weights[..., :2]
     used = weights > 0
-    whole = slice(0, len(history.times))
-    residuals = source.grid.points - project_targets(series, prediction, whole)
+    residuals = source.grid.points - project_targets(series, prediction)
     if len(rows):
         # the step of a moved target is no gross error
         near = np.abs(np.nan_to_num(residuals[:, rows] - mean[rows])) < 1.0

@@ -32,7 +32,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
 )
 from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inverse
-from thermocald.photogrammetry.series.normals import chunks
 from thermocald.physics import catalogue
 from thermocald.physics.formula import is_formula, known_together
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
@@ -402,14 +401,9 @@ def _rms(series: ReducedSeries, model: ThermalModel) -> float:
     """Return the RMS px of measured minus predicted image points, less a constant per target."""
     prediction = model.predict(series.readings_history, series.source.field)
     mean, _, moved = average_residuals(series, prediction)
-    points, weights = series.source.grid.points, series.weights[..., :2]
-    total, count = 0.0, 0
-    for part in chunks(*points.shape[:2]):
-        left = points[part] - project_targets(series, prediction, part) - mean
-        use = (weights[part] > 0) & ~moved[:, None]
-        total += float(np.sum(np.where(use, left, 0.0) ** 2))
-        count += int(use.sum())
-    return float(np.sqrt(total / max(count, 1)))
+    left = series.source.grid.points - project_targets(series, prediction) - mean
+    use = (series.weights[..., :2] > 0) & ~moved[:, None]
+    return float(np.sqrt(np.sum(left[use] ** 2) / max(use.sum(), 1)))
 
 
 def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) -> ModelEffect:

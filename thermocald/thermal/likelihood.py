@@ -368,10 +368,8 @@ def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> 
         size, turn = np.linalg.eigh(np.moveaxis(weights, 2, 0))  # not Cholesky: it may be singular
         root = turn * np.sqrt(np.maximum(size, 0.0))[:, None, :]
         here = group[0][1]
-        for r in range(len(group)):
-            half = root[:, :1, r] * group[0][0]
-            for k, (operator, *_) in enumerate(group[1:], 1):
-                half += root[:, k, r, None] * operator
+        for part in np.moveaxis(root, 2, 0):
+            half = sum(part[:, k, None] * operator for k, (operator, *_) in enumerate(group))
             M[here, here] += half.T @ half
         for operator, _, _, dN in group:
             for far, there, d, _ in (error for others in own[g + 1 :] for error in others):

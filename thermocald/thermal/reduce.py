@@ -321,7 +321,9 @@ def _reduce(
     for turn in range(6):
         w = source.grid.reject(bad).weights
         N = normal_matrices(w, A)
-        offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
+        v = _solve_cameras(w, N, A, misclosure - offsets)[2]
+        offsets = offsets + _solve_offsets(w[..., :2], np.nan_to_num(v), N, A)
+        b, values, v = _solve_cameras(w, N, A, misclosure - offsets)
         if 1 <= turn < 5:
             bad = find_outliers(v, weights, seen, bad)
     lPl = sums_of_squares(w, misclosure - offsets)
@@ -366,24 +368,11 @@ def _reduce(
     )
 
 
-def _improve_offsets(
-    w: Array, N: Array, A: Array, misclosure: Array, offsets: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Improve the offsets (T, 2) px by one step.
-
-    Returns the offsets, and with them right-hand sides (E, k), values (E, k) and residuals (E, T,
-    2) px.
-    """
-
-    def cameras(offsets: Array) -> tuple[Array, Array, Array]:
-        left = misclosure - offsets
-        b = right_hand_sides(w, left, A)
-        values = solve(N, b)
-        return b, values, left - (values @ A.reshape(-1, A.shape[-1]).T).reshape(left.shape)
-
-    _, _, v = cameras(offsets)
-    offsets = offsets + _solve_offsets(w[..., :2], np.nan_to_num(v), N, A)
-    return (offsets, *cameras(offsets))
+def _solve_cameras(w: Array, N: Array, A: Array, left: Array) -> tuple[Array, Array, Array]:
+    """Return right-hand sides (E, k), values (E, k) and residuals (E, T, 2) px of free cameras."""
+    b = right_hand_sides(w, left, A)
+    values = solve(N, b)
+    return b, values, left - (values @ A.reshape(-1, A.shape[-1]).T).reshape(left.shape)
 
 
 def _solve_offsets(weights: Array, v: Array, N: Array, A: Array) -> Array:

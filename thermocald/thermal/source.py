@@ -14,8 +14,8 @@ Limit: outside these windows, movement faster than a row is averaged out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -56,18 +56,16 @@ def limit_rows(targets: int) -> int:
     return min(max(_POINTS // max(targets, 1), _FEWEST), _MOST)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of a condensed series: their first epochs (R,), epoch counts (R,), and grid."""
+class _Rows(NamedTuple):
+    """The rows of a condensed series: their first epochs and epoch counts (R,), and their points.
+
+    points (R, T, 2) px, weights (R, T, 3) px⁻².
+    """
 
     first: Index
     count: Index
-    grid: ObservationGrid
-
-    def at(self, rows: Index | NDArray[np.bool_]) -> _Rows:
-        """Return some of the rows."""
-        grid = ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
-        return _Rows(self.first[rows], self.count[rows], grid)
+    points: Array
+    weights: Array
 
 
 def condensed(
@@ -93,18 +91,14 @@ def condensed(
         )
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
         inside = [(rows.first >= w.start) & (rows.first < w.stop) for w in windows]
-        parts = [rows.at(~np.any(inside, axis=0))]
+        parts = [_Rows(*(column[~np.any(inside, axis=0)] for column in rows))]
         parts += [
             _average_epochs(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0]
             for w in windows
         ]
-        merged = ObservationGrid(
-            np.concatenate([p.grid.points for p in parts]),
-            np.concatenate([p.grid.weights for p in parts]),
-        )
-        begins = np.concatenate([p.first for p in parts])
-        rows = _Rows(begins, np.concatenate([p.count for p in parts]), merged)
-        rows = rows.at(np.argsort(begins, kind="stable"))
+        rows = _Rows(*map(np.concatenate, zip(*parts, strict=True)))
+        order = np.argsort(rows.first, kind="stable")
+        rows = _Rows(*(column[order] for column in rows))
     return _put_on_rows(series, rows)
 
 
@@ -131,7 +125,7 @@ def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
         frame_times=mean(series.frame_times),
         reading_times=mean(series.reading_times),
         readings={n: mean(np.asarray(r, dtype=float)) for n, r in series.readings.items()},
-        grid=rows.grid,
+        grid=ObservationGrid(rows.points, rows.weights),
         numbers=series.numbers[rows.first],
         columns={n: mean(c) for n, c in (series.columns or {}).items()},
         counts=rows.count,
@@ -195,8 +189,8 @@ def _average_epochs(
     points = np.where(there[..., None], points + middle, np.nan)
     begin = start + np.arange(R) * size
     count = np.minimum(begin + size, start + epochs) - begin
-    rows_ = _Rows(begin, count, ObservationGrid(points, np.where(there[..., None], normal, 0.0)))
-    return rows_, sums[:, :3] / np.maximum(sums[:, 3:], 1e-300)
+    means = _Rows(begin, count, points, np.where(there[..., None], normal, 0.0))
+    return means, sums[:, :3] / np.maximum(sums[:, 3:], 1e-300)
 
 
 def _locate_targets(grid: ObservationGrid) -> Array:

@@ -286,7 +286,6 @@ def build_camera(
         e = next(e for e in listed if catalogue.get(e.name).seen_in == "targets")
         names += [f"{e.name}.{key}" for key in catalogue.get(e.name).linear]
         covariance = block_diag(covariance, moved[0].covariance)
-    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
     sigma = _image_sigma(series, growth)
     stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
     fits = tuple(
@@ -307,13 +306,12 @@ def build_camera(
     channels = dict.fromkeys(
         c for s in series for c, read in s.source.readings.items() if np.isfinite(read).any()
     )
+    values = np.array([first.value(n) for n in names])
+    known = with_covariance(first, tuple(names), values, covariance)
     model = replace(
-        first,
-        effects=tuple(_with_sds(e, sd, series[0]) for e in first.effects),
+        known,
+        effects=tuple(_with_event_sd(e, series[0]) for e in known.effects),
         image_sigma=sigma,
-        sds={n: s for n, s in sd.items() if n.split(".")[0] in ("interior", "rates")},
-        covariance_names=tuple(names),
-        covariance=tuple(tuple(row) for row in covariance.tolist()),
         validity={c: _span(series, c) for c in channels},
         fitted_on=tuple(
             {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
@@ -340,8 +338,8 @@ def build_camera(
         poorly += [name for name in rated if name not in poorly]
     if poorly:
         fitted["read_poorly"] = {"effects": poorly}
-    share = sd["interior.c"] / model.interior.c
-    rates = {p: (r, sd[f"rates.{p}"]) for p, r in model.rates.items() if r}
+    share = model.sd("interior.c") / model.interior.c
+    rates = {p: (r, model.sd(f"rates.{p}")) for p, r in model.rates.items() if r}
     if carried := carried_by_c(share, rates):
         fitted["rates_hang_on_c"] = {"c_known_to": share, "sds": carried}
     return ThermalCamera(model, {**fitted, "prediction_test": []})
@@ -406,18 +404,34 @@ def _rms(series: ReducedSeries, model: ThermalModel) -> float:
     return float(np.sqrt(np.sum(left[use] ** 2) / max(use.sum(), 1)))
 
 
-def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) -> ModelEffect:
+def _with_event_sd(effect: ModelEffect, series: ReducedSeries) -> ModelEffect:
+    """Return an effect with the sd of its event, a time between two frames: it is uniform."""
+    sd = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
     kind = catalogue.get(effect.name)
-    if kind.seen_in == "noise":
-        return effect
-    found: dict[str, Any] = {
-        k: sd[f"{effect.name}.{k}"] for k in effect.values if f"{effect.name}.{k}" in sd
-    }
-    for key, parameter in kind.nonlinear.items():
-        if parameter.role == "event":
-            # a time between two frames: uniform over the interval
-            found[key] = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
-    return ModelEffect(effect.name, effect.values, found)
+    events = [key for key, parameter in kind.nonlinear.items() if parameter.role == "event"]
+    return replace(effect, sds={**effect.sds, **dict.fromkeys(events, sd)})
+
+
+def with_covariance(
+    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array
+) -> ThermalModel:
+    """Return the model with other values and another covariance of some numbers.
+
+    names: as in `ThermalModel.parameter_names`.
+    """
+    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    moved = model.with_values(dict(zip(names, values.tolist(), strict=True)))
+    effects = tuple(
+        replace(e, sds={**e.sds, **{k: sd[f] for k in e.values if (f := f"{e.name}.{k}") in sd}})
+        for e in moved.effects
+    )
+    return replace(
+        moved,
+        effects=effects,
+        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
+        covariance_names=names,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+    )
 
 
 def _list_unknowns(fit: Fit, scale: Array) -> Unknowns:

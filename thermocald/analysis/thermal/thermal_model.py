@@ -23,10 +23,9 @@ import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
 from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step, predicted_error
-from thermocald.analysis.thermal.result import build_camera
+from thermocald.analysis.thermal.result import build_camera, with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
@@ -45,9 +44,7 @@ from thermocald.thermal.series import in_blocks
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.arrays import Array
     from thermocald.physics.model import Distortion, ModelEffect, ThermalModel
-    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -85,22 +82,10 @@ def fit_thermal_model(
     if any(catalogue.get(e.name).seen_in == "noise" for e in listed):
         growth = estimate_noise_slope(others)
         others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
-    fitter, fit = _fit_hypothesis(others, listed, search, frozenset(fixed), dict(priors or {}))
-    moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
-    return build_camera(fitter, fit, others, listed, growth, moved, sure)
-
-
-def _fit_hypothesis(
-    series: Sequence[ReducedSeries],
-    listed: Sequence[ModelEffect],
-    search: bool,
-    held: frozenset[str],
-    priors: dict[str, tuple[float, float]],
-) -> tuple[HypothesisFitter, Fit]:
-    """Fit the hypothesis of all effects that act on trajectories."""
-    ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(series)]
+    # the hypothesis of all effects that act on trajectories
+    ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(others)]
     fitter = HypothesisFitter(ready)
-    fitter.held, fitter.priors = held, priors
+    fitter.held, fitter.priors = frozenset(fixed), dict(priors or {})
     fit = fitter.fit(())
     for effect in listed:
         if catalogue.get(effect.name).seen_in == "trajectory":
@@ -111,7 +96,8 @@ def _fit_hypothesis(
         fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
     for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
         fit = fitter.refine_in(again(fitter, fit), fit)
-    return fitter, fit
+    moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
+    return build_camera(fitter, fit, others, listed, growth, moved, sure)
 
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:
@@ -316,30 +302,6 @@ def shrink_to_type(
         wider[i] = (value - low) / (NORMAL_95 * sd[i])
     shrunk = with_covariance(model, names, new.values, new.covariance * np.outer(wider, wider))
     return replace(shrunk, evidence={**model.evidence, "shrunk_to_type": str(kind.camera)})
-
-
-def with_covariance(
-    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array
-) -> ThermalModel:
-    """Return the model with other values and another covariance of some numbers and its interior.
-
-    names: as in `ThermalModel.parameter_names`, the interior orientation's among them.
-    """
-    found = dict(zip(names, values.tolist(), strict=True))
-    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
-    moved = model.with_values({n: v for n, v in found.items() if not n.startswith("interior.")})
-    effects = tuple(
-        replace(e, sds={**e.sds, **{k: sd[f] for k in e.values if (f := f"{e.name}.{k}") in sd}})
-        for e in moved.effects
-    )
-    return replace(
-        moved,
-        interior=InteriorOrientation(**{p: found[f"interior.{p}"] for p in IOP_NAMES}),
-        effects=effects,
-        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
-        covariance_names=names,
-        covariance=tuple(tuple(row) for row in covariance.tolist()),
-    )
 
 
 def _names(model: ThermalModel) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ from thermocald.thermal.hypothesis import BASE, Block, Fit, Term
 from thermocald.thermal.likelihood import (
     ReadingErrorTerm,
     Weighting,
-    add_error_term,
     prepare,
 )
 from thermocald.thermal.series import ReducedSeries, cosines, unit_directions
@@ -199,7 +198,7 @@ class HypothesisFitter:
         for block, operator, channel in self.list_operators(terms, blocks, series):
             (d,) = block.directions(x)
             if d.any():
-                carried = add_error_term(carried, ReadingErrorTerm(d, operator, channel))
+                carried.append(ReadingErrorTerm(d, operator, channel))
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
         bends = list(unresolved.values())
         return prepare(self.series[series], carried, bends, self.thermometer_factor)

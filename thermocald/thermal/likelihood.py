@@ -25,7 +25,7 @@ Learning, section 2.7 for marginalised linear terms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -254,16 +254,6 @@ class ReadingErrorTerm:
     direction: Array
     operator: Array
     channel: str
-
-
-def add_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> list[ReadingErrorTerm]:
-    """Add a term; terms with the same operator are merged, their directions added."""
-    for i, old in enumerate(terms):
-        alike = old.channel == new.channel and old.operator.shape == new.operator.shape
-        if alike and np.array_equal(old.operator, new.operator):
-            both = replace(old, direction=old.direction + new.direction)
-            return [*terms[:i], both, *terms[i + 1 :]]
-    return [*terms, new]
 
 
 def prepare(

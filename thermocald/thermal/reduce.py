@@ -365,12 +365,10 @@ def _reduce(
         values=values,
         residuals=v,
         weights=w / variance,
-        offsets=offsets,
         n=count,
         sigma0=sigma0 / np.sqrt(variance),
         variance=variance,
         correlation=_measure_correlation(v),
-        gross=int(bad.sum()),
         hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
         distortion=distortion,
     )

@@ -82,10 +82,6 @@ class SeriesInput:
                 out[name] = (t[there], values[there])
         return out
 
-    def epochs(self, rows: NDArray[np.bool_]) -> int:
-        """Return the number of epochs in some rows (E,)."""
-        return int(rows.sum() if self.counts is None else self.counts[rows].sum())
-
     @property
     def per_row(self) -> Array:
         """The number of epochs in each row (E,)."""
@@ -271,16 +267,15 @@ class ReducedSeries:
 
     N (E, 19, 19), b (E, 19): normal equations in px-scaled columns, weighted by the estimated
     noise; yy (E,): bᵀN⁻¹b; values (E, 19): the free camera of each epoch, scaled; residuals (E, T,
-    2) px: of the free camera, without the offsets (T, 2) px, NaN where unseen or gross; weights (E,
+    2) px: of the free camera, without the targets' offsets, NaN where unseen or gross; weights (E,
     T, 3) px⁻²; n (E,): numbers of image points; sigma0 (E,).
 
     variance: factor by which the given variances were too small; correlation: variance of slow
-    trajectories over that of white noise; gross: number of rejected points; excluded: rows of
-    targets left out; blocks: the epochs in each row of a long series, or None; hidden, movement:
-    random effects or None; tremble (P, t): directions of each epoch's random
-    movement, of unit variance, or None; bend (E, T, 2) px: curvature of the projection that was
-    subtracted from the observations, or None; slope_jumps (E,) K/s: jumps of the temperature's
-    slope as measured by the images, or None.
+    trajectories over that of white noise; excluded: rows of targets left out; blocks: the epochs in
+    each row of a long series, or None; hidden, movement: random effects, or None; tremble (P, t):
+    directions of each epoch's random movement, of unit variance, or None; bend (E, T, 2) px:
+    curvature of the projection that was subtracted from the observations, or None; slope_jumps (E,)
+    K/s: jumps of the temperature's slope as measured by the images, or None.
     """
 
     source: SeriesInput
@@ -296,12 +291,10 @@ class ReducedSeries:
     values: Array
     residuals: Array
     weights: Array
-    offsets: Array
     n: NDArray[np.int64]
     sigma0: Array
     variance: float
     correlation: float
-    gross: int
     excluded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     blocks: Blocks | None = None
     hidden: HiddenTargets | None = None
@@ -470,7 +463,12 @@ _DAYS = 30.0  # from which a series' long blocks are whole days, as daily cycles
 def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
     """Choose at most `rows` blocks; return their first epochs (B,)."""
     E = len(evidence.times)
-    nonlinear = _scatter(evidence, _remove_rates(evidence))
+    N, T = evidence.N, evidence.history.temperature() - evidence.T0
+    P, by_T = N.shape[1], np.einsum("e,epq->pq", T, N)
+    A = np.block([[N.sum(axis=0), by_T], [by_T, np.einsum("e,epq->pq", T * T, N)]])
+    c = np.concatenate([evidence.b.sum(axis=0), T @ evidence.b])
+    rates = np.outer(T, scaled_solve(A, c, 1e-10)[P:])
+    nonlinear = _scatter(evidence, evidence.values - rates)
     every = _scatter(evidence, evidence.values)
 
     def gain(start: int, stop: int) -> float:
@@ -498,19 +496,6 @@ def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
         for part in ((start, middle), (middle, stop)):
             heapq.heappush(heap, (-gain(*part), *part))
     return np.array(sorted([*done, *(start for _, start, _ in heap)]), dtype=np.int64)
-
-
-def _remove_rates(evidence: ReducedSeries) -> Array:
-    """Return the cameras (E, P) without levels and temperature rates, by least squares."""
-    N, T = evidence.N, evidence.history.temperature() - evidence.T0
-    P = N.shape[1]
-    A = np.empty((2 * P, 2 * P))
-    A[:P, :P] = N.sum(axis=0)
-    A[:P, P:] = A[P:, :P] = np.einsum("e,epq->pq", T, N)
-    A[P:, P:] = np.einsum("e,epq->pq", T * T, N)
-    c = np.concatenate([evidence.b.sum(axis=0), T @ evidence.b])
-    x = scaled_solve(A, c, 1e-10)
-    return np.asarray(evidence.values - x[:P] - np.outer(T, x[P:]))
 
 
 def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], float]:

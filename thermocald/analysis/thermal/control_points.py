@@ -233,12 +233,9 @@ def _from_json(path: Path) -> ControlPoints:
             return _from_features(document, str(path))
     except DataError:
         raise
-    except KeyError as error:
-        raise DataError(
-            f"{path}: is not valid JSON of control points: {error} is missing"
-        ) from error
-    except (AttributeError, TypeError, ValueError, IndexError) as error:
-        raise DataError(f"{path}: is not valid JSON of control points: {error}") from error
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        fault = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise DataError(f"{path}: is not valid JSON of control points: {fault}") from error
     raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 
 

@@ -146,10 +146,8 @@ class Predictor:
         covariance = camera.covariance + np.outer(unknown, unknown)
         drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > GAP_S else 0.0)
         covariance = covariance + drifted**2 * np.outer(rates, rates)
-        beyond, far = 0.0, False
-        if (validity := self.thermal.validity) is not None:
-            beyond, far = validity.beyond(T), validity.is_far(T)
-            covariance = covariance + np.diag((rates * beyond) ** 2)
+        beyond, far = self.thermal.validity.beyond(T), self.thermal.validity.is_far(T)
+        covariance = covariance + np.diag((rates * beyond) ** 2)
         model = self.thermal.model
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
         shift = self._largest_px(camera.values, unknown)
@@ -204,8 +202,8 @@ class Predictor:
 
     def _change(self, seconds: float) -> float:
         """Return the standard deviation of a temperature's change in a time, K."""
-        v = self.thermal.validity
-        spread = (_USUAL_RANGE_K if v is None else v.high - v.low) / math.sqrt(12.0)
+        span = self.thermal.validity.high - self.thermal.validity.low
+        spread = (span if math.isfinite(span) else _USUAL_RANGE_K) / math.sqrt(12.0)
         return spread * math.sqrt(-math.expm1(-2.0 * seconds / _CORRELATED_S))
 
     def _largest_px(self, values: Array, shift: Array) -> float:
@@ -374,8 +372,7 @@ class GaugeCalibrator(EpochCalibrator):
         extra = {
             "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": beyond,
         }  # fmt: skip
-        limits = self.thermal.validity
-        outside = limits.place(now.camera.temperature) if limits is not None and beyond else ""
+        outside = self.thermal.validity.place(now.camera.temperature) if beyond else ""
         if now.far:
             bad = failed("outside_range", f"{outside}: nothing is predicted there", measured)
             return CalibratedEpoch(epoch, bad, extra)

@@ -40,7 +40,10 @@ class ExtrapolationWarning(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """The lowest and the highest temperature of the fit, °C; of: a thermometer's name."""
+    """The lowest and the highest temperature of the fit, °C, infinite if unknown.
+
+    of: a thermometer's name.
+    """
 
     low: float
     high: float

@@ -205,8 +205,7 @@ def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     vectors = np.einsum("eij,ej->ei", np.linalg.pinv(N, rcond=1e-9, hermitian=True), g)
     gain = np.einsum("ei,ei->e", g, vectors)
     best = int(np.argmax(gain))
-    t = others.times
-    time = float(0.5 * (t[best] + t[best + 1]))
+    _, time, _ = others.locate(float(others.times[best + 1]))
     if gain[best] < event_threshold(others, 3):
         return Moved(time, np.zeros(3), np.zeros((3, 3)))
     return Moved(time, vectors[best], inverse_of_determined(N[best]))

@@ -238,7 +238,7 @@ def _assess(
         variance += float(share.mean() * of_targets.mean())
     return SeriesFit(
         s.source.series or s.source.name,
-        s.source.epochs(s.n > 0),
+        int(s.source.per_row[s.n > 0].sum()),
         _rms(s, model),
         reading_sd * averaged,
         None if s.source.counts is None else int((s.n > 0).sum()),

@@ -241,10 +241,9 @@ class ThermalCamera(Result):
         return covariance
 
     @cached_property
-    def validity(self) -> Validity | None:
-        """The temperatures that the model was fitted on; None if it does not state them."""
-        limits = next(iter(self.model.validity.values()), None)
-        return None if limits is None else Validity(*limits)
+    def validity(self) -> Validity:
+        """The temperatures that the model was fitted on, without limits if it states none."""
+        return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -366,9 +365,7 @@ class ThermalCamera(Result):
 
         T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
         """
-        outside = np.zeros(T.shape)
-        if self.validity is not None:
-            outside = self.validity.check(T, extrapolate)
+        outside = self.validity.check(T, extrapolate)
         variance = (rates * outside[:, None]) ** 2
         drift: Array | float = 0.0
         for effect in self.model.effects:

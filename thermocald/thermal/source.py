@@ -63,7 +63,7 @@ class _Rows(NamedTuple):
     """
 
     first: Index
-    count: Index
+    counts: Index
     points: Array
     weights: Array
 
@@ -91,14 +91,14 @@ def condensed(
         )
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
         inside = [(rows.first >= w.start) & (rows.first < w.stop) for w in windows]
-        parts = [_Rows(*(column[~np.any(inside, axis=0)] for column in rows))]
+        parts = [_Rows._make(column[~np.any(inside, axis=0)] for column in rows)]
         parts += [
             _average_epochs(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0]
             for w in windows
         ]
-        rows = _Rows(*map(np.concatenate, zip(*parts, strict=True)))
+        rows = _Rows._make(map(np.concatenate, zip(*parts, strict=True)))
         order = np.argsort(rows.first, kind="stable")
-        rows = _Rows(*(column[order] for column in rows))
+        rows = _Rows._make(column[order] for column in rows)
     return _put_on_rows(series, rows)
 
 
@@ -128,7 +128,7 @@ def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
         grid=ObservationGrid(rows.points, rows.weights),
         numbers=series.numbers[rows.first],
         columns={n: mean(c) for n, c in (series.columns or {}).items()},
-        counts=rows.count,
+        counts=rows.counts,
         noises=noises,
     )
 

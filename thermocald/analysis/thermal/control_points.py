@@ -193,11 +193,11 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
     texts = {n: n for n in ("kind", "code") if n in table.columns} | {"target": there.pop("target")}
     optional = [n for w, n in there.items() if w in ("x", "y", "diameter")]
     numbers = dict.fromkeys(n for n in there.values() if n not in optional)
-    found = table.read(numbers=list(numbers), optional=optional, texts=list(texts.values()))
-    if not found:
+    read = table.read(numbers=list(numbers), optional=optional, texts=list(texts.values()))
+    if not read:
         raise DataError(f"{path}: holds no control points")
-    whole = {wanted: found[n] for wanted, n in there.items()}
-    words = {wanted: [word.strip() for word in found[n]] for wanted, n in texts.items()}
+    whole = {wanted: read[n] for wanted, n in there.items()}
+    words = {wanted: [word.strip() for word in read[n]] for wanted, n in texts.items()}
     for wanted, values in whole.items():
         if wanted[0] == "s":
             table.check(there[wanted], values <= 0, "a standard deviation must be above 0")

@@ -307,10 +307,10 @@ def build_camera(
         c for s in series for c, read in s.source.readings.items() if np.isfinite(read).any()
     )
     values = np.array([first.value(n) for n in names])
-    known = with_covariance(first, tuple(names), values, covariance)
+    certain = with_covariance(first, tuple(names), values, covariance)
     model = replace(
-        known,
-        effects=tuple(_with_event_sd(e, series[0]) for e in known.effects),
+        certain,
+        effects=tuple(_with_event_sd(e, series[0]) for e in certain.effects),
         image_sigma=sigma,
         validity={c: _span(series, c) for c in channels},
         fitted_on=tuple(

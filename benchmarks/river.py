@@ -13,14 +13,44 @@ import argparse
 import os
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import cv2
 import numpy as np
 
 from tests.analysis.river_scenes import KINDS, Outcome, play
-from tests.analysis.test_scene import LACKING, day, drawn
+from tests.analysis.test_gauge import SD_RATE, START
+from tests.analysis.test_scene import HOURS, LACKING, WARMTH, Bank, camera, drawn
+from thermocald.analysis.thermal.scene import SceneCourse, follow_scene
+from thermocald.store.logger.temperatures import TemperatureLog
+
+
+def day(folder: Path, seed: int, lacks: str = "") -> SceneCourse:
+    """Follow thirteen frames of a day from 10 to 35 °C and back; the model lacks an effect.
+
+    Rates, readings, light and mount vary as their stated uncertainties.
+    """
+    bank, known = Bank(seed), camera()
+    rng = bank.rng
+    rates = {n: r + rng.normal(0, SD_RATE) for n, r in known.model.rates.items()}
+    true = replace(known, model=replace(known.model, rates=rates, effects=LACKING[lacks]))
+    times = START + 3600 * HOURS
+    states = true.along(times, {"housing": WARMTH}, times[::12])
+    bank.cold = states[0]
+    frames = []
+    for k, time in enumerate(times[::12]):
+        path = folder / f"{seed}-{k}.png"
+        turn = rng.normal(0, 2e-4, 3) if k else np.zeros(3)
+        cv2.imwrite(str(path), bank.frame(states[k], turn, rng.uniform(0.8, 1.1)))
+        frames.append((path, time))
+    log = TemperatureLog(times, {"housing": WARMTH + rng.normal(0, 0.05, len(WARMTH))})
+    course = follow_scene(known, log, frames)
+    for path, _ in frames:
+        path.unlink()
+    return course
 
 
 def rms(values: list[float]) -> float:

@@ -14,13 +14,10 @@ from tests.blocks import InBlocks
 from thermocald.analysis.series import adjusted, recorded
 from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.study import study
-from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.series import long_series
 from thermocald.photogrammetry.series.normals import gathered
 from thermocald.series import Series
 from thermocald.store.recording.reader import Recording, open_recording
-from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.source import condensed
 
 DAY = 8640
 SAME = 1e-9  # of the principal distance, or of a rate
@@ -64,18 +61,6 @@ def test_the_study(day, samples, monkeypatch):
         assert b.significance[name].success_ratio == a.significance[name].success_ratio
         slopes = [x.channels[0].dependences[name].slope for x in (a, b)]
         assert abs(slopes[1] - slopes[0]) < SAME * INTERIOR.c  # for a change of 1 K
-
-
-@pytest.mark.slow
-def test_the_fit(day):
-    (recording, grid), rates = day, []
-    series = tc.open(recording.path).observed()
-    for size in (DAY, 500):
-        short = condensed(series, InBlocks(grid, size), TOGETHER)
-        assert len(short.frame_times) < DAY / 2
-        fitted = fit_thermal_model([reduce_series(short, strict=False)], [])
-        rates.append([fitted.model.rates[name] for name in ("c", "x0", "y0")])
-    np.testing.assert_allclose(rates[1], rates[0], rtol=SAME)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.audit_thermal import NAMES, fitted, rate_errors, seen, seen_by_opencv, simulated
-from thermocald.analysis.thermal.model_text import model_lines
+from thermocald.analysis.thermal.certificate import model_lines
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations
@@ -85,15 +85,3 @@ def test_the_distortion_is_recognised_before_any_effect(effect):
     for seed in SEEDS[:3]:
         reduced = reduce_series(seen(simulated(seed, (effect,))), strict=False)
         assert choose_distortion([reduced])[0] == "angle"
-
-
-def test_a_change_of_basis_is_reversible():
-    e = reduce_series(seen(simulated(1, ())), strict=False)
-    other = e.in_basis("image")
-    same = other.in_basis("angle")
-    assert other.distortion == "image"
-    np.testing.assert_allclose(same.N, e.N, rtol=1e-9, atol=1e-9 * np.abs(e.N).max())
-    np.testing.assert_allclose(same.values, e.values, rtol=0, atol=1e-7 * np.abs(e.values).max())
-    # both parametrisations move the image equally
-    moved = [np.einsum("tik,ek->eti", s.columns, s.values) for s in (e, other)]
-    np.testing.assert_allclose(*moved, atol=1e-6)

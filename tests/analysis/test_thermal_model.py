@@ -13,7 +13,7 @@ from benchmarks.audit_camera import Scene
 from benchmarks.audit_thermal import rate_errors
 from tests.commands import answer as run
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.analysis.thermal.thermal_model import fit_thermal_model, type_model
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics.model import ModelEffect
@@ -151,20 +151,6 @@ def test_a_kink_between_two_readings_is_no_signal():
         assert abs(found.values[key] - value) < 4 * found.sds[key], key
 
 
-def test_wrong_coordinates_do_not_affect_the_rates():
-    """Coordinates with errors of 0.05 mm affect the level only."""
-    s = simulated(3)
-    rng = np.random.default_rng(8)
-    wrong = replace(s.field, points=s.field.points + rng.normal(0, 0.05, s.field.points.shape),
-                    sigmas=np.full(s.field.points.shape, 0.05))  # fmt: skip
-    series = for_fit(epochs_input(s.head, wrong, list(s.epochs()), "M1"))
-    f = fit_thermal_model([series], [START])
-    assert abs(f.fitted["sigma0"] - 1.0) < 0.05
-    assert np.abs(rate_errors(f, s)).max() < 3.5
-    # the level's standard deviation includes the field's: some thousandths of a mm
-    assert 2e-4 < f.model.sd("interior.x0") < 5e-3
-
-
 def test_refusals(fitted):
     _, (first, second) = fitted
     other = replace(second, source=replace(second.source, camera="another"))
@@ -183,21 +169,6 @@ def test_refusals(fitted):
     few = list(steady.epochs())[:2]
     with pytest.raises(DataError, match="fewer than 3 epochs"):
         for_fit(epochs_input(steady.head, steady.field, few, "few"))
-
-
-def test_type_model_of_three_cameras(fitted):
-    base = fitted[0].model
-    models = []
-    for k, x0 in enumerate((-3.8e-4, -4.1e-4, -3.5e-4)):
-        rates = {**base.rates, "x0": x0}
-        models.append(replace(base, camera=f"rpi-{k}", rates=rates))
-    found = type_model(models, "rpi-v2.1")
-    assert found.rates["x0"] == pytest.approx(-3.8e-4)
-    # for one more camera: the scatter of 3e-5, and the sd of the mean of three
-    assert found.sds["rates.x0"] == pytest.approx(3e-5 * np.sqrt(4 / 3), rel=0.01)
-    assert found.camera == "rpi-v2.1"
-    with pytest.raises(DataError, match="not alike"):
-        type_model([base, replace(base, T0=11.0)], "x")
 
 
 @pytest.fixture(scope="module")

@@ -92,3 +92,5 @@ def test_models_of_different_kinds_are_refused():
         shrink_to_type(fleet[0], replace(kind, covariance=None))
     with pytest.raises(DataError, match="not alike"):
         shrink_to_type(replace(fleet[0], T0=20.0), kind)
+    with pytest.raises(DataError, match="not alike"):
+        type_model([fleet[0], replace(fleet[1], T0=11.0)], "x")

@@ -37,11 +37,8 @@ def dense(evidence_of):
     e = evidence[0]
     keep, images = of_images(e)
     J = np.zeros((len(images), len(e.state_sd("temperature"))))
-    for block in fit.blocks:
+    for block, operator, _ in fitter.list_operators(fit.terms, fit.blocks, 0):
         d = keep.T @ fit.direction(block)[0]
-        operator = (
-            fitter.drive((), 0)[1] if block.term < 0 else fitter.trajectories(fit.terms[0], 0)[1]
-        )
         J += np.einsum("k,er->ekr", d, operator).reshape(J.shape)
     S = images + J @ np.diag(e.state_sd("temperature") ** 2) @ J.T
     return e, fit, keep, S, images

@@ -24,8 +24,8 @@ from thermocald.thermal.movement import (
     measure_jumps,
     weight_jumps_down,
 )
-from thermocald.thermal.random_effects import Movement, waves
 from thermocald.thermal.reduce import reduce_series, reduce_together
+from thermocald.thermal.series import Movement, waves
 
 
 def test_slow_drifts_in_weak_directions_are_movement(evidence_of):

@@ -29,7 +29,7 @@ from thermocald.photogrammetry.series.field_motion import (
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.reduce import with_points, without_targets
-from thermocald.thermal.scan import cosines
+from thermocald.thermal.series import cosines
 from thermocald.thermal.source import refuse_copies
 
 if TYPE_CHECKING:

@@ -257,7 +257,7 @@ class ThermalModel:
         return float(next(e for e in self.effects if e.name == group).sds.get(key, 0.0))
 
     def with_values(self, numbers: Mapping[str, float]) -> ThermalModel:
-        """Return the model with other values for some rates and effects' parameters."""
+        """Return the model with other values for some numbers, as in `parameter_names`."""
         own: dict[str, dict[str, float]] = {}
         for name, value in numbers.items():
             group, key = name.rsplit(".", 1)
@@ -266,7 +266,12 @@ class ThermalModel:
             replace(e, values={**e.values, **own[e.name]}) if e.name in own else e
             for e in self.effects
         )
-        return replace(self, rates={**self.rates, **own.get("rates", {})}, effects=effects)
+        return replace(
+            self,
+            interior=self.interior.with_values(**own.get("interior", {})),
+            rates={**self.rates, **own.get("rates", {})},
+            effects=effects,
+        )
 
     def covariance_of(self, names: Sequence[str]) -> Array:
         """Return the covariance (k, k) of some numbers; those outside the matrix have their sds."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
-from thermocald.photogrammetry.linalg import scaled_inverse, scaled_solve, unit_diagonal
+from thermocald.photogrammetry.linalg import explained, scaled_inverse, scaled_solve
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive, drive_matrix, driven_history
 from thermocald.physics.model import BASES, Distortion, choose_basis
@@ -25,10 +25,9 @@ from thermocald.thermal.hypothesis import BASE, Block, Fit, Term
 from thermocald.thermal.likelihood import (
     ReadingErrorTerm,
     Weighting,
-    add_error_term,
     prepare,
 )
-from thermocald.thermal.series import COLUMNS, ReducedSeries, unit_directions
+from thermocald.thermal.series import ReducedSeries, cosines, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -96,17 +95,17 @@ class HypothesisFitter:
 
     def trajectories(
         self, term: Term, series: int, terms: Sequence[Term] = (), operators: bool = True
-    ) -> tuple[Array, Array | None, str]:
-        """Return a signal's trajectories (E, m), the first one's operator (E, states), the channel.
+    ) -> tuple[Array, list[tuple[Array, str]]]:
+        """Return a signal's trajectories (E, m), and operator (E, states) of each channel it reads.
 
-        The operator is None if there are several trajectories, if the readings' errors do not reach
-        the signal, or without `operators`.
+        There are no operators if there are several trajectories, if the readings' errors do not
+        reach the signal, or without `operators`.
         """
         effect = catalogue.get(term.effect)
         values = term.values(series)
         evidence = self.series[series]
         if values is None:
-            return np.zeros((len(evidence.times), 1)), None, evidence.history.reference
+            return np.zeros((len(evidence.times), 1)), []
         drives = tuple((t.effect, t.nonlinear) for t in terms if t.is_drive)
         through = term.through_drive and bool(drives)
         key = (
@@ -114,7 +113,7 @@ class HypothesisFitter:
             operators,
         )  # fmt: skip
 
-        def compute() -> tuple[Array, Array | None, str]:
+        def compute() -> tuple[Array, list[tuple[Array, str]]]:
             history = evidence.history
             before: csr_array | None = None
             if through:
@@ -122,43 +121,31 @@ class HypothesisFitter:
                 before = drive_matrix(history, chain, at_readings=True)
                 history = driven_history(history, chain)
             trajectory = evidence.averaged(effect.signal(history, **values))
-            operator = None
-            channel = effect.channel(history, **values)
+            found: list[tuple[Array, str]] = []
             if operators and trajectory.shape[1] == 1:
                 sparse = effect.sensitivity(history, **values)
+                by_channel = effect.further_sensitivities(evidence.history, **values)
                 if sparse.nnz:
                     whole = sparse if before is None else sparse @ before
-                    operator = evidence.states(channel, whole)
-            return trajectory, operator, channel
+                    by_channel = {effect.channel(history, **values): whole, **by_channel}
+                found = [(evidence.states(c, m), c) for c, m in by_channel.items()]
+            return trajectory, found
 
         return self._once("trajectory", key, compute, 600)
 
-    def further_operators(self, term: Term, series: int) -> list[tuple[Array, str]]:
-        """Return operator (E, states) and channel of each further column that a signal reads."""
-        values = term.values(series)
-        if values is None:
-            return []
-
-        def compute() -> list[tuple[Array, str]]:
-            evidence = self.series[series]
-            found = term.kind.further_sensitivities(evidence.history, **values)
-            return [(evidence.states(c, m), c) for c, m in found.items()]
-
-        key = (series, term.effect, tuple(sorted(values.items())))
-        return self._once("further", key, compute)
-
     def list_operators(
         self, terms: Sequence[Term], blocks: Sequence[Block], series: int
-    ) -> Iterator[tuple[Block, Array | None, str]]:
-        """Yield each block with the operator (or None) and channel of the readings' errors."""
+    ) -> Iterator[tuple[Block, Array, str]]:
+        """Yield each block with the operators and channels of the readings' errors."""
         for block in blocks:
             if block.series not in (None, series) or block.trajectories > 1:
                 continue
             if block.term < 0:
                 reference = self.series[series].history.reference
                 yield block, self.drive(terms, series)[1], reference
-            else:
-                yield block, *self.trajectories(terms[block.term], series, terms)[1:]
+                continue
+            for operator, channel in self.trajectories(terms[block.term], series, terms)[1]:
+                yield block, operator, channel
 
     # -- fitting ---------------------------------------------------------------------------
 
@@ -207,21 +194,17 @@ class HypothesisFitter:
     ) -> Weighting:
         """Return the weighting of a series with the covariance for some coefficients."""
         carried: list[ReadingErrorTerm] = []
+        unresolved: dict[int, tuple[Array, Array]] = {}
         for block, operator, channel in self.list_operators(terms, blocks, series):
-            d = np.zeros(len(COLUMNS))
-            d[[COLUMNS.index(p) for p in block.parameters]] = x[block.start : block.stop]
-            if block.term >= 0:
-                for further, name in self.further_operators(terms[block.term], series):
-                    carried = add_error_term(carried, ReadingErrorTerm(d, further, name))
-            if operator is not None and d.any():
-                unresolved = self._unresolved(terms, block, series)
-                carried = add_error_term(
-                    carried, ReadingErrorTerm(d, operator, channel, unresolved)
-                )
-        return prepare(self.series[series], carried, self.thermometer_factor)
+            (d,) = block.directions(x)
+            if d.any():
+                carried.append(ReadingErrorTerm(d, operator, channel))
+                unresolved[block.start] = d, self._unresolved(terms, block, series)
+        bends = list(unresolved.values())
+        return prepare(self.series[series], carried, bends, self.thermometer_factor)
 
-    def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
-        """Return the sd (E,) of a trajectory beyond the readings' errors, None if it is 0.
+    def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array:
+        """Return the sd (E,) of a trajectory beyond the readings' errors.
 
         It is that of the rate next to a switched lamp, of the temperature between the readings
         there, and of the extreme reading where a play turns.
@@ -234,8 +217,8 @@ class HypothesisFitter:
             values = term.values(series) or {}
             # the rows' times represent the frames of a long series
             here = history.at(evidence.times)
-            left = term.kind.unresolved(here, self._slope_jump(series), **values)
-            return left if left.any() else None
+            return term.kind.unresolved(here, self._slope_jump(series), **values)
+        nothing: Array = np.zeros(len(evidence.times))
         drives = _drives(terms, series)
         delays = [
             float(values[key])
@@ -245,14 +228,13 @@ class HypothesisFitter:
         ]
         if len(delays) == len(drives):  # a memory smooths what happens between two readings
             if evidence.slope_jumps is None:
-                return None
-            left = instrument.between(evidence.times, evidence.slope_jumps, sum(delays))
-            return left if left.any() else None
+                return nothing
+            return instrument.between(evidence.times, evidence.slope_jumps, sum(delays))
         before = driven_history(history, drives[:-1])
         name, values = drives[-1]
         turns = catalogue.get(name).turns(before, **values)
         if not turns.any():
-            return None
+            return nothing
         step = float(np.median(np.diff(history.reading_times[instrument.real])))
         bend = 0.5 * step * self._slope_jump(series)
         shares = evidence.averaged(turns.astype(float))
@@ -414,7 +396,6 @@ class HypothesisFitter:
                 A, g, _ = self.normal_equations(fit, only)
                 step = scaled_solve(A, g, _RIDGE)[len(fit.coefficients) :]
                 improved = False
-                tried: list[Term] = []
                 for damping in (1.0, 0.3, 0.1):
                     terms = list(fit.terms)
                     for (i, name), d in zip(searched, damping * step, strict=True):
@@ -424,9 +405,6 @@ class HypothesisFitter:
                         if parameter.role == "period":
                             value = min(value, max(old, longest))
                         terms[i] = terms[i].with_value(name, value)
-                    if terms == tried:  # all parameters are still at their bounds
-                        continue
-                    tried = terms
                     trial = self.fit(terms, fit.coefficients, 2, only)
                     gain = cost(fit) - cost(trial)
                     if gain > 0:
@@ -471,18 +449,16 @@ def choose_distortion(series: Sequence[ReducedSeries]) -> tuple[Distortion, floa
 def _squares(series: ReducedSeries) -> Array:
     """Return a series' sum of squares after a smooth movement, for each of `_MOVING`."""
     T = series.averaged(series.history.temperature())
-    orders = np.arange(1, min(_ORDERS, len(T) // 4) + 1)
-    t = (series.times - series.times[0]) / max(float(np.ptp(series.times)), 1e-9)
-    smooth = np.column_stack([np.ones(len(t)), T - T.mean(), np.cos(np.pi * np.outer(t, orders))])
+    waves = cosines(series.times, min(_ORDERS, len(T) // 4))
+    smooth = np.column_stack([np.ones(len(T)), T - T.mean(), *waves])
     products = smooth[:, :, None] * smooth[:, None, :]
     normal = np.einsum("ekl,epq->kplq", products, series.N, optimize=True)
     right = smooth.T @ series.b
     K, P = right.shape
-    explained = []
+    gains = []
     for moving in _MOVING:
         chosen = np.concatenate([np.arange(P), *(k * P + moving for k in range(1, K))])
         own = np.ix_(chosen, chosen)
-        scaled, scale = unit_diagonal(normal.reshape(K * P, K * P)[own])
-        rest = right.ravel()[chosen] * scale
-        explained.append(float(rest @ np.linalg.lstsq(scaled, rest, rcond=1e-10)[0]))
-    return float(series.yy.sum()) - np.array(explained)
+        whole = normal.reshape(K * P, K * P)[own]
+        gains.append(float(explained(whole, right.ravel()[chosen], 1e-10)))
+    return float(series.yy.sum()) - np.array(gains)

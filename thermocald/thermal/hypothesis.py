@@ -106,6 +106,11 @@ class Block:
     def stop(self) -> int:
         return self.start + self.trajectories * len(self.parameters)
 
+    def directions(self, coefficients: Array) -> Array:
+        """Return its coefficients, of all (K,), as (trajectories, P) in px-scaled columns."""
+        own = coefficients[self.start : self.stop].reshape(self.trajectories, -1)
+        return own @ unit_directions(self.parameters).T
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -134,10 +139,7 @@ class Fit:
 
     def direction(self, block: Block) -> Array:
         """Return the coefficients of a block (trajectories, P) in px-scaled columns."""
-        out = np.zeros((block.trajectories, len(COLUMNS)))
-        part = self.coefficients[block.start : block.stop].reshape(block.trajectories, -1)
-        out[:, [COLUMNS.index(p) for p in block.parameters]] = part
-        return out
+        return block.directions(self.coefficients)
 
     def parameters(self, series: int) -> Array:
         """Return the movement (E, P) of the parameters according to the hypothesis, px-scaled."""

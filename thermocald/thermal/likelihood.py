@@ -9,20 +9,23 @@ nor lagged thermometer noise is mistaken for an effect:
     S = N⁻¹ + J C Jᵀ,  J = Σ_k d_k ⊗ O_k,   S⁻¹ = N - N J (C⁻¹ + JᵀN J)⁻¹ JᵀN
 
 The level of every parameter belongs to the series and is eliminated here. The offsets of targets
-that are hidden for long and the mount's movement are integrated out with δ (`random_effects`).
+that are hidden for long (if these were fixed, a target that reappears would bias the camera) and
+the camera's slow movement on its mount (a random walk, possibly bounded, in the well-determined
+combinations of the camera's parameters) are random effects, which are integrated out with δ.
 Random shifts of single epochs, due to trembling or to a temperature between two readings, are part
 of the noise.
 
 All that is integrated out forms one triangular factor, which whitens trajectories: one by one if
 they are few, otherwise through the epochs, which all trajectories share.
 
-Source: Fuller (1987), Measurement Error Models, section 3.2; Rasmussen, Williams (2006), Gaussian
-Processes for Machine Learning, section 2.7 for marginalised linear terms.
+Source: Fuller (1987), Measurement Error Models, section 3.2; Patterson, Thompson (1971), Biometrika
+58, 545-554 (variance components); Rasmussen, Williams (2006), Gaussian Processes for Machine
+Learning, section 2.7 for marginalised linear terms.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -245,44 +248,33 @@ class ReadingErrorTerm:
     """The effect of a thermometer's error on the camera.
 
     direction (P,): px per unit of the trajectory; operator (E, R): ∂ trajectory / ∂ independent
-    errors of the channel (`ReducedSeries.states`); unresolved (E,): standard deviation of the
-    trajectory, in its unit, where the temperature bends between two readings; None if the operator
-    covers that.
+    errors of the channel (`ReducedSeries.states`).
     """
 
     direction: Array
     operator: Array
     channel: str
-    unresolved: Array | None = None
-
-
-def add_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> list[ReadingErrorTerm]:
-    """Add a term; terms with the same operator are merged, their directions added."""
-    for i, old in enumerate(terms):
-        alike = old.channel == new.channel and old.operator.shape == new.operator.shape
-        plain = old.unresolved is None and new.unresolved is None
-        if alike and plain and np.array_equal(old.operator, new.operator):
-            both = replace(old, direction=old.direction + new.direction)
-            return [*terms[:i], both, *terms[i + 1 :]]
-    return [*terms, new]
 
 
 def prepare(
-    evidence: ReducedSeries, carried: list[ReadingErrorTerm], thermometer_factor: float = 1.0
+    evidence: ReducedSeries,
+    carried: list[ReadingErrorTerm],
+    bends: list[tuple[Array, Array]],
+    thermometer_factor: float,
 ) -> Weighting:
     """Return the weighting of a series by image noise, movement, and thermometers' errors.
 
-    carried: the propagation of the thermometers' errors; thermometer_factor: multiplies the
-    standard deviations of the readings.
+    carried: the propagation of the thermometers' errors; bends: of each trajectory its direction
+    (P,) and its sd (E,), in its unit, where the temperature bends between two readings;
+    thermometer_factor: multiplies the standard deviations of the readings.
     """
     from scipy.linalg import cholesky
 
     sums = sum_series(evidence)
     # an error that no reading resolves is noise of single epochs
-    for c in carried:
-        if c.unresolved is not None and c.unresolved.any():
-            bent = np.flatnonzero(c.unresolved)
-            sums = sums.blurred(c.unresolved[bent, None, None] * c.direction[:, None], bent)
+    for direction, sd in bends:
+        if len(bent := np.flatnonzero(sd)):
+            sums = sums.blurred(sd[bent, None, None] * direction[:, None], bent)
     E, P = sums.b.shape
     S = start = len(sums.right)
     errors = []
@@ -293,23 +285,21 @@ def prepare(
             errors.append((operator, at, direction, sums.N @ direction))
             start = at.stop
     moving = slice(S, start)
-    touched = _find_touched(sums.N, carried)
     places: dict[str, slice] = {}
-    sds, deviations = [np.ones(start - S)], {}
+    sds = [np.ones(start - S)]
     for name in dict.fromkeys(c.channel for c in carried):
-        sd = evidence.state_sd(name)[touched[name]] * thermometer_factor
+        sd = evidence.state_sd(name) * thermometer_factor
         places[name] = slice(start, start + len(sd))
-        deviations[name] = evidence.state_deviation(name)[touched[name]]
         sds.append(sd)
         start += len(sd)
     whole = np.concatenate(sds)
     # the readings' deviation from the smooth trajectory, propagated to the camera
     shift = np.zeros((E, P))
     for item in carried:
-        operator = item.operator[:, touched[item.channel]]
-        shift += np.outer(operator @ deviations[item.channel], item.direction)
+        deviation = item.operator @ evidence.state_deviation(item.channel)
+        shift += np.outer(deviation, item.direction)
         dN = sums.N @ item.direction
-        errors.append((operator, places[item.channel], item.direction, dN))
+        errors.append((item.operator, places[item.channel], item.direction, dN))
     moved = np.einsum("epq,eq->ep", sums.N, shift)
     yy = sums.yy - 2 * float(np.sum(shift * sums.b)) + float(np.sum(shift * moved))
     b = sums.b - moved
@@ -353,21 +343,6 @@ def whiten(factor: Array, right: Array, transposed: bool = False) -> Array:
     return out
 
 
-def _find_touched(
-    N: Array, carried: list[ReadingErrorTerm]
-) -> dict[str, NDArray[np.int64] | slice]:
-    """Return the errors of each channel that reach an epoch with weight; others have no effect."""
-    seen = N.any(axis=(1, 2))
-    if seen.all():
-        return {c.channel: slice(None) for c in carried}
-    reached: dict[str, NDArray[np.bool_]] = {}
-    for c in carried:
-        before = reached.get(c.channel, np.zeros(c.operator.shape[1], dtype=bool))
-        reached[c.channel] = np.logical_or(before, np.any(c.operator[seen] != 0.0, axis=0))
-    # at least one, even if no epoch has any weight
-    return {name: np.flatnonzero(r) if r.any() else slice(1) for name, r in reached.items()}
-
-
 def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> None:
     """Add JᵀN J of movement and readings' errors to the upper half of M.
 
@@ -383,10 +358,8 @@ def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> 
         size, turn = np.linalg.eigh(np.moveaxis(weights, 2, 0))  # not Cholesky: it may be singular
         root = turn * np.sqrt(np.maximum(size, 0.0))[:, None, :]
         here = group[0][1]
-        for r in range(len(group)):
-            half = root[:, :1, r] * group[0][0]
-            for k, (operator, *_) in enumerate(group[1:], 1):
-                half += root[:, k, r, None] * operator
+        for part in np.moveaxis(root, 2, 0):
+            half = sum(part[:, k, None] * operator for k, (operator, *_) in enumerate(group))
             M[here, here] += half.T @ half
         for operator, _, _, dN in group:
             for far, there, d, _ in (error for others in own[g + 1 :] for error in others):

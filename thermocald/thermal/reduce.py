@@ -7,8 +7,7 @@ Whatever is constant over the series has no information about heat. One offset p
 errors of the field's coordinates) is eliminated together with the cameras, so that a target that is
 hidden now and then is not mistaken for a drift.
 
-Gross errors are detected in time: a target leaps away from its own neighbours. The series is
-processed in parts, so that a long one needs no more memory than its points.
+Gross errors are detected in time: a target leaps away from its own neighbours.
 
 The series is linearised at one camera, adjusted to its mean image. The partial derivatives of the
 normal equations refer to this camera, so that its errors become errors of the rates; it is as
@@ -48,18 +47,33 @@ from thermocald.photogrammetry.series.normals import (
     sums_of_squares,
 )
 from thermocald.physics.history import History
-from thermocald.thermal import criteria
-from thermocald.thermal.random_effects import group_hidden_targets
-from thermocald.thermal.series import ReducedSeries, SeriesInput, scaled_basis, solve
+from thermocald.thermal.series import (
+    ReducedSeries,
+    SeriesInput,
+    group_hidden_targets,
+    scaled_basis,
+    solve,
+)
 from thermocald.thermal.thermometer import Thermometer, thermometers
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array, Mask
     from thermocald.physics.model import Distortion
+
+
+# what a series must contain
+MIN_EPOCHS = 20  # with a result: each of six blocks, left out in turn, has three epochs
+LEAST_EPOCHS = 3  # for a fit of known effects
+MIN_TARGETS = 12  # for 19 unknowns and five redundant coordinates
+MIN_DURATION = 120.0  # s: heat needs minutes to reach a camera
+LEAST_CHANGE_K = 1.0  # of the temperature; also at least LEAST_CHANGE times its noise
+LEAST_CHANGE = 8.0
+GROSS = 4.5  # sd of a residual from its neighbours in time: 7 in 10⁶ by chance
+SPIKE = 7.0  # the same before any adjustment, relative to the neighbours' median
 
 
 def require(source: SeriesInput, strict: bool) -> None:
@@ -76,29 +90,29 @@ def require(source: SeriesInput, strict: bool) -> None:
         )
     seen = source.grid.observed.sum(axis=1)
     if not strict:
-        if np.sum(seen >= criteria.MIN_TARGETS) < criteria.LEAST_EPOCHS:
+        if np.sum(seen >= MIN_TARGETS) < LEAST_EPOCHS:
             raise DataError(
-                f"{source.name}: fewer than {criteria.LEAST_EPOCHS} epochs show "
-                f"{criteria.MIN_TARGETS} targets or more"
+                f"{source.name}: fewer than {LEAST_EPOCHS} epochs show "
+                f"{MIN_TARGETS} targets or more"
             )
         return
     reference = next(iter(source.readings))
-    if np.isfinite(source.readings[reference]).sum() < criteria.MIN_EPOCHS and (
-        len(source.frame_times) >= criteria.MIN_EPOCHS
+    if np.isfinite(source.readings[reference]).sum() < MIN_EPOCHS and (
+        len(source.frame_times) >= MIN_EPOCHS
     ):
         raise _no_temperature(source, reference)
-    good = int(np.sum(seen >= criteria.MIN_TARGETS))
-    if good < criteria.MIN_EPOCHS:
+    good = int(np.sum(seen >= MIN_TARGETS))
+    if good < MIN_EPOCHS:
         raise DataError(
-            f"{source.name}: {good} of {len(seen)} epochs have {criteria.MIN_TARGETS} targets or "
-            f"more; discovery needs {criteria.MIN_EPOCHS} such epochs, better 100"
+            f"{source.name}: {good} of {len(seen)} epochs have {MIN_TARGETS} targets or "
+            f"more; discovery needs {MIN_EPOCHS} such epochs, better 100"
         )
     duration = float(source.frame_times[-1] - source.frame_times[0])
-    if duration < criteria.MIN_DURATION:
+    if duration < MIN_DURATION:
         raise DataError(
             f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
             "camera, and a faster movement is not a thermal effect. Record at least "
-            f"{criteria.MIN_DURATION:.0f} s, better half an hour"
+            f"{MIN_DURATION:.0f} s, better half an hour"
         )
     rows = source.grid.observed.any(axis=0)
     if plane_fit(source.field.points[rows])[2]:
@@ -112,39 +126,26 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
     """Make the error for a reference temperature with too few readings."""
     return DataError(
         f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
-        f"than {criteria.MIN_EPOCHS} readings. Record the camera's temperature with its frames"
+        f"than {MIN_EPOCHS} readings. Record the camera's temperature with its frames"
     )
 
 
 _HALF = 2  # neighbours on either side
-_PART = 2048  # epochs at a time
 _LAGS = 20  # epochs, of autocorrelations
 _ITERATIONS = 60  # of conjugate gradients
 
 
-def _parts(epochs: int) -> Iterator[slice]:
-    return (slice(k, min(k + _PART, epochs)) for k in range(0, epochs, _PART))
+def running_median(values: Array, half: int, *, itself: bool = True) -> Array:
+    """Return the running median over 2 half + 1 epochs, along the first axis, ignoring NaN.
 
-
-def _take_running_median(
-    values: Array, part: slice, mask: Mask | None = None, *, itself: bool = True
-) -> Array:
-    """Return the running median over five epochs (e, T, 2) of a part, ignoring NaN.
-
-    mask (E, T): points to ignore; itself: whether the epoch itself is among the five.
+    itself: whether the epoch itself is among them.
     """
-    first, last = max(part.start - _HALF, 0), min(part.stop + _HALF, len(values))
-    near = values[first:last]
-    if mask is not None:
-        near = np.where(mask[first:last, :, None], np.nan, near)
-    before, after = part.start - first, last - part.stop
-    padded = np.pad(near, ((_HALF - before, _HALF - after), (0, 0), (0, 0)),
-                    constant_values=np.nan)  # fmt: skip
-    width, n = 2 * _HALF + 1, part.stop - part.start
-    return _take_median([padded[k : k + n] for k in range(width) if itself or k != _HALF], 0)
+    padded = np.pad(values, ((half, half), (0, 0), (0, 0)), constant_values=np.nan)
+    near = [padded[k : k + len(values)] for k in range(2 * half + 1) if itself or k != half]
+    return take_median(near, 0)
 
 
-def _take_median(values: ArrayLike, axis: int) -> Array:
+def take_median(values: ArrayLike, axis: int) -> Array:
     """Return the median along an axis, ignoring NaN; NaN where all values are."""
     ordered = np.sort(values, axis=axis)  # NaN go to the end
     count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
@@ -159,18 +160,15 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
     This precedes any adjustment, in which a gross error of many pixels would mask itself and
     others.
     """
-    size, own = np.zeros(seen.shape), np.zeros(len(seen))
-    for part in _parts(len(seen)):
-        # Without the epoch itself: in a steady movement it would be its own median, and the usual
-        # deviation would be zero.
-        d = misclosure[part] - _take_running_median(misclosure, part, itself=False)
-        for k in range(2):
-            d[..., k] -= _take_median(d[..., k], 1)[:, None]  # the whole image may move
-        own[part] = MAD_TO_SD * _take_median(np.abs(d).reshape(len(d), -1), 1)
-        size[part] = np.max(np.abs(np.nan_to_num(d)), axis=2)
+    # without the epoch itself: in a steady movement it would be its own median, and the usual
+    # deviation would be zero
+    d = misclosure - running_median(misclosure, _HALF, itself=False)
+    d -= take_median(d, 1)[:, None]  # the whole image may move
+    own = MAD_TO_SD * take_median(np.abs(d).reshape(len(d), -1), 1)
+    size = np.max(np.abs(np.nan_to_num(d)), axis=2)
     finite = own[np.isfinite(own)]
     level = float(np.median(finite)) if len(finite) else 0.0
-    limit = criteria.SPIKE * np.fmax(np.nan_to_num(own), level)
+    limit = SPIKE * np.fmax(np.nan_to_num(own), level)
     return np.asarray(seen & (size > limit[:, None]))
 
 
@@ -180,18 +178,13 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
     bad: the points found so far, which are ignored. As noise may grow with heat, the limit is
     relative to the epoch's own spread, or to the series' if that is larger.
     """
-    size, own = np.zeros(seen.shape), np.zeros(len(seen))
-    good = seen & ~bad
-    normal = []
-    for part in _parts(len(seen)):
-        root = np.sqrt(weights[part, :, :2])
-        kept = np.where(good[part, :, None], np.abs(np.nan_to_num(v[part])) * root, np.nan)
-        own[part] = MAD_TO_SD * _take_median(kept.reshape(len(kept), -1), 1)
-        normal.append(kept[np.isfinite(kept)])
-        local = np.abs(np.nan_to_num(v[part] - _take_running_median(v, part, bad)))
-        size[part] = np.max(local * root, axis=2)
-    level = MAD_TO_SD * float(np.median(np.concatenate(normal)))
-    limit = criteria.GROSS * np.fmax(np.nan_to_num(own), level)
+    root = np.sqrt(weights[..., :2])
+    kept = np.where((seen & ~bad)[..., None], np.abs(np.nan_to_num(v)) * root, np.nan)
+    own = MAD_TO_SD * take_median(kept.reshape(len(kept), -1), 1)
+    around = running_median(np.where(bad[..., None], np.nan, v), _HALF)
+    size = np.max(np.abs(np.nan_to_num(v - around)) * root, axis=2)
+    level = MAD_TO_SD * float(np.median(kept[np.isfinite(kept)]))
+    limit = GROSS * np.fmax(np.nan_to_num(own), level)
     return np.asarray(seen & (size > limit[:, None]))
 
 
@@ -254,7 +247,7 @@ def reduce_series(
 
     Raises DataError, which states what is missing, if the data do not suffice.
     """
-    least = criteria.MIN_EPOCHS if strict else criteria.LEAST_EPOCHS
+    least = MIN_EPOCHS if strict else LEAST_EPOCHS
     require(source, strict)
     times = source.frame_times - source.frame_times[0]
     reading_times = source.reading_times - source.frame_times[0]
@@ -284,9 +277,7 @@ def reduce_series(
         source.polygons(),
     )
     change = float(np.ptp(trajectory))
-    least_change = max(
-        criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * instruments[reference].noise
-    )
+    least_change = max(LEAST_CHANGE_K, LEAST_CHANGE * instruments[reference].noise)
     if strict and change < least_change:
         raise DataError(
             f"{source.name}: the temperature {reference!r} is constant within "
@@ -339,15 +330,14 @@ def _reduce(
     seen = source.grid.observed
     bad = find_spikes(misclosure, seen)
     offsets = np.zeros((len(X), 2))
-    for turn in range(5):
+    for turn in range(6):
         w = source.grid.reject(bad).weights
         N = normal_matrices(w, A)
-        offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
-        if turn >= 1:
+        v = _solve_cameras(w, N, A, misclosure - offsets)[2]
+        offsets = offsets + _solve_offsets(w[..., :2], np.nan_to_num(v), N, A)
+        b, values, v = _solve_cameras(w, N, A, misclosure - offsets)
+        if 1 <= turn < 5:
             bad = find_outliers(v, weights, seen, bad)
-    w = source.grid.reject(bad).weights
-    N = normal_matrices(w, A)
-    offsets, b, values, v = _improve_offsets(w, N, A, misclosure, offsets)
     lPl = sums_of_squares(w, misclosure - offsets)
     yy = np.einsum("ek,ek->e", values, b)
     count = (seen & ~bad).sum(axis=1)
@@ -355,10 +345,10 @@ def _reduce(
     # one offset per target is estimated too
     loss = 1.0 - 2 * int(used.sum()) / max(2 * int(count.sum()), 1)
     sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
-    enough = count >= criteria.MIN_TARGETS
+    enough = count >= MIN_TARGETS
     if not enough.any():
         raise DataError(
-            f"{source.name}: without gross errors, no epoch has {criteria.MIN_TARGETS} targets or "
+            f"{source.name}: without gross errors, no epoch has {MIN_TARGETS} targets or "
             "more; use a field with more targets in the image"
         )
     variance = float(np.median(sigma0[enough]) ** 2)
@@ -379,35 +369,20 @@ def _reduce(
         values=values,
         residuals=v,
         weights=w / variance,
-        offsets=offsets,
         n=count,
         sigma0=sigma0 / np.sqrt(variance),
         variance=variance,
         correlation=_measure_correlation(v),
-        gross=int(bad.sum()),
         hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
         distortion=distortion,
     )
 
 
-def _improve_offsets(
-    w: Array, N: Array, A: Array, misclosure: Array, offsets: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Improve the offsets (T, 2) px by one step.
-
-    Returns the offsets, and with them right-hand sides (E, k), values (E, k) and residuals (E, T,
-    2) px.
-    """
-
-    def cameras(offsets: Array) -> tuple[Array, Array, Array]:
-        left = misclosure - offsets
-        b = right_hand_sides(w, left, A)
-        values = solve(N, b)
-        return b, values, left - (values @ A.reshape(-1, A.shape[-1]).T).reshape(left.shape)
-
-    _, _, v = cameras(offsets)
-    offsets = offsets + _solve_offsets(w[..., :2], np.nan_to_num(v), N, A)
-    return (offsets, *cameras(offsets))
+def _solve_cameras(w: Array, N: Array, A: Array, left: Array) -> tuple[Array, Array, Array]:
+    """Return right-hand sides (E, k), values (E, k) and residuals (E, T, 2) px of free cameras."""
+    b = right_hand_sides(w, left, A)
+    values = solve(N, b)
+    return b, values, left - (values @ A.reshape(-1, A.shape[-1]).T).reshape(left.shape)
 
 
 def _solve_offsets(weights: Array, v: Array, N: Array, A: Array) -> Array:

@@ -21,7 +21,7 @@ trajectories estimated so far.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -32,16 +32,16 @@ from thermocald.photogrammetry.linalg import (
     orthonormal_combinations,
     scaled_solve,
 )
-from thermocald.thermal import criteria
-from thermocald.thermal.hypothesis import BASE, Candidate, Fit
-from thermocald.thermal.series import ReducedSeries, solve, unit_directions
+from thermocald.physics import catalogue
+from thermocald.thermal.hypothesis import BASE, Candidate, Fit, Term, make_candidate
+from thermocald.thermal.series import ReducedSeries, cosines, solve, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.arrays import Array, Index
+    from thermocald.physics.model import ModelEffect
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.likelihood import Weighting
 
 
@@ -225,9 +225,68 @@ def normals_of_term(
     return normals_beside(fit, further, k, weightings, leave)
 
 
+_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
+
+
+def event_threshold(series: ReducedSeries, coefficients: int) -> float:
+    """Return the χ² that an event has to explain, given its coefficients and the times tried."""
+    n = max(int((series.n > 0).sum()), 2)
+    return float((coefficients + 2) * np.log(n) + _MARGIN)
+
+
+def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
+    """Return an effect as a term to add to a fitted hypothesis.
+
+    search: search its non-linear parameters over their whole range, except those in `fitter.held`;
+    the time of an event is always searched, in each series.
+    """
+    kind = catalogue.get(effect.name)
+    given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
+    names = BASE if kind.is_drive else given
+    text = {k: effect.values[k] for k, p in kind.nonlinear.items() if p.text and k in effect.values}
+    numbers = {
+        k: float(effect.values[k])
+        for k, p in kind.nonlinear.items()
+        if k in effect.values and not p.text and k not in kind.fresh
+    }
+    held = {k: v for k, v in numbers.items() if f"{effect.name}.{k}" in fitter.held}
+    candidate = make_candidate(kind, names, fitter.series, (*text.items(), *held.items()))
+    if kind.is_event:
+        found = Scanner(fitter).scan(candidate, fit)
+        fresh: list[tuple[tuple[str, Any], ...] | None] = []
+        for s, gains in enumerate(found.events):
+            best = int(np.argmax(gains))
+            least = event_threshold(fitter.series[s], found.coefficients)
+            time = float(fitter.series[s].times[best + 1])
+            fresh.append(((candidate.name, time),) if gains[best] > least else None)
+        return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
+    if search and candidate.name:
+        found = Scanner(fitter).scan(candidate, fit)
+        return candidate.term(float(candidate.grid[found.best]), len(fitter.series))
+    return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
+
+
+def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
+    """Return a fit's terms without events that explain no more than chance beside the others."""
+    terms = list(fit.terms)
+    for block in fit.blocks:
+        if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:
+            continue
+        place = slice(block.start, block.stop)
+        heights, cofactor = fit.coefficients[place], fit.covariance[place, place]
+        gain = float(heights @ np.linalg.solve(cofactor, heights))
+        if gain <= event_threshold(fitter.series[block.series], len(heights)):
+            fresh = list(terms[block.term].fresh)
+            fresh[block.series] = None
+            terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))
+    return tuple(terms)
+
+
 _RIDGE = 1e-12  # of a unit diagonal
 _FAINT = 1e-6  # χ² of a trajectory of unit size, below which it is negligible
 
+SIGNIFICANT = 6.0  # sd by which a model's misfit must exceed its expectation
+NEGLIGIBLE_PX = 0.004  # RMS of a smooth misfit that does not matter: a tenth of a point's noise
 ORDERS = 14
 
 
@@ -257,15 +316,7 @@ class Adequacy:
     @property
     def adequate(self) -> bool:
         """Whether the misfit is insignificant or negligible."""
-        return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX
-
-
-def cosines(times: Array, orders: int) -> Array:
-    """Return smooth trajectories (orders, E) over a series; order 1 is half a wave."""
-    u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
-    rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
-    rows -= rows.mean(axis=1, keepdims=True)
-    return rows
+        return self.significance < SIGNIFICANT or self.misfit_px < NEGLIGIBLE_PX
 
 
 def examine_all(fitter: HypothesisFitter, fit: Fit) -> tuple[Adequacy, ...]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.linalg import best_level, explained, unit_diagonal
+from thermocald.photogrammetry.linalg import best_level, explained, scaled_solve
 from thermocald.physics.history import History
 from thermocald.physics.model import Distortion, distortion_along, follow_angle
 
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
-    from thermocald.thermal.random_effects import HiddenTargets, Movement
     from thermocald.thermal.thermometer import Thermometer
 
 FIELD_SCALES = ("scale_X", "scale_Y", "scale_Z")
@@ -82,10 +82,6 @@ class SeriesInput:
                 out[name] = (t[there], values[there])
         return out
 
-    def epochs(self, rows: NDArray[np.bool_]) -> int:
-        """Return the number of epochs in some rows (E,)."""
-        return int(rows.sum() if self.counts is None else self.counts[rows].sum())
-
     @property
     def per_row(self) -> Array:
         """The number of epochs in each row (E,)."""
@@ -108,6 +104,158 @@ class Blocks:
     first: NDArray[np.int64]
 
 
+_OFTEN = 0.9  # share of the epochs with a target from which its offset needs no unknown
+_SEEN = 0.05  # variance of an amplitude, in units of the image noise, from which it is an unknown
+_LOOSE = 1e-4  # px⁻², prior weight of an offset
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTargets:
+    """The offsets of hidden targets, as S combinations that the camera's parameters could absorb.
+
+    patterns (G, E) px⁻²: weights of the targets that are seen at the same epochs; members: for each
+    pattern the targets' rows (n,) and the combinations (2n, s) of their coordinates; group (S,):
+    the pattern of each combination; vectors (S, P): its products with the scaled parameters' design
+    matrix; right (S, E): its products with the weighted misclosures.
+    """
+
+    patterns: Array
+    members: tuple[tuple[NDArray[np.int64], Array], ...]
+    group: NDArray[np.int64]
+    vectors: Array
+    right: Array
+
+    @property
+    def cross(self) -> Array:
+        """The normal equations' block (S, E, P) with the epochs' parameters."""
+        return np.asarray(self.patterns[self.group][:, :, None] * self.vectors[:, None, :])
+
+    @property
+    def normal(self) -> Array:
+        """The diagonal (S,) of the offsets' own normal matrix."""
+        return np.asarray(self.patterns.sum(axis=1)[self.group] + _LOOSE)
+
+    def scaled(self, factor: Array | float) -> HiddenTargets:
+        """Multiply the weights by a factor, or by a factor (E,) for each epoch."""
+        return replace(self, patterns=self.patterns * factor, right=self.right * factor)
+
+    def in_blocks(self, starts: NDArray[np.int64]) -> HiddenTargets:
+        """Sum over blocks of neighbouring epochs, which begin at the rows `starts`."""
+        return replace(
+            self,
+            patterns=np.add.reduceat(self.patterns, starts, axis=1),
+            right=np.add.reduceat(self.right, starts, axis=1),
+        )
+
+    def turned(self, T: Array, values: Array) -> HiddenTargets:
+        """Transform the offsets with normal matrices to T N Tᵀ, about the epochs' values (E, P)."""
+        vectors = self.vectors @ T.T
+        change = (vectors - self.vectors) @ values.T
+        right = self.right + self.patterns[self.group] * change
+        return replace(self, vectors=vectors, right=right)
+
+    def less(self, change: Array) -> HiddenTargets:
+        """Subtract changes (E, T, 2) px from the image points."""
+        parts = [
+            self.patterns[k] * (change[:, rows].reshape(len(change), -1) @ U).T
+            for k, (rows, U) in enumerate(self.members)
+        ]
+        return replace(self, right=self.right - np.concatenate(parts))
+
+
+def group_hidden_targets(w: Array, left: Array, A: Array) -> HiddenTargets | None:
+    """Group the targets that are hidden for long by the epochs that show them; None if none is.
+
+    w (E, T, 3) px⁻²: weights; left (E, T, 2) px: misclosures; A (T, 2, P): partial derivatives.
+    """
+    there = w[..., 0] > 0
+    epochs = there.any(axis=1)
+    rows = np.flatnonzero(there.any(axis=0) & (there[epochs].mean(axis=0) < _OFTEN))
+    if not len(rows):
+        return None
+    together: dict[bytes, list[int]] = {}
+    for row in rows.tolist():
+        together.setdefault(np.packbits(there[:, row]).tobytes(), []).append(row)
+    patterns, members, group, vectors = [], [], [], []
+    for number, targets in enumerate(together.values()):
+        U, s, V = np.linalg.svd(A[targets].reshape(2 * len(targets), -1), full_matrices=False)
+        kept = s > 1e-9 * s[0]
+        patterns.append(w[:, targets, :2].mean(axis=(1, 2)))
+        members.append((np.array(targets), U[:, kept]))
+        group.append(np.full(int(kept.sum()), number))
+        vectors.append(s[kept, None] * V[kept])
+    empty = HiddenTargets(
+        np.stack(patterns), tuple(members), np.concatenate(group), np.concatenate(vectors),
+        np.zeros((sum(U.shape[1] for _, U in members), len(w))),
+    )  # fmt: skip
+    return empty.less(-np.where(there[..., None], left, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """A slow movement of the epochs' parameters that no hypothesis explains.
+
+    directions (P, m): in px-scaled columns; trajectories (E, K): orthonormal cosines; sd (m, K): of
+    their amplitudes, in units of the image noise. Amplitudes below the noise are left out.
+    """
+
+    directions: Array
+    trajectories: Array
+    sd: Array
+
+    @cached_property
+    def states(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The direction and the cosine of each amplitude that counts, indices (F,) each."""
+        seen = self.sd**2 > _SEEN
+        if not seen.any():
+            seen[-1, 0] = True
+        mode, wave = np.nonzero(seen)
+        return mode, wave
+
+    @property
+    def operators(self) -> list[tuple[Array, Array]]:
+        """The directions (P,) that count, each with its trajectories (E, ·) of unit variance."""
+        mode, wave = self.states
+        return [
+            (self.directions[:, i], self.trajectories[:, k] * self.sd[i, k])
+            for i in np.unique(mode)
+            for k in [wave[mode == i]]
+        ]
+
+    def moments(self, mean: Array, root: Array) -> tuple[Array, Array]:
+        """Return the amplitudes' products and their gain in precision, (m, m), summed over cosines.
+
+        mean (F,), root (·, F): of the amplitudes and of their covariance, given the data; the
+        amplitudes that are left out have mean 0 and variance 1.
+        """
+        mode, wave = self.states
+        m, K = self.sd.shape
+        amplitudes = np.zeros((m, K))
+        amplitudes[mode, wave] = mean
+        known = np.zeros((m, m))
+        for k in np.unique(wave):
+            own = np.flatnonzero(wave == k)
+            part = root[:, own]
+            known[np.ix_(mode[own], mode[own])] += np.eye(len(own)) - part.T @ part
+        return amplitudes @ amplitudes.T, known
+
+
+def waves(times: Array, count: int) -> Array:
+    """Return cosines (E, K) over a series, orthonormal for epochs at even intervals."""
+    E = len(times)
+    u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
+    u = (u * (E - 1) + 0.5) / E
+    return np.asarray(np.sqrt(2.0 / E) * np.cos(np.pi * np.arange(1, count + 1) * u[:, None]))
+
+
+def cosines(times: Array, orders: int) -> Array:
+    """Return smooth trajectories (orders, E) over a series; order 1 is half a wave."""
+    u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
+    rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
+    rows -= rows.mean(axis=1, keepdims=True)
+    return rows
+
+
 @dataclass(frozen=True, eq=False)
 class ReducedSeries:
     """A series, reduced to normal equations.
@@ -119,16 +267,15 @@ class ReducedSeries:
 
     N (E, 19, 19), b (E, 19): normal equations in px-scaled columns, weighted by the estimated
     noise; yy (E,): bᵀN⁻¹b; values (E, 19): the free camera of each epoch, scaled; residuals (E, T,
-    2) px: of the free camera, without the offsets (T, 2) px, NaN where unseen or gross; weights (E,
+    2) px: of the free camera, without the targets' offsets, NaN where unseen or gross; weights (E,
     T, 3) px⁻²; n (E,): numbers of image points; sigma0 (E,).
 
     variance: factor by which the given variances were too small; correlation: variance of slow
-    trajectories over that of white noise; gross: number of rejected points; excluded: rows of
-    targets left out; blocks: the epochs in each row of a long series, or None; hidden, movement:
-    random effects (`random_effects`), or None; tremble (P, t): directions of each epoch's random
-    movement, of unit variance, or None; bend (E, T, 2) px: curvature of the projection that was
-    subtracted from the observations, or None; slope_jumps (E,) K/s: jumps of the temperature's
-    slope as measured by the images, or None.
+    trajectories over that of white noise; excluded: rows of targets left out; blocks: the epochs in
+    each row of a long series, or None; hidden, movement: random effects, or None; tremble (P, t):
+    directions of each epoch's random movement, of unit variance, or None; bend (E, T, 2) px:
+    curvature of the projection that was subtracted from the observations, or None; slope_jumps (E,)
+    K/s: jumps of the temperature's slope as measured by the images, or None.
     """
 
     source: SeriesInput
@@ -144,12 +291,10 @@ class ReducedSeries:
     values: Array
     residuals: Array
     weights: Array
-    offsets: Array
     n: NDArray[np.int64]
     sigma0: Array
     variance: float
     correlation: float
-    gross: int
     excluded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     blocks: Blocks | None = None
     hidden: HiddenTargets | None = None
@@ -318,7 +463,12 @@ _DAYS = 30.0  # from which a series' long blocks are whole days, as daily cycles
 def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
     """Choose at most `rows` blocks; return their first epochs (B,)."""
     E = len(evidence.times)
-    nonlinear = _scatter(evidence, _remove_rates(evidence))
+    N, T = evidence.N, evidence.history.temperature() - evidence.T0
+    P, by_T = N.shape[1], np.einsum("e,epq->pq", T, N)
+    A = np.block([[N.sum(axis=0), by_T], [by_T, np.einsum("e,epq->pq", T * T, N)]])
+    c = np.concatenate([evidence.b.sum(axis=0), T @ evidence.b])
+    rates = np.outer(T, scaled_solve(A, c, 1e-10)[P:])
+    nonlinear = _scatter(evidence, evidence.values - rates)
     every = _scatter(evidence, evidence.values)
 
     def gain(start: int, stop: int) -> float:
@@ -346,20 +496,6 @@ def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
         for part in ((start, middle), (middle, stop)):
             heapq.heappush(heap, (-gain(*part), *part))
     return np.array(sorted([*done, *(start for _, start, _ in heap)]), dtype=np.int64)
-
-
-def _remove_rates(evidence: ReducedSeries) -> Array:
-    """Return the cameras (E, P) without levels and temperature rates, by least squares."""
-    N, T = evidence.N, evidence.history.temperature() - evidence.T0
-    P = N.shape[1]
-    A = np.empty((2 * P, 2 * P))
-    A[:P, :P] = N.sum(axis=0)
-    A[:P, P:] = A[P:, :P] = np.einsum("e,epq->pq", T, N)
-    A[P:, P:] = np.einsum("e,epq->pq", T * T, N)
-    c = np.concatenate([evidence.b.sum(axis=0), T @ evidence.b])
-    scaled, scale = unit_diagonal(A)
-    x = scale * np.linalg.lstsq(scaled, c * scale, rcond=1e-10)[0]
-    return np.asarray(evidence.values - x[:P] - np.outer(T, x[P:]))
 
 
 def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], float]:
@@ -412,7 +548,6 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     b = np.add.reduceat(evidence.b, first, axis=0)
     values = solve(N, b)
     yy = np.einsum("ek,ek->e", values, b)
-    rank = float(np.sum(np.linalg.eigvalsh(N.sum(axis=0)) > 1e-9 * np.trace(N.sum(axis=0))))
     knots = next(iter(evidence.thermometers.values())).times
     inside = (knots >= evidence.history.times[0] - 30.0) & (
         knots <= evidence.history.times[-1] + 30.0
@@ -438,7 +573,7 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
         blocks=Blocks(
             average,
             pool,
-            rank * float((evidence.n > 0).sum() - (total > 0).sum()),
+            evidence.rank * float((evidence.n > 0).sum() - (total > 0).sum()),
             first,
         ),
         hidden=evidence.hidden.in_blocks(first) if evidence.hidden else None,

@@ -14,8 +14,8 @@ Limit: outside these windows, movement faster than a row is averaged out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid, recut
 from thermocald.store.recording.reader import Recording
-from thermocald.thermal import criteria
+from thermocald.thermal.reduce import take_median
 from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.thermometer import estimate_reading_noise
 
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
     from thermocald.store.sources import StoredRecording
 
+_GROSS_OF_MEAN = 6.0  # sd from the median of the epochs of a short mean
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
 _FEWEST, _MOST = 2_000, 10_000  # rows
 _COARSE = 0.8  # share of the rows that are long means
@@ -55,18 +56,16 @@ def limit_rows(targets: int) -> int:
     return min(max(_POINTS // max(targets, 1), _FEWEST), _MOST)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of a condensed series: their first epochs (R,), epoch counts (R,), and grid."""
+class _Rows(NamedTuple):
+    """The rows of a condensed series: their first epochs and epoch counts (R,), and their points.
+
+    points (R, T, 2) px, weights (R, T, 3) px⁻².
+    """
 
     first: Index
-    count: Index
-    grid: ObservationGrid
-
-    def at(self, rows: Index | NDArray[np.bool_]) -> _Rows:
-        """Return some of the rows."""
-        grid = ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
-        return _Rows(self.first[rows], self.count[rows], grid)
+    counts: Index
+    points: Array
+    weights: Array
 
 
 def condensed(
@@ -92,18 +91,14 @@ def condensed(
         )
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
         inside = [(rows.first >= w.start) & (rows.first < w.stop) for w in windows]
-        parts = [rows.at(~np.any(inside, axis=0))]
+        parts = [_Rows._make(column[~np.any(inside, axis=0)] for column in rows)]
         parts += [
             _average_epochs(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0]
             for w in windows
         ]
-        merged = ObservationGrid(
-            np.concatenate([p.grid.points for p in parts]),
-            np.concatenate([p.grid.weights for p in parts]),
-        )
-        begins = np.concatenate([p.first for p in parts])
-        rows = _Rows(begins, np.concatenate([p.count for p in parts]), merged)
-        rows = rows.at(np.argsort(begins, kind="stable"))
+        rows = _Rows._make(map(np.concatenate, zip(*parts, strict=True)))
+        order = np.argsort(rows.first, kind="stable")
+        rows = _Rows._make(column[order] for column in rows)
     return _put_on_rows(series, rows)
 
 
@@ -130,10 +125,10 @@ def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
         frame_times=mean(series.frame_times),
         reading_times=mean(series.reading_times),
         readings={n: mean(np.asarray(r, dtype=float)) for n, r in series.readings.items()},
-        grid=rows.grid,
+        grid=ObservationGrid(rows.points, rows.weights),
         numbers=series.numbers[rows.first],
         columns={n: mean(c) for n, c in (series.columns or {}).items()},
-        counts=rows.count,
+        counts=rows.counts,
         noises=noises,
     )
 
@@ -194,8 +189,8 @@ def _average_epochs(
     points = np.where(there[..., None], points + middle, np.nan)
     begin = start + np.arange(R) * size
     count = np.minimum(begin + size, start + epochs) - begin
-    rows_ = _Rows(begin, count, ObservationGrid(points, np.where(there[..., None], normal, 0.0)))
-    return rows_, sums[:, :3] / np.maximum(sums[:, 3:], 1e-300)
+    means = _Rows(begin, count, points, np.where(there[..., None], normal, 0.0))
+    return means, sums[:, :3] / np.maximum(sums[:, 3:], 1e-300)
 
 
 def _locate_targets(grid: ObservationGrid) -> Array:
@@ -220,20 +215,13 @@ def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.boo
         out[-short:] = _find_gross(p[-short:], seen[-short:], short)
     values = np.where(seen[..., None], p, np.nan)[:n]
     runs = values.reshape(-1, short, *p.shape[1:])
-    off = (runs - _take_lower_median(runs)).reshape(n, *p.shape[1:])
+    off = (runs - take_median(runs, 1)[:, None]).reshape(n, *p.shape[1:])
     # the whole image may move within a short mean
-    off = np.abs(off - _take_lower_median(off))
+    off = np.abs(off - take_median(off, 1)[:, None])
     known = np.isfinite(off)
     scale = float(mad_sd(off[known])) if known.any() else 0.0
-    out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
+    out[:n] |= (np.where(known, off, 0.0) > _GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
     return out
-
-
-def _take_lower_median(values: Array) -> Array:
-    """Return the lower median over axis 1, which stays with length 1, ignoring NaN."""
-    ordered = np.sort(values, axis=1)  # NaN go to the end
-    count = np.isfinite(ordered).sum(axis=1, keepdims=True)
-    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=1)
 
 
 def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import mad_sd
-from thermocald.photogrammetry.series.normals import spread_windows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
 
 _SMOOTHING = np.logspace(-1, 5, 19)
-_MOST_FOR_NOISE = 200_000  # readings, in a dozen runs
 _OFTEN_SHARP = 0.2  # share of sharp intervals above which a sharp bend need not be a kink
 _KINK = 1.5  # times the usual sharp bend, which a kink must then exceed
 _ALIKE = 0.75  # of the sharpest bend near it, which a kink must then reach
@@ -197,13 +195,8 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
 
     It is computed from third divided differences, as thermometers are not read at even intervals,
     clipped iteratively at 2.2 sigma, so that a switched lamp, which affects four of them, does not
-    count as noise. It is at least the error due to the resolution. Of very many readings, runs
-    spread over the series are used.
+    count as noise. It is at least the error due to the resolution.
     """
-    if len(readings) > _MOST_FOR_NOISE:
-        runs = spread_windows(len(readings), _MOST_FOR_NOISE)
-        times = np.concatenate([times[run] for run in runs])
-        readings = np.concatenate([readings[run] for run in runs])
     there = np.isfinite(readings) & np.isfinite(times)
     t, values = times[there], readings[there]
     floor = find_step(values, resolution) / np.sqrt(12.0)
@@ -392,24 +385,18 @@ def extend(channel: Thermometer) -> Thermometer:
     edge = np.concatenate([np.arange(n), np.arange(n + K, n + K + m)])
     at = np.concatenate([np.full(n, n + k[0]), np.full(m, n + k[-1])])
     ends = csr_array((np.ones(n + m), (edge, at)), shape=(n + K + m, n + K + m))
-    ones = [csr_array(np.eye(size)) for size in (n, m)]
-    mixing = csr_array(block_diag([ones[0], channel.mixing, ones[1]]) + ends)
+    mixing = csr_array(block_diag([np.eye(n), channel.mixing, np.eye(m)]) + ends)
     rate = float(np.sqrt(np.mean(np.gradient(channel.trajectory[k], t[k]) ** 2)))
-    return Thermometer(
-        np.concatenate([before, t, after]),
-        np.concatenate([held, channel.trajectory, carried]),
-        np.concatenate([np.zeros(n), channel.deviation, np.zeros(m)]),
-        np.concatenate(
-            [
-                0.5 * abs(first) * (t[0] - before) + 0.1 * channel.noise,
-                channel.sd,
-                0.5 * (abs(last) + rate) * (after - t[-1]) + 0.1 * channel.noise,
-            ]
-        ),
-        mixing,
-        np.concatenate([np.zeros(n, dtype=bool), channel.real, np.zeros(m, dtype=bool)]),
-        channel.noise,
-        channel.coarse,
+    early = 0.5 * abs(first) * (t[0] - before) + 0.1 * channel.noise
+    late = 0.5 * (abs(last) + rate) * (after - t[-1]) + 0.1 * channel.noise
+    return replace(
+        channel,
+        times=np.concatenate([before, t, after]),
+        trajectory=np.concatenate([held, channel.trajectory, carried]),
+        deviation=np.pad(channel.deviation, (n, m)),
+        sd=np.concatenate([early, channel.sd, late]),
+        mixing=mixing,
+        real=np.pad(channel.real, (n, m)),
     )
 
 

@@ -19,6 +19,7 @@ from scipy.special import chdtri
 
 from thermocald.analysis.camera.camera import CameraDifference
 from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
+from thermocald.analysis.thermal.result import with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry import camera_files
@@ -165,23 +166,17 @@ def fit_calibrations(
         covariance *= sigma0**2
     names = [f"interior.{IOP_NAMES[k]}" for k in free]
     names += [f"rates.{IOP_NAMES[free[i]]}" for i in rated]
-    sds = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    values = first.camera.interior.as_array().copy()
-    values[free] = x[: len(free)]
-    found = dict(zip(names, x.tolist(), strict=True))
-    model = ThermalModel(
+    start = ThermalModel(
         first.name,
         first.camera.sensor,
         at,
-        InteriorOrientation.from_array(values),
-        {name: found.get(f"rates.{name}", 0.0) for name in RATED},
+        first.camera.interior,
+        dict.fromkeys(RATED, 0.0),
         distortion=distortion,
-        sds=sds,
-        covariance_names=tuple(names),
-        covariance=tuple(tuple(row) for row in covariance.tolist()),
         validity={channel: (float(T.min()), float(T.max()))},
         name=first.name,
     )
+    model = with_covariance(start, tuple(names), x, covariance)
     rms = [_rms(model, c, t) for c, t in zip(calibrations, T.tolist(), strict=True)]
     fitted_on: list[dict[str, Any]] = [
         {"calibration": str(c.path), "temperature": round(t, 3), "photographs": c.photographs,

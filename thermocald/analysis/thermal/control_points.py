@@ -187,33 +187,27 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
         for wanted, names in _NAMES.items()
         if (found := next((n for n in names if n in table.columns), None)) is not None
     }
-    for wanted in ("target", "X", "Y", "Z", "sX", "sY", "sZ"):
-        if wanted not in there:  # raises the table's error
-            Table(path, (wanted,), DataError)
-    if clicked := "x" in there:
-        Table(path, ("x", "y", "sx", "sy"), DataError)
-    names: list[str] = []
-    texts: dict[str, list[str]] = {n: [] for n in ("kind", "code") if n in table.columns}
-    columns: dict[str, list[Array]] = {n: [] for n in there if n != "target"}
-    for chunk in table.chunks():
-        names += [word.strip() for word in chunk.text(there["target"])]
-        for wanted, values in columns.items():
-            column = chunk.numbers(there[wanted], empty_is_nan=wanted in ("x", "y", "diameter"))
-            if wanted[0] == "s":
-                chunk.check(there[wanted], column <= 0, "a standard deviation must be above 0")
-            values.append(column)
-        for wanted, words in texts.items():
-            words += [word.strip() for word in chunk.text(wanted)]
-    if not names:
+    missing = [w for w in ("target", "X", "Y", "Z", "sX", "sY", "sZ") if w not in there]
+    clicked = ["x", "y", "sx", "sy"] if "x" in there else []
+    Table(path, (*missing, *clicked), DataError)  # raises the table's error
+    texts = {n: n for n in ("kind", "code") if n in table.columns} | {"target": there.pop("target")}
+    optional = [n for w, n in there.items() if w in ("x", "y", "diameter")]
+    numbers = dict.fromkeys(n for n in there.values() if n not in optional)
+    read = table.read(numbers=list(numbers), optional=optional, texts=list(texts.values()))
+    if not read:
         raise DataError(f"{path}: holds no control points")
-    whole = {n: np.concatenate(values) for n, values in columns.items()}
+    whole = {wanted: read[n] for wanted, n in there.items()}
+    words = {wanted: [word.strip() for word in read[n]] for wanted, n in texts.items()}
+    for wanted, values in whole.items():
+        if wanted[0] == "s":
+            table.check(there[wanted], values <= 0, "a standard deviation must be above 0")
     looks: dict[str, Any] = {}
-    if "kind" in texts:
-        looks["kinds"] = [kind or KINDS[0] for kind in texts["kind"]]
+    if "kind" in words:
+        looks["kinds"] = [kind or KINDS[0] for kind in words["kind"]]
         if wrong := set(looks["kinds"]) - set(KINDS):
             raise DataError(f"{path}: kind {min(wrong)!r} is none of {', '.join(KINDS)}")
-    if "code" in texts:
-        looks["codes"] = texts["code"]
+    if "code" in words:
+        looks["codes"] = words["code"]
     if "diameter" in whole:
         looks["diameters"] = UNITS[unit] * whole["diameter"]
 
@@ -223,7 +217,7 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
     seen = (stacked("x", "y"), stacked("sx", "sy")) if clicked else None
     sigmas = stacked("sX", "sY", "sZ")
     return ControlPoints.build(
-        names, stacked("X", "Y", "Z"), sigmas, unit, str(path), seen, **looks
+        words["target"], stacked("X", "Y", "Z"), sigmas, unit, str(path), seen, **looks
     )
 
 
@@ -239,12 +233,9 @@ def _from_json(path: Path) -> ControlPoints:
             return _from_features(document, str(path))
     except DataError:
         raise
-    except KeyError as error:
-        raise DataError(
-            f"{path}: is not valid JSON of control points: {error} is missing"
-        ) from error
-    except (AttributeError, TypeError, ValueError, IndexError) as error:
-        raise DataError(f"{path}: is not valid JSON of control points: {error}") from error
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        fault = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise DataError(f"{path}: is not valid JSON of control points: {fault}") from error
     raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 
 

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -335,28 +336,26 @@ def _block(
 
 
 def _moment(text: str) -> float | datetime:
-    try:
-        seconds = float(text)
-    except ValueError:
-        try:
-            moment = parse_moment(text)
-        except ValueError:
-            moment = None
-        if isinstance(moment, datetime):
+    seconds = _float(text)
+    if np.isfinite(seconds):
+        return seconds
+    with suppress(ValueError):
+        if isinstance(moment := parse_moment(text), datetime):
             return moment
-        seconds = np.nan
-    if not np.isfinite(seconds):
-        raise ValueError(f"column time: {text!r} is not a time")
-    return seconds
+    raise ValueError(f"column time: {text!r} is not a time")
 
 
 def _number(column: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
+    value = _float(text)
     if not np.isfinite(value):
         raise ValueError(f"column {column}: {text!r} is not a number")
     if column in ("sx", "sy") and value <= 0:
         raise ValueError(f"column {column}: a standard deviation must be above 0")
     return value
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -17,10 +17,11 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
+from thermocald.physics.effect import Steady
 from thermocald.store.logger.dialect import to_celsius
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from thermocald.arrays import Array
     from thermocald.physics.history import History
@@ -39,7 +40,10 @@ class ExtrapolationWarning(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """The lowest and the highest temperature of the fit, °C; of: a thermometer's name."""
+    """The lowest and the highest temperature of the fit, °C, infinite if unknown.
+
+    of: a thermometer's name.
+    """
 
     low: float
     high: float
@@ -102,80 +106,47 @@ class Validity:
         return outside
 
 
-@dataclass(frozen=True, eq=False)
-class SteadyCamera:
-    """p(T) and ∂p/∂(parameters) as polynomials in T - T₀, and from each knee on in T - T_k.
+def steady_parts(
+    model: ThermalModel, channels: Mapping[str, float] | None = None
+) -> Iterator[tuple[str, int, float, Steady]]:
+    """Yield what makes up a steady camera: a number's name, its row of IOP_NAMES, value and signal.
 
-    knees: T_k, slope, ∂slope, ∂/∂T_k of each. `model` then makes the distortion follow c.
+    channels: °C of other thermometers.
     """
-
-    model: ThermalModel
-    names: tuple[str, ...]
-    p: tuple[Array, Array, Array]
-    J: tuple[Array, Array, Array]
-    knees: tuple[tuple[float, Array, Array, Array], ...]
-
-    def at(self, T: float) -> tuple[Array, Array, Array]:
-        """Return values (10,), their slope (10,) per K, and the derivatives (10, p) at T °C."""
-        dT = T - self.model.T0
-        p0, p1, p2 = self.p
-        J0, J1, J2 = self.J
-        values = p0 + dT * (p1 + dT * p2)
-        slope = p1 + 2.0 * dT * p2
-        J = J0 + dT * (J1 + dT * J2)
-        for knee, rate, by_rate, by_knee in self.knees:
-            if knee < T:
-                values = values + (T - knee) * rate
-                slope = slope + rate
-                J = J + (T - knee) * by_rate + by_knee
-        columns = np.column_stack([slope, J])
-        carried = self.model.carried_derivatives(values, columns, ("slope", *self.names))
-        return self.model.carried(values), carried[:, 0], carried[:, 1:]
-
-
-def steady_camera(
-    model: ThermalModel,
-    names: tuple[str, ...],
-    channels: Mapping[str, float] | None,
-) -> SteadyCamera:
-    """Return the steady camera of a model.
-
-    names: of the parameters whose derivatives are wanted; channels: °C of other thermometers.
-    """
-    p = [np.zeros(10) for _ in range(3)]
-    J = [np.zeros((10, len(names))) for _ in range(3)]
-    knees = []
-
-    def add(parameter: str, value: float, row: int, power: int, factor: float = 1.0) -> None:
-        p[power][row] += value * factor
-        if parameter in names:
-            J[power][row, names.index(parameter)] += factor
-
     for row, n in enumerate(IOP_NAMES):
-        add(f"interior.{n}", float(getattr(model.interior, n)), row, 0)
+        yield f"interior.{n}", row, float(getattr(model.interior, n)), Steady((1.0, 0.0, 0.0))
         if n in model.rates:
-            add(f"rates.{n}", model.rates[n], row, 1)
+            yield f"rates.{n}", row, model.rates[n], Steady((0.0, 1.0, 0.0))
     for effect in model.effects:
         kind = catalogue.get(effect.name)
         steady = kind.steady(effect.values, model.T0, channels)
-        own = [
-            (k, IOP_NAMES.index(k)) for k in kind.linear if k in effect.values and k in IOP_NAMES
-        ]
-        if steady.knee is not None:
-            rate, by_rate, by_knee = np.zeros(10), np.zeros_like(J[0]), np.zeros_like(J[0])
-            for key, row in own:
-                rate[row] = float(effect.values[key])
-                if (name := f"{effect.name}.{key}") in names:
-                    by_rate[row, names.index(name)] = 1.0
-                if (name := f"{effect.name}.{steady.knee_name}") in names:
-                    by_knee[row, names.index(name)] = -rate[row]
-            knees.append((steady.knee, rate, by_rate, by_knee))
-        for power, factor in enumerate(steady.powers):
-            if not factor:
-                continue
-            for key, row in own:
-                add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
-    return SteadyCamera(model, names, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
+        for key in kind.linear:
+            if key in effect.values and key in IOP_NAMES:
+                row = IOP_NAMES.index(key)
+                yield f"{effect.name}.{key}", row, float(effect.values[key]), steady
+
+
+def steady_camera(
+    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float] | None, T: float
+) -> tuple[Array, Array, Array]:
+    """Return a model's steady camera at T °C: values (10,), slope (10,) per K, derivatives (10, p).
+
+    names: of the parameters whose derivatives are wanted; channels: °C of other thermometers.
+    """
+    dT, values, columns = T - model.T0, np.zeros(10), np.zeros((10, 1 + len(names)))
+    for name, row, value, steady in steady_parts(model, channels):
+        p0, p1, p2 = steady.powers
+        beyond = 0.0 if steady.knee is None else max(T - steady.knee, 0.0)
+        signal = p0 + dT * (p1 + dT * p2) + beyond
+        values[row] += value * signal
+        columns[row, 0] += value * (p1 + 2.0 * dT * p2 + (beyond > 0.0))
+        if name in names:
+            columns[row, 1 + names.index(name)] += signal
+        knee = f"{name.rpartition('.')[0]}.{steady.knee_name}"
+        if beyond > 0.0 and knee in names:
+            columns[row, 1 + names.index(knee)] -= value
+    carried = model.carried_derivatives(values, columns, ("slope", *names))
+    return model.carried(values), carried[:, 0], carried[:, 1:]
 
 
 def predict_orientations(
@@ -205,16 +176,17 @@ def predict_orientations(
             J[:, IOP_NAMES.index(key), i] = 1.0
         elif group == "rates":
             J[:, IOP_NAMES.index(key), i] = drive - model.T0
-        elif not catalogue.get(group).is_drive:
-            up, down = (moved_model(model, name, s).influence(group, history) for s in (1.0, -1.0))
-            J[:, :, i] = (up - down) / (2.0 * _step(model, name))
         else:
-            if driven is None:
-                up, down = (moved_model(model, name, s).drive(history) for s in (1.0, -1.0))
+            sides = {sign: moved_model(model, name, sign) for sign in (1.0, -1.0)}
+            if not catalogue.get(group).is_drive:
+                up, down = (side.influence(group, history) for side in sides.values())
             else:
-                up, down = driven[name, 1.0], driven[name, -1.0]
-            slope = (up - down) / (2.0 * _step(model, name))
-            J[:, :, i] = slope[:, None] * model.rate_vector
+                drives = [
+                    driven[name, sign] if driven else side.drive(history)
+                    for sign, side in sides.items()
+                ]
+                up, down = (moved[:, None] * model.rate_vector for moved in drives)
+            J[:, :, i] = (up - down) / (2.0 * _step(model, name))
     J = model.carried_derivatives(linear, J, names)
     if steady is not None:
         J -= steady
@@ -233,13 +205,6 @@ def moved_model(model: ThermalModel, name: str, sign: float) -> ThermalModel:
 
 def _step(model: ThermalModel, name: str) -> float:
     return _STEP * max(abs(model.value(name)), 1e-9)
-
-
-def widened(covariance: Array, variance: Array) -> Array:
-    """Return covariances (E, 10, 10) with the variances (E, 10) of a drift added."""
-    rows = np.arange(10)
-    covariance[:, rows, rows] += variance
-    return covariance
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -298,13 +263,3 @@ def require_known(log: Array, readings: Array, times: Array) -> None:
 def require_sd(temperature_sd: float) -> None:
     if not 0.0 <= temperature_sd < math.inf:
         raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be a number, at least 0")
-
-
-def noise_share(times: Array, at: Array) -> Array:
-    """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
-    if len(times) < 2:
-        return np.ones(len(at))
-    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    step = np.maximum(times[after] - times[after - 1], 1e-9)
-    share = np.clip((at - times[after - 1]) / step, 0.0, 1.0)
-    return share**2 + (1.0 - share) ** 2

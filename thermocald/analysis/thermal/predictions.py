@@ -223,10 +223,9 @@ def check_prediction(thermal: ThermalCamera, inputs: Sequence[SeriesInput]) -> P
         scaled = thermal.for_images(sensor.width, sensor.height, s.source.camera)
         error = predicted_error(scaled.model, s, sd)
         in_fit = (s.source.series, Path(s.source.name).resolve()) in known
-        if (limits := thermal.validity) is not None:
-            T = limits.worst(s.history.temperature())
-            if limits.beyond(T):
-                warnings.warn(f"{s.source.name}: {limits.place(T)}", stacklevel=3)
+        T = thermal.validity.worst(s.history.temperature())
+        if thermal.validity.beyond(T):
+            warnings.warn(f"{s.source.name}: {thermal.validity.place(T)}", stacklevel=3)
         found.append({**asdict(error), "in_fit": in_fit})
         bands = f"{error.coverage:.1%} inside their 95 % bands"
         if thermal.model.misses_an_effect:

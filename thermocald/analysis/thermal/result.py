@@ -16,13 +16,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.series.course import carried_by_c
-from thermocald.analysis.thermal.level import (
+from thermocald.analysis.thermal.prediction_test import (
     AFFINITY_SD,
     average_residuals,
     estimate_level,
+    image_partials,
     project_targets,
+    thermometer_noise,
 )
-from thermocald.analysis.thermal.prediction_test import image_partials, thermometer_noise
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -31,7 +32,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
 )
 from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inverse
-from thermocald.photogrammetry.series.normals import chunks
 from thermocald.physics import catalogue
 from thermocald.physics.formula import is_formula, known_together
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
@@ -44,7 +44,7 @@ from thermocald.thermal.series import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.thermal.level import Moved
+    from thermocald.analysis.thermal.prediction_test import Moved
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Unknowns
@@ -178,9 +178,7 @@ def _effect(
     values = {**e.values, **dict.fromkeys((n for n in kind.linear if n in e.values), 0.0)}
     for name, value in (own or {}).items():
         if kind.nonlinear[name].role == "event":  # anywhere between two frames: take the middle
-            times = fitter.series[k].times
-            before = max(int(np.searchsorted(times, float(value) - 1e-6)) - 1, 0)
-            value = float(0.5 * (float(value) + times[before]))
+            _, value, _ = fitter.series[k].locate(float(value))
         values[name] = value
     for key in dict.fromkeys((*values, *kind.nonlinear, *kind.linear)):
         name = f"{e.name}.{key}"
@@ -240,7 +238,7 @@ def _assess(
         variance += float(share.mean() * of_targets.mean())
     return SeriesFit(
         s.source.series or s.source.name,
-        s.source.epochs(s.n > 0),
+        int(s.source.per_row[s.n > 0].sum()),
         _rms(s, model),
         reading_sd * averaged,
         None if s.source.counts is None else int((s.n > 0).sum()),
@@ -288,7 +286,6 @@ def build_camera(
         e = next(e for e in listed if catalogue.get(e.name).seen_in == "targets")
         names += [f"{e.name}.{key}" for key in catalogue.get(e.name).linear]
         covariance = block_diag(covariance, moved[0].covariance)
-    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
     sigma = _image_sigma(series, growth)
     stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
     fits = tuple(
@@ -309,13 +306,12 @@ def build_camera(
     channels = dict.fromkeys(
         c for s in series for c, read in s.source.readings.items() if np.isfinite(read).any()
     )
+    values = np.array([first.value(n) for n in names])
+    certain = with_covariance(first, tuple(names), values, covariance)
     model = replace(
-        first,
-        effects=tuple(_with_sds(e, sd, series[0]) for e in first.effects),
+        certain,
+        effects=tuple(_with_event_sd(e, series[0]) for e in certain.effects),
         image_sigma=sigma,
-        sds={n: s for n, s in sd.items() if n.split(".")[0] in ("interior", "rates")},
-        covariance_names=tuple(names),
-        covariance=tuple(tuple(row) for row in covariance.tolist()),
         validity={c: _span(series, c) for c in channels},
         fitted_on=tuple(
             {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
@@ -342,8 +338,8 @@ def build_camera(
         poorly += [name for name in rated if name not in poorly]
     if poorly:
         fitted["read_poorly"] = {"effects": poorly}
-    share = sd["interior.c"] / model.interior.c
-    rates = {p: (r, sd[f"rates.{p}"]) for p, r in model.rates.items() if r}
+    share = model.sd("interior.c") / model.interior.c
+    rates = {p: (r, model.sd(f"rates.{p}")) for p, r in model.rates.items() if r}
     if carried := carried_by_c(share, rates):
         fitted["rates_hang_on_c"] = {"c_known_to": share, "sds": carried}
     return ThermalCamera(model, {**fitted, "prediction_test": []})
@@ -403,28 +399,39 @@ def _rms(series: ReducedSeries, model: ThermalModel) -> float:
     """Return the RMS px of measured minus predicted image points, less a constant per target."""
     prediction = model.predict(series.readings_history, series.source.field)
     mean, _, moved = average_residuals(series, prediction)
-    points, weights = series.source.grid.points, series.weights[..., :2]
-    total, count = 0.0, 0
-    for part in chunks(*points.shape[:2]):
-        left = points[part] - project_targets(series, prediction, part) - mean
-        use = (weights[part] > 0) & ~moved[:, None]
-        total += float(np.sum(np.where(use, left, 0.0) ** 2))
-        count += int(use.sum())
-    return float(np.sqrt(total / max(count, 1)))
+    left = series.source.grid.points - project_targets(series, prediction) - mean
+    use = (series.weights[..., :2] > 0) & ~moved[:, None]
+    return float(np.sqrt(np.sum(left[use] ** 2) / max(use.sum(), 1)))
 
 
-def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) -> ModelEffect:
+def _with_event_sd(effect: ModelEffect, series: ReducedSeries) -> ModelEffect:
+    """Return an effect with the sd of its event, a time between two frames: it is uniform."""
+    sd = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
     kind = catalogue.get(effect.name)
-    if kind.seen_in == "noise":
-        return effect
-    found: dict[str, Any] = {
-        k: sd[f"{effect.name}.{k}"] for k in effect.values if f"{effect.name}.{k}" in sd
-    }
-    for key, parameter in kind.nonlinear.items():
-        if parameter.role == "event":
-            # a time between two frames: uniform over the interval
-            found[key] = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
-    return ModelEffect(effect.name, effect.values, found)
+    events = [key for key, parameter in kind.nonlinear.items() if parameter.role == "event"]
+    return replace(effect, sds={**effect.sds, **dict.fromkeys(events, sd)})
+
+
+def with_covariance(
+    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array
+) -> ThermalModel:
+    """Return the model with other values and another covariance of some numbers.
+
+    names: as in `ThermalModel.parameter_names`.
+    """
+    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    moved = model.with_values(dict(zip(names, values.tolist(), strict=True)))
+    effects = tuple(
+        replace(e, sds={**e.sds, **{k: sd[f] for k in e.values if (f := f"{e.name}.{k}") in sd}})
+        for e in moved.effects
+    )
+    return replace(
+        moved,
+        effects=effects,
+        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
+        covariance_names=names,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+    )
 
 
 def _list_unknowns(fit: Fit, scale: Array) -> Unknowns:

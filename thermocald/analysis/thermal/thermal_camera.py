@@ -27,18 +27,16 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
-from thermocald.analysis.thermal.certificate import render_certificate
-from thermocald.analysis.thermal.model_text import model_lines
+from thermocald.analysis.thermal.certificate import model_lines, render_certificate
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
     moved_model,
-    noise_share,
     predict_orientations,
     require_known,
     require_sd,
     steady_camera,
-    widened,
+    steady_parts,
 )
 from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
@@ -49,13 +47,13 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
+from thermocald.physics.operators import interpolation_matrix
 from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.analysis.thermal.modelled_camera import SteadyCamera
     from thermocald.arrays import Array
     from thermocald.physics.model import ThermalModel
 
@@ -132,7 +130,7 @@ class ThermalCamera(Result):
 
         def at(t: float) -> tuple[Array, Array, Array]:
             alike = dict.fromkeys(self.channels, t)
-            return steady_camera(self.model, self.parameters, alike).at(t)
+            return steady_camera(self.model, self.parameters, alike, t)
 
         base, _, J0 = at(self.model.T0)
         values, _, J = zip(*map(at, T.tolist()), strict=True)
@@ -243,14 +241,9 @@ class ThermalCamera(Result):
         return covariance
 
     @cached_property
-    def validity(self) -> Validity | None:
-        """The temperatures that the model was fitted on; None if it does not state them."""
-        limits = next(iter(self.model.validity.values()), None)
-        return None if limits is None else Validity(*limits)
-
-    @cached_property
-    def _steady(self) -> SteadyCamera:
-        return steady_camera(self.model, self.parameters, None)
+    def validity(self) -> Validity:
+        """The temperatures that the model was fitted on, without limits if it states none."""
+        return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -275,19 +268,15 @@ class ThermalCamera(Result):
         if math.isnan(T):
             raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
-        if channels is None:
-            values, slope, J = self._steady.at(T)
-        else:
+        if channels is not None:
             self._require_channels(channels)
-            values, slope, J = steady_camera(self.model, self.parameters, channels).at(T)
+        values, slope, J = steady_camera(self.model, self.parameters, channels, T)
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        beyond = 0.0
-        if others or (self.validity is not None and self.validity.beyond(T)):
-            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
-            covariance += np.diag(drift)
+        (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+        covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
 
     def along(
@@ -342,24 +331,29 @@ class ThermalCamera(Result):
             history.temperature(), others, self.model.rate_vector, extrapolate
         )
         values, covariance = [], []
-        steady = None if relative_to is None else self._steady.at(relative_to)[2]
+        steady = None
+        if relative_to is not None:
+            steady = steady_camera(self.model, self.parameters, None, relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
             noise = None
             if temperature_sd:
-                noise = temperature_sd**2 * noise_share(t - begin, part.times)
+                shares = interpolation_matrix(t - begin, part.times).power(2).sum(axis=1)
+                noise = temperature_sd**2 * shares
             drive = self.model.drive(part)
             found = predict_orientations(
                 self.model, self.parameters, self.covariance, part, drive, noise, steady
             )
             values.append(found[0])
             covariance.append(found[1])
+        Q = np.concatenate(covariance)
+        Q[:, range(10), range(10)] += drift
         return Along(
             self.model.sensor,
             instants,
             history.temperature(),
             np.concatenate(values),
-            widened(np.concatenate(covariance), drift),
+            Q,
             outside,
             self.model.camera,
         )
@@ -371,9 +365,7 @@ class ThermalCamera(Result):
 
         T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
         """
-        outside = np.zeros(T.shape)
-        if self.validity is not None:
-            outside = self.validity.check(T, extrapolate)
+        outside = self.validity.check(T, extrapolate)
         variance = (rates * outside[:, None]) ** 2
         drift: Array | float = 0.0
         for effect in self.model.effects:
@@ -396,15 +388,22 @@ class ThermalCamera(Result):
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
-    def steady_tables(self) -> tuple[tuple[Array, Array, Array], list[tuple[float, ...]]]:
+    def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
 
-        Three arrays (10,); of each knee the temperature °C and the ten parameters' change per
-        kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
+        Polynomials (3, 10); of each knee (11,) the temperature °C and the ten parameters' change
+        per kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        return self._steady.p, [(T, *rate.tolist()) for T, rate, _, _ in self._steady.knees]
+        powers = np.zeros((3, 10))
+        knees: dict[str, Array] = {}
+        for name, row, value, steady in steady_parts(self.model):
+            powers[:, row] += value * np.array(steady.powers)
+            if steady.knee is not None:
+                knee = np.array([steady.knee, *np.zeros(10)])
+                knees.setdefault(name.rpartition(".")[0], knee)[1 + row] += value
+        return powers, list(knees.values())
 
 
 def load_camera(path: Path | str) -> ThermalCamera:
@@ -499,8 +498,8 @@ class LiveCamera:
         values, covariance = predict_orientations(
             model, thermal.parameters, thermal.covariance, history, drive, driven=driven
         )
-        C = widened(covariance, drift)[0]
-        self._now = Camera(model.sensor, row[0], values[0], C, float(beyond), model.camera)
+        Q = covariance[0] + np.diag(drift[0])
+        self._now = Camera(model.sensor, row[0], values[0], Q, float(beyond), model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:

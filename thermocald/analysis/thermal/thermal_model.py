@@ -17,21 +17,19 @@ a user who did not calibrate, and is the prior for a camera measured at few temp
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.level import estimate_step, event_threshold
-from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
-from thermocald.analysis.thermal.result import build_camera
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step, predicted_error
+from thermocald.analysis.thermal.result import build_camera, with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
-from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
+from thermocald.thermal.hypothesis import targets_of
 from thermocald.thermal.movement import add_jumps_to_noise
 from thermocald.thermal.noise import (
     calibrate_thermometers,
@@ -40,15 +38,13 @@ from thermocald.thermal.noise import (
     weight_slow_noise,
 )
 from thermocald.thermal.reduce import reweight, without_targets
-from thermocald.thermal.scan import Scanner, remove_curvature
+from thermocald.thermal.scan import make_term, remove_curvature, without_chance_events
 from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.arrays import Array
     from thermocald.physics.model import Distortion, ModelEffect, ThermalModel
-    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -86,22 +82,10 @@ def fit_thermal_model(
     if any(catalogue.get(e.name).seen_in == "noise" for e in listed):
         growth = estimate_noise_slope(others)
         others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
-    fitter, fit = _fit_hypothesis(others, listed, search, frozenset(fixed), dict(priors or {}))
-    moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
-    return build_camera(fitter, fit, others, listed, growth, moved, sure)
-
-
-def _fit_hypothesis(
-    series: Sequence[ReducedSeries],
-    listed: Sequence[ModelEffect],
-    search: bool,
-    held: frozenset[str],
-    priors: dict[str, tuple[float, float]],
-) -> tuple[HypothesisFitter, Fit]:
-    """Fit the hypothesis of all effects that act on trajectories."""
-    ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(series)]
+    # the hypothesis of all effects that act on trajectories
+    ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(others)]
     fitter = HypothesisFitter(ready)
-    fitter.held, fitter.priors = held, priors
+    fitter.held, fitter.priors = frozenset(fixed), dict(priors or {})
     fit = fitter.fit(())
     for effect in listed:
         if catalogue.get(effect.name).seen_in == "trajectory":
@@ -112,7 +96,8 @@ def _fit_hypothesis(
         fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
     for again in (sharpen_trajectories, sharpen_trajectories, remove_curvature, add_jumps_to_noise):
         fit = fitter.refine_in(again(fitter, fit), fit)
-    return fitter, fit
+    moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
+    return build_camera(fitter, fit, others, listed, growth, moved, sure)
 
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:
@@ -152,54 +137,6 @@ def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> No
             raise DataError(
                 f"{e.name}: none of the targets {', '.join(moved) or '(none)'} is in the test field"
             )
-
-
-def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
-    """Return an effect as a term to add to a fitted hypothesis.
-
-    search: search its non-linear parameters over their whole range, except those in `fitter.held`;
-    the time of an event is always searched, in each series.
-    """
-    kind = catalogue.get(effect.name)
-    given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
-    names = BASE if kind.is_drive else given
-    text = {k: effect.values[k] for k, p in kind.nonlinear.items() if p.text and k in effect.values}
-    numbers = {
-        k: float(effect.values[k])
-        for k, p in kind.nonlinear.items()
-        if k in effect.values and not p.text and k not in kind.fresh
-    }
-    held = {k: v for k, v in numbers.items() if f"{effect.name}.{k}" in fitter.held}
-    candidate = make_candidate(kind, names, fitter.series, (*text.items(), *held.items()))
-    if kind.is_event:
-        found = Scanner(fitter).scan(candidate, fit)
-        fresh: list[tuple[tuple[str, Any], ...] | None] = []
-        for s, gains in enumerate(found.events):
-            best = int(np.argmax(gains))
-            least = event_threshold(fitter.series[s], found.coefficients)
-            time = float(fitter.series[s].times[best + 1])
-            fresh.append(((candidate.name, time),) if gains[best] > least else None)
-        return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
-    if search and candidate.name:
-        found = Scanner(fitter).scan(candidate, fit)
-        return candidate.term(float(candidate.grid[found.best]), len(fitter.series))
-    return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
-
-
-def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
-    """Return a fit's terms without events that explain no more than chance beside the others."""
-    terms = list(fit.terms)
-    for block in fit.blocks:
-        if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:
-            continue
-        place = slice(block.start, block.stop)
-        heights, cofactor = fit.coefficients[place], fit.covariance[place, place]
-        gain = float(heights @ np.linalg.solve(cofactor, heights))
-        if gain <= event_threshold(fitter.series[block.series], len(heights)):
-            fresh = list(terms[block.term].fresh)
-            fresh[block.series] = None
-            terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))
-    return tuple(terms)
 
 
 def fit_camera(
@@ -365,30 +302,6 @@ def shrink_to_type(
         wider[i] = (value - low) / (NORMAL_95 * sd[i])
     shrunk = with_covariance(model, names, new.values, new.covariance * np.outer(wider, wider))
     return replace(shrunk, evidence={**model.evidence, "shrunk_to_type": str(kind.camera)})
-
-
-def with_covariance(
-    model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array
-) -> ThermalModel:
-    """Return the model with other values and another covariance of some numbers and its interior.
-
-    names: as in `ThermalModel.parameter_names`, the interior orientation's among them.
-    """
-    found = dict(zip(names, values.tolist(), strict=True))
-    sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
-    moved = model.with_values({n: v for n, v in found.items() if not n.startswith("interior.")})
-    effects = tuple(
-        replace(e, sds={**e.sds, **{k: sd[f] for k in e.values if (f := f"{e.name}.{k}") in sd}})
-        for e in moved.effects
-    )
-    return replace(
-        moved,
-        interior=InteriorOrientation(**{p: found[f"interior.{p}"] for p in IOP_NAMES}),
-        effects=effects,
-        sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
-        covariance_names=names,
-        covariance=tuple(tuple(row) for row in covariance.tolist()),
-    )
 
 
 def _names(model: ThermalModel) -> tuple[str, ...]:

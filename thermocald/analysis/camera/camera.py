@@ -262,7 +262,7 @@ def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Arra
     return found
 
 
-def _draw(sensor: Sensor, points: Array, vectors: Array, title: str) -> Figure:
+def _draw(sensor: Sensor, points: Array, vectors: Array, title: str = "") -> Figure:
     """Draw vectors (n, 2) px at image points (n, 2) px, enlarged."""
     from thermocald.figures import Arrows, draw_arrows
 
@@ -406,7 +406,7 @@ class CameraDifference(Result):
     def plot(self) -> Figure:
         """Draw the shifts over the image, enlarged."""
         every = np.arange(_GRID**2).reshape(_GRID, _GRID)[::2, ::2].ravel()
-        return _draw(self.first.sensor, self._grid[every], self.shifts[every], self.lines()[0])
+        return _draw(self.first.sensor, self._grid[every], self.shifts[every])
 
     @cached_property
     def _grid(self) -> Array:

@@ -28,6 +28,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.fft import dct
+from scipy.special import chdtri
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import (
@@ -52,8 +54,12 @@ _UPDATES = 150
 _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six directions
 _SLOW_COST = 2.0  # further log-likelihood that a memory must gain
 _NEGLIGIBLE = 0.02  # of the noise's variance
-_LEAK_DEGREE = 6
-_LEAST_PER_DEGREE = 20  # fast frequencies; with fewer much of the mount's movement would be lost
+_DEGREE = 6
+_LEAST_FAST = 120  # frequencies of a drift's removal; with fewer too much movement would be lost
+_MOST_BENDS = 4
+_MOST_BENDS_TRIED = 400
+_LEAST_BEND = 8  # epochs from either end
+_BY_CHANCE = 1e-3  # probability of a bend too many, which costs three of the frequencies
 _END = 15  # epochs at each end that give the slope there
 
 
@@ -66,9 +72,11 @@ def components(trajectory: Array, period: float, held: bool = False) -> tuple[Ar
     Returns the variances (k,) of the white part and of the part with memory, about its mean, and
     the memory in epochs, 0 without one. A component without support by the likelihood is 0.
     """
-    levelled = _remove_leak(_level_ends(trajectory), period) if period else trajectory
-    power = _cosines(levelled) ** 2
     n = len(trajectory)
+    coefficients = _cosines(_level_ends(trajectory) if period else trajectory)
+    if period and n - 1 - (low := int(2 * n / period)) >= _LEAST_FAST:
+        coefficients = _remove_drift(coefficients, low)
+    power = coefficients**2
     omega = np.pi * np.arange(1, n) / n
     one = np.ones_like(omega)
     drift = _drift(omega, period)
@@ -139,29 +147,52 @@ def _level_ends(trajectory: Array) -> Array:
     return level
 
 
-def _remove_leak(trajectory: Array, period: float) -> Array:
-    """Subtract from a trajectory (E, k) the polynomial that explains most of its fast part.
+def _remove_drift(coefficients: Array, low: int) -> Array:
+    """Remove a drift from the cosine coefficients (E - 1, k) of frequencies from `low` on.
 
-    A strong drift that is not level at its ends has high frequencies, as a polynomial has; with
-    noise of a millipixel they would look like movements of the mount.
+    A strong drift that is not level at its ends, or bends where a heater is switched, has high
+    frequencies too; with noise of a millipixel they would look like movements of the mount. The
+    drift is a polynomial with bends, as many as the likelihood of a smooth spectrum supports.
     """
-    n = len(trajectory)
-    low = int(2 * n / period)
-    if n - 1 - low < _LEAST_PER_DEGREE * _LEAK_DEGREE:
-        return trajectory
-    u = np.linspace(-1.0, 1.0, n)
-    basis = np.stack([u**k for k in range(1, _LEAK_DEGREE + 1)], axis=1)
-    fast, _, _, _ = np.linalg.lstsq(_cosines(basis)[low:], _cosines(trajectory)[low:], rcond=None)
-    return trajectory - basis @ fast
+    fast, n = coefficients[low:], len(coefficients) + 1
+    u = np.linspace(-1.0, 1.0, n)[:, None]
+    basis = _cosines(u ** np.arange(1, _DEGREE + 1))[low:]
+    basis = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
+    fast = fast - basis @ (basis.T @ fast)
+    rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
+    after = np.clip(u - u[rows, 0], 0.0, None)
+    bends = np.stack([_cosines(after**k)[low:].T for k in (1, 2, 3)], axis=-1)  # (bends, m, 3)
+    gain_needed = 0.5 * chdtri(3 * fast.shape[1], _BY_CHANCE / len(rows))
+    for _ in range(_MOST_BENDS):
+        inside = bends - basis @ (basis.T @ bends)
+        inside = np.linalg.qr(inside / np.linalg.norm(inside, axis=1, keepdims=True))[0]
+        left = fast - inside @ (np.swapaxes(inside, 1, 2) @ fast)
+        likelihood = _likelihood(left, low)
+        best = int(np.argmax(likelihood))
+        if likelihood[best] - _likelihood(fast, low) < gain_needed:
+            break
+        fast, basis = left[best], np.column_stack([basis, inside[best]])
+    return np.concatenate([coefficients[:low], fast])
+
+
+def _likelihood(coefficients: Array, low: int) -> Array:
+    """Return the log-likelihood (...) of coefficients (..., m, k) of frequencies from `low` on.
+
+    Their spectrum is the power averaged over an octave, at least the noise's 1.
+    """
+    power = np.pad(coefficients**2, [(0, 0)] * (coefficients.ndim - 2) + [(1, 0), (0, 0)])
+    sums, m = np.cumsum(power, axis=-2), coefficients.shape[-2]
+    at = np.arange(m) + low + 1
+    last = np.clip((at * np.sqrt(2.0)).astype(int) - low, 8, m)
+    first = np.clip((at / np.sqrt(2.0)).astype(int) - low - 1, 0, last - 8)
+    mean = (sums[..., last, :] - sums[..., first, :]) / (last - first)[:, None]
+    likelihood: Array = -0.5 * np.log(np.maximum(mean, 1.0)).sum(axis=(-1, -2))
+    return likelihood
 
 
 def _cosines(trajectory: Array) -> Array:
     """Return the coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
-    n = len(trajectory)
-    even = np.concatenate([trajectory, trajectory[::-1]])
-    spectrum = np.fft.rfft(even, axis=0)[1:n]
-    turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
-    coefficients: Array = (spectrum * turn).real / np.sqrt(2 * n)
+    coefficients: Array = dct(trajectory, axis=0, norm="ortho")[1:]
     return coefficients
 
 

@@ -207,6 +207,13 @@ def is_convincing(base: Solution, best: Solution) -> bool:
     return min(outside) > -least and sum(outside) > least
 
 
+def make_own_rates(series: int, count: int) -> Term:
+    """Make the term of rates that one of `count` series has for itself."""
+    along_T = catalogue.find(lambda k: isinstance(k, Proportional) and k.power == 1).name
+    fresh = tuple(() if k == series else None for k in range(count))
+    return Term(along_T, BASE, fresh=fresh, through_drive=True)
+
+
 def contradict(best: Solution) -> bool:
     """Test whether a further series needs rates of its own, however much the mount moves.
 
@@ -214,11 +221,8 @@ def contradict(best: Solution) -> bool:
     """
     count = len(best.fitter.series)
     shared = _profile(best, best).fit.objective
-    along_T = catalogue.find(lambda k: isinstance(k, Proportional) and k.power == 1).name
     for s in range(1, count):
-        fresh = tuple(() if k == s else None for k in range(count))
-        own = Term(along_T, BASE, fresh=fresh, through_drive=True)
-        fit = best.fitter.fit((*best.terms, own))
+        fit = best.fitter.fit((*best.terms, make_own_rates(s, count)))
         trial = _profile(best, replace(best, fit=fit))
         if shared - trial.fit.objective > criteria.MOUNT_FURTHER:
             return True

@@ -31,7 +31,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES, partials, project
 from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
-from thermocald.photogrammetry.linalg import scaled_inverse
+from thermocald.photogrammetry.linalg import chi2_quantile, scaled_inverse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -190,18 +190,6 @@ class Innovation:
     bound: float
     dof: int
     change: Change
-
-
-def chi2_quantile(p: float, dof: int) -> float:
-    """Return the chi-square quantile at probability p, to 4 % for dof ≥ 6.
-
-    By Wilson and Hilferty (1931), as scipy.stats would cost the daemon 22 MB.
-    """
-    from statistics import NormalDist
-
-    z = NormalDist().inv_cdf(p)
-    h = 2.0 / (9.0 * dof)
-    return float(dof * (1.0 - h + z * np.sqrt(h)) ** 3)
 
 
 class OnlineFilter:

@@ -28,11 +28,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.fft import dct
-from scipy.special import chdtri
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
 from thermocald.photogrammetry.linalg import (
+    chi2_quantile,
     mad_sd,
     stacked_inverses,
     symmetric_power,
@@ -162,14 +161,14 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
     rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
     after = np.clip(u - u[rows, 0], 0.0, None)
     bends = np.stack([_cosines(after**k)[low:].T for k in (1, 2, 3)], axis=-1)  # (bends, m, 3)
-    gain_needed = 0.5 * chdtri(3 * fast.shape[1], _BY_CHANCE / len(rows))
+    needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
     for _ in range(_MOST_BENDS):
         inside = bends - basis @ (basis.T @ bends)
         inside = np.linalg.qr(inside / np.linalg.norm(inside, axis=1, keepdims=True))[0]
         left = fast - inside @ (np.swapaxes(inside, 1, 2) @ fast)
         likelihood = _likelihood(left, low)
         best = int(np.argmax(likelihood))
-        if likelihood[best] - _likelihood(fast, low) < gain_needed:
+        if likelihood[best] - _likelihood(fast, low) < needed:
             break
         fast, basis = left[best], np.column_stack([basis, inside[best]])
     return np.concatenate([coefficients[:low], fast])
@@ -192,7 +191,11 @@ def _likelihood(coefficients: Array, low: int) -> Array:
 
 def _cosines(trajectory: Array) -> Array:
     """Return the coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
-    coefficients: Array = dct(trajectory, axis=0, norm="ortho")[1:]
+    n = len(trajectory)
+    even = np.concatenate([trajectory, trajectory[::-1]])
+    spectrum = np.fft.rfft(even, axis=0)[1:n]
+    turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
+    coefficients: Array = (spectrum * turn).real / np.sqrt(2 * n)
     return coefficients
 
 

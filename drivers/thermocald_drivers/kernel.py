@@ -380,7 +380,8 @@ def is_limit(name: str) -> bool:
 
 def raw_zones(text: str) -> dict[str, float]:
     """Parse lines "type number" to {zone: number}; omit a name that has several numbers."""
-    lines = re.findall(r"^[ \t]*(\S.*?)[ \t]+(-?[0-9]{1,9})[ \t\r]*$", text, re.MULTILINE)
+    text = text.replace("\r", "")
+    lines = re.findall(r"^[ \t]*(\S.*?)[ \t]+(-?[0-9]{1,9})[ \t]*$", text, re.MULTILINE)
     return unambiguous((name, int(number)) for name, number in lines)
 
 

@@ -20,7 +20,7 @@ LONGEST = (
     "golden/test_golden", "daemon/test_endurance", "daemon/test_changes", "blind/test_score",
     "main_paths/test_live", "docs/test_commands", "test_properties", "cli/test_first_hour",
     "discovery/test_movement", "discovery/test_years", "cli/test_discover",
-    "daemon/test_page_attacks", "daemon/test_faults", "daemon/test_rhythm", "fleet/test_dask",
+    "daemon/test_page_attacks", "daemon/test_faults", "fleet/test_dask",
     "output/test_pages", "store/test_bounds", "photogrammetry/test_ring_code", "docs/test_site",
     "daemon/test_chaos", "analysis/test_type_model", "analysis/test_type_fit",
     "discovery/test_grammar", "analysis/test_river", "analysis/test_running_series",

@@ -380,8 +380,12 @@ def is_limit(name: str) -> bool:
 
 def raw_zones(text: str) -> dict[str, float]:
     """Parse lines "type number" to {zone: number}; omit a name that has several numbers."""
-    lines = re.findall(r"^[ \t]*(\S.*?)[ \t]+(-?[0-9]{1,9})[ \t\r]*$", text, re.MULTILINE)
-    return unambiguous((name, int(number)) for name, number in lines)
+    lines = (line.strip().rpartition(" ") for line in text.replace("\r", "").split("\n"))
+    return unambiguous(
+        (name.strip(), int(number))
+        for name, _, number in lines
+        if name.strip() and re.fullmatch(r"-?[0-9]{1,9}", number)
+    )
 
 
 def unambiguous(pairs: Iterable[tuple[str, float]]) -> dict[str, float]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
-from thermocald.acquisition.device_loop import Link, Schedule
+from thermocald.acquisition.device_loop import Link, OutputLoop, Schedule
 from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound, WrongDevice
-from thermocald.hal import VirtualClock, open_device
+from thermocald.hal import SystemClock, VirtualClock, open_device
 
 
 def test_a_day_of_ticks_has_no_drift():
@@ -174,3 +176,29 @@ def test_a_device_that_comes_and_goes_all_day_is_not_reported_each_time(clock, l
     assert "10 times within an hour" in caplog.text
     poll(clock, link, device, 3000, 10.0)  # calm, then out for good
     assert events[19:] == ["device_out", "device_back"]
+
+
+@pytest.mark.parametrize("back", [True, False])
+def test_the_last_400_results_wait_for_an_output_that_is_away(back):
+    """What is still waiting when the daemon stops is lost, and does not delay it."""
+    away, got = [True], []
+
+    def emit(result):
+        if away:
+            raise DeviceGone("away")
+        got.append(result["epoch"])
+
+    output = SimpleNamespace(open=lambda: None, close=lambda: None, emit=emit)
+    loop = OutputLoop("log", output, SystemClock(), lambda *_: None)
+    loop.start()
+    for epoch in range(1000):
+        loop.put({"epoch": epoch})
+    end = time.monotonic() + 20.0
+    if back:
+        away.clear()
+        while 999 not in got and time.monotonic() < end:
+            time.sleep(0.02)
+    assert loop.stop(5.0)
+    assert got[-400:] == (list(range(600, 1000)) if back else [])
+    assert len(got) == loop.emitted <= 401  # one is being sent
+    assert loop.emitted + loop.lost == 1000

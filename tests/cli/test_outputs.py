@@ -6,6 +6,7 @@ Every command with an option that names an output is listed here: a missing one 
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import shutil
 import socket
@@ -249,7 +250,8 @@ def test_a_place_that_cannot_be_written_is_one_sentence(world, refusing, tmp_pat
     assert world.files() == before
 
 
-ENDINGS = [OSError(28, "No space left"), KeyboardInterrupt(), SystemExit()]
+FULL = [OSError(number, os.strerror(number)) for number in (errno.ENOSPC, errno.EDQUOT)]
+ENDINGS = [*FULL, KeyboardInterrupt(), SystemExit()]
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 
 import pytest
@@ -150,11 +151,16 @@ def test_a_letter_by_starttls(start, tmp_path):
 
 def test_mqtt_retains_what_is_out(start):
     broker = start(Broker)
-    options = {"host": "127.0.0.1", "port": broker.port, "when": WHEN, "timeout_s": 2}
+    channels = ["a/b", "lens #2", "#", "+"]  # none may become a level or a wildcard of a topic
+    when = [*WHEN, *({"temperature": name, "above_c": 60} for name in channels)]
+    options = {"host": "127.0.0.1", "port": broker.port, "when": when, "timeout_s": 2}
     with open_device("output", "alert_mqtt", options, SystemClock()) as device:
-        device.emit(OUT)
+        device.emit(OUT | dict.fromkeys(channels, 61.0))
     broker.close()
-    configuration, state = broker.messages
+    topics = [message[0] for message in broker.messages if "/alert/" in message[0]]
+    assert len(set(topics)) == 5
+    assert all(re.fullmatch(r"thermocald/cam/alert/[\w-]+", topic) for topic in topics)
+    configuration, state = broker.messages[:2]
     assert configuration[0].startswith("homeassistant/binary_sensor/")
     assert state[0] == "thermocald/cam/alert/drift_c_px"
     assert json.loads(configuration[1])["state_topic"] == state[0]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import time
 
 import pytest
+from thermocald_drivers import kernel
 
 from tests.drivers.test_device_outputs import phone_reads
 from thermocald.errors import BadReading
@@ -150,3 +152,10 @@ def test_the_unit_of_a_zone(server, text, celsius):
     name = text.split()[0]
     found = read(server, "zone", [name], zones=text + "\n").get(name)
     assert found == (celsius and pytest.approx(celsius))
+
+
+def test_a_line_of_blanks_takes_no_time():
+    begin = time.monotonic()
+    text = "x" + " " * 20_000 + "\r\n\rgpu 36000\r\r\n"
+    assert kernel.raw_zones(text) == {"gpu": 36000}
+    assert time.monotonic() - begin < 1.0

@@ -61,7 +61,8 @@ def test_half_a_line_of_a_killed_process_costs_no_further_line(tmp_path, end, le
     assert path.read_bytes() == left + b'{"epoch": 1}\n'
 
 
-def test_a_full_disk_leaves_no_half_line(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_leaves_no_half_line(tmp_path, monkeypatch, number):
     path = tmp_path / "results.jsonl"
     with output(path) as device:
         device.emit(RESULT)
@@ -69,7 +70,7 @@ def test_a_full_disk_leaves_no_half_line(tmp_path, monkeypatch):
 
         def full(file, data):
             if not left[0]:
-                raise OSError(errno.ENOSPC, "No space left on device")
+                raise OSError(number, os.strerror(number))
             count = write(file, data[: left[0]])
             left[0] -= count
             return count

@@ -16,7 +16,7 @@ from thermocald_drivers.v4l2 import V4l2Camera
 
 from tests.drivers.fakes.v4l2_kernel import FakeCamera, encode
 from thermocald import errors
-from thermocald.hal import SystemClock, open_device
+from thermocald.hal import SystemClock, VirtualClock, open_device
 
 
 @pytest.fixture
@@ -62,6 +62,14 @@ def test_the_time_is_the_middle_of_the_exposure(kernel, flags, shift):
     with camera(kernel, exposure_s=0.1) as device:
         frame = device.capture()
     assert frame.monotonic == pytest.approx(stamps[-1] + shift, abs=2e-4)
+
+
+def test_times_are_on_the_daemons_clock(kernel):
+    clock = VirtualClock(utc=1_700_000_000.0, monotonic=500.0)
+    with camera(kernel, clock) as device:
+        frame = device.capture()
+    assert frame.monotonic == pytest.approx(500.0, abs=0.05)
+    assert frame.utc == pytest.approx(1_700_000_000.0, abs=0.05)
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
+import thermocald as tc
 from tests.commands import answer, succeed
 from thermocald.fleet.forward import Forwarder
 from thermocald.physics.presets import preset_simulation
@@ -42,6 +44,23 @@ def test_a_server_gives_what_the_file_gives(places):
     assert len(set(sources)) == 2
     assert "secret" not in str(sources)
     assert here == there
+
+
+@pytest.mark.slow
+def test_discover_and_correct_read_a_server_too(places, tmp_path):
+    # discovery depends only on these
+    here, there = (tc.open(place).observed() for place in places)
+    assert "secret" not in there.name
+    assert np.array_equal(here.frame_times, there.frame_times)
+    assert np.array_equal(here.grid.points, there.grid.points, equal_nan=True)
+    assert np.array_equal(here.grid.weights, there.grid.weights)
+    assert here.readings.keys() == there.readings.keys()
+    file, server = places
+    run("fit", file, "-o", tmp_path / "m.yaml")
+    rows = "".join(f"{t!r},1000,{100 + i}\n" for i, t in enumerate(here.frame_times[5:40].tolist()))
+    (tmp_path / "points.csv").write_text(f"time,x,y\n{rows}")
+    command = ("correct", tmp_path / "points.csv", "--model", tmp_path / "m.yaml", "--log")
+    assert run(*command, file) == run(*command, server)
 
 
 def test_several_series_at_an_address_are_said(server, tmp_path):

@@ -115,7 +115,9 @@ def test_a_full_disk_of_the_server_is_said_and_made_up_for(small_disk, filled):
 
 @pytest.fixture
 def certificates(tmp_path):
-    """An authority, and certificates of a server and of the station `pi`, also expired ones."""
+    """An authority, and certificates of a server and of the station `pi`, also expired ones;
+    and one of `pi` that no authority signed.
+    """
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed")
 
@@ -123,7 +125,10 @@ def certificates(tmp_path):
         subprocess.run(["openssl", *arguments], cwd=tmp_path, check=True, capture_output=True)
 
     made = ("req", "-newkey", "rsa:2048", "-nodes")
-    openssl(*made, "-x509", "-subj", "/CN=ca", "-keyout", "ca.key", "-out", "ca.crt")
+    for name, common in (("ca", "ca"), ("foreign", "pi")):
+        openssl(*made, "-x509", "-subj", f"/CN={common}", "-keyout", f"{name}.key",
+                "-out", f"{name}.crt")  # fmt: skip
+    (tmp_path / "foreign.key").chmod(0o600)
     for name, common, days in (("server", "localhost", "2"), ("stale", "localhost", "-1"),
                                ("pi", "pi", "2"), ("late", "pi", "-1")):  # fmt: skip
         openssl(*made, "-subj", f"/CN={common}", "-keyout", f"{name}.key", "-out", f"{name}.csr")
@@ -135,7 +140,7 @@ def certificates(tmp_path):
 
 @pytest.mark.slow
 def test_certificates(certificates, filled):
-    """A client certificate suffices; an expired one, of either side, is reported."""
+    """A client certificate suffices; an expired or foreign one, of either side, is reported."""
     store, _ = filled
 
     def use(server, of: str) -> None:
@@ -153,9 +158,9 @@ def test_certificates(certificates, filled):
         )
         server.options = "-c ssl=on -c ssl_ca_file=ca.crt"
 
-    def send(certificate="pi") -> int:
+    def send(certificate="pi", root="ca") -> int:
         query = (
-            f"?sslmode=verify-full&sslrootcert={certificates}/ca.crt&hostaddr=127.0.0.1"
+            f"?sslmode=verify-full&sslrootcert={certificates}/{root}.crt&hostaddr=127.0.0.1"
             f"&sslcert={certificates}/{certificate}.crt&sslkey={certificates}/{certificate}.key"
         )
         place = f"postgresql://pi@localhost:{server.port}/thermocald{query}"
@@ -169,12 +174,16 @@ def test_certificates(certificates, filled):
         grant(address(server), "pi", writes=True)
         with pytest.raises(ServerError, match="certificate") as late:
             send("late")
+        with pytest.raises(ServerError, match="of another authority") as unknown:
+            send("foreign")
+        with pytest.raises(ServerError, match="certificate is not accepted"):
+            send(root="foreign")
         use(server, "stale")
         server.stop("fast")
         server.start()
         with pytest.raises(ServerError, match="certificate is not accepted; is it expired") as old:
             send()
-        for told in (late, old):
+        for told in (late, unknown, old):
             assert not isinstance(told.value, ServerGone)
         use(server, "server")
         server.stop("fast")

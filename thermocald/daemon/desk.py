@@ -17,11 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from thermocald.acquisition.pipeline import check_frame
 from thermocald.config import in_words, parse_config
 from thermocald.daemon.control import DaemonBusy, ask
 from thermocald.daemon.live_state import find_state
-from thermocald.daemon.plan import plan_cameras
 from thermocald.daemon.session import Session
 from thermocald.daemon.systemd import set_up_logging
 from thermocald.errors import (
@@ -34,8 +32,6 @@ from thermocald.errors import (
 from thermocald.files import read_yaml
 from thermocald.hal import SystemClock, load_driver, open_device
 from thermocald.numbers import with_sd
-from thermocald.store.database.store import Store
-from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -116,6 +112,8 @@ def _prepare(config: Config, session: Session, done: int) -> Config:
 
 
 def _stored(config: Config, session: Session) -> int:
+    from thermocald.store.database.store import Store
+
     if not config.store.path.exists():
         return 0
     with Store.open(config.store.path) as store:
@@ -125,6 +123,9 @@ def _stored(config: Config, session: Session) -> int:
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
+    from thermocald.acquisition.pipeline import check_frame
+    from thermocald.daemon.plan import plan_cameras
+
     clock = SystemClock()
     for one in config.thermometers:
         with open_device("thermometer", one.driver, one.options, clock) as thermometer:
@@ -368,6 +369,7 @@ class Watch:
 
     def _compare(self) -> Separation:
         from thermocald.discovery.experiment import compare_effects
+        from thermocald.store.sources import open_source
         from thermocald.thermal.reduce import reduce_together
         from thermocald.thermal.source import epochs_input
 

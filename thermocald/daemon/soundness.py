@@ -13,19 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.acquisition.calibrator import Calibrator
-from thermocald.acquisition.thermometers import Thermometers
-from thermocald.analysis.series.recorded import misplaced_doubts
 from thermocald.arrays import spread_rows
-from thermocald.config import load_config
-from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
-from thermocald.store.database.store import Store
-from thermocald.store.logger.photographs import strange_photographs
-from thermocald.store.recording.reader import Recording, read_recording
-from thermocald.store.recording.sense import doubt_lines, interior_doubts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,6 +24,7 @@ if TYPE_CHECKING:
 
     from thermocald.config import DeviceConfig
     from thermocald.hal import Kind
+    from thermocald.store.recording.reader import Recording
 
 
 KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
@@ -134,6 +126,10 @@ def _is_system(path: Path) -> bool:
 
 
 def _examine_recording(path: Path) -> dict[str, Any]:
+    from thermocald.store.logger.photographs import strange_photographs
+    from thermocald.store.recording.reader import read_recording
+    from thermocald.store.recording.sense import doubt_lines
+
     recording = read_recording(path)
     columns = recording.columns
     seen = [len(o) for e in recording.epochs if (o := e.observations) is not None]
@@ -181,6 +177,10 @@ def _examine_recording(path: Path) -> dict[str, Any]:
 
 def calibration_doubts(recording: Recording) -> list[str]:
     """Calibrate some epochs; return doubts about their interior orientation and test field."""
+    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.analysis.series.recorded import misplaced_doubts
+    from thermocald.store.recording.sense import interior_doubts
+
     calibrator = Calibrator.of_recording(recording)
     rows = spread_rows(len(recording), _TRIED)
     tried = [calibrator.calibrate(recording.epochs[row]).adjustment for row in rows.tolist()]
@@ -196,6 +196,11 @@ def calibration_doubts(recording: Recording) -> list[str]:
 
 
 def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
+    from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.acquisition.thermometers import Thermometers
+    from thermocald.config import load_config
+    from thermocald.daemon.plan import plan_cameras
+
     config = load_config(path, load_driver)
     lines = [f"{path}: a valid configuration"]
     for key, place in (("store.path", config.store.path), ("frames.folder", config.frames.folder)):
@@ -236,6 +241,8 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
 
 
 def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    from thermocald.store.database.store import Store
+
     with Store.open(path) as store:
         say(f"{path}: reading the whole file")
         found = store.examine()

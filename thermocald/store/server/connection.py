@@ -61,7 +61,9 @@ _ADVICE = {
 }
 _REFUSED = {
     "password authentication|no pg_hba": _ADVICE["28"],
-    "certificate": "the certificate is not accepted; is it expired, or of another authority?",
+    "certificate|unknown ca": (
+        "the certificate is not accepted; is it expired, or of another authority?"
+    ),
     "database.*does not exist": _ADVICE["3D"],
 }
 """Pattern of libpq's message, for errors without SQLSTATE → what to do."""

@@ -351,7 +351,8 @@ class ColumnChunk(Chunk):
     def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:
         encoded = self._batch.column(name).dictionary_encode()
         known = [index.get(str(word), -1) for word in encoded.dictionary.to_pylist()]
-        rows = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+        # the indices of other programs may be unsigned
+        rows = encoded.indices.cast(_pyarrow().int64()).fill_null(-1).to_numpy()
         found: NDArray[np.int64] = np.array([*known, -1], dtype=np.int64)[rows]
         return found
 

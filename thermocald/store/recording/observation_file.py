@@ -369,7 +369,8 @@ def _parse_once(table: Table) -> Table:
         folder = _cache()
         copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
         if copy.exists():
-            os.utime(copy)
+            with suppress(OSError):  # a cache that is read-only
+                os.utime(copy)
         else:
             for old in folder.glob("*.parquet"):
                 with suppress(OSError):

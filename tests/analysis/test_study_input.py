@@ -83,3 +83,11 @@ def test_a_store_without_any_result_is_refused(recording, tmp_path):
         store.append(stored, opened.epochs[0], EpochResult("weak_geometry", "one plane"))
     with pytest.raises(DataError, match=r"no epoch has a result \(1 × weak geometry\)"):
         tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
+
+
+def test_an_empty_store_is_refused_with_one_line(tmp_path):
+    with Store.open(tmp_path / "s.db", "append", durable=False):
+        pass
+    with pytest.raises(DataError, match="holds no series") as caught:
+        tc.open_all(tmp_path / "s.db")
+    assert "\n" not in str(caught.value)

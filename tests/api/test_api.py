@@ -12,15 +12,18 @@ import runpy
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.quiver import QuiverKey
 
 import thermocald as tc
 from tests.commands import call, finish
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
+from thermocald.analysis.camera.camera import CameraDifference
 from thermocald.discovery.plan import Plan
 from thermocald.errors import ConfigurationError, DataError, RecordingError, StoreError, UsageError
 from thermocald.result import jsonable
@@ -144,6 +147,21 @@ def test_a_drawn_distortion_is_zero_at_the_principal_point(camera):
     middle = now.sensor.centre + np.array([1, -1]) * now.values[1:3] / pitch
     near = np.argmin(np.linalg.norm(arrows.XY - middle, axis=1))
     assert shift[near] < 0.05 < 5.0 < shift.max()
+
+
+def test_the_scale_of_drawn_arrows_is_legible(camera):
+    """It was drawn above the figure, or over a long name."""
+    cold, warm = camera.at(28.0).model, camera.at(35.0).model
+    drawings = (
+        replace(camera.at(35.0), name="nexus5-warm-laboratory-17").plot(),
+        CameraDifference(("cold.json", "warm.json"), cold, warm).plot(),
+    )
+    for figure in drawings:
+        figure.draw_without_rendering()
+        (key,) = [a for a in figure.axes[0].artists if isinstance(a, QuiverKey)]
+        scale, title = (text.get_window_extent() for text in (key.text, figure.axes[0]._left_title))
+        assert scale.y1 < figure.bbox.y1
+        assert not scale.overlaps(title)
 
 
 def test_epochs_as_a_data_frame(epochs):

@@ -33,7 +33,7 @@ from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
 from thermocald.output.study.report import render_study, save_figures
-from thermocald.photogrammetry.camera.camera_model import CameraSpec
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
@@ -464,6 +464,18 @@ def test_a_study_of_nearly_nothing_says_why(empty_study):
     assert "The series has a single epoch: nothing can be said about change." in words
     assert "No Monte-Carlo" in words
     assert "Record more epochs, over a wider range of temperatures." in words
+    assert _MARKS.findall(words) == []
+
+
+def test_a_calibration_without_a_result_says_why(undrawn):
+    field = corner_field("plain", per_side=2, pitch_mm=100.0)
+    camera = CameraSpec("", Sensor(640, 480, 0.001))
+    result = calibrate_observations(
+        ["a.jpg"], [Observations.none()], {}, field, camera, AdjustmentSettings()
+    )
+    words = words_of(render_calibration(result, camera.sensor, "camera"))
+    assert "Not calibrated: " in words
+    assert "a.jpg" in words
     assert _MARKS.findall(words) == []
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,6 +72,17 @@ def test_any_length(store, series, size):
         store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
     assert chunks(store) == size // CHUNK // MERGED + size // CHUNK % MERGED
     assert read(store, series) == expected(numbers)
+
+
+def test_later_calibrations_in_chunk_and_tail_of_two_series(store, series, head, field):
+    other = store.create_series(replace(head, series="M2"), field)
+    for i in range(CHUNK + 5):
+        store.append(series, epoch(i), None, extra={"blur": 0.5 * i})
+        store.append(other, epoch(100 + i), result(100 + i), extra={"blur": 50 + 0.5 * i})
+    for i in range(CHUNK + 5):
+        store.amend(series, i, result(i))
+    assert read(store, series) == expected(range(CHUNK + 5))
+    assert read(store, other) == expected(range(100, 105 + CHUNK))
 
 
 def test_a_column_that_comes_and_goes(store, series):

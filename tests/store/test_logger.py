@@ -184,6 +184,16 @@ def test_a_log_of_changes_holds_its_value_in_a_pause_but_not_while_unavailable(t
     assert sum("is held in 1 pause of up to 600 s" in note for note in found.notes) == 2
 
 
+@pytest.mark.parametrize(("order", "month"), [("dmy", 7), ("mdy", 6)])
+def test_photographs_settle_the_order_of_day_and_month(tmp_path, order, month):
+    day = 6 if order == "dmy" else 7
+    first = datetime(2026, month, day, 10, tzinfo=UTC).timestamp()
+    (tmp_path / "log.csv").write_text("time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n")
+    found = read_log(tmp_path / "log.csv", LogOptions(clock=BERLIN), (first + 20, first + 40))
+    assert found.times.tolist() == [first, first + 60]
+    assert any("this puts the log near the photographs" in note for note in found.notes)
+
+
 @pytest.mark.parametrize(("rows", "first"), [
     (("06/07/2026 23:59", "07/07/2026 00:01"), datetime(2026, 7, 6, 21, 59, tzinfo=UTC)),
     (("07/06/2026 23:59", "07/07/2026 00:01"), datetime(2026, 7, 6, 21, 59, tzinfo=UTC)),
@@ -572,6 +582,15 @@ def test_hours_without_am_and_pm_are_doubtful(tmp_path):
     )
     (note,) = [note for note in found.notes if "doubtful" in note]
     assert "run back 1 time, the first by 43140 s" in note
+
+
+def test_rows_before_the_clock_was_set_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"line 4, column 'time': is 26 years after the row before"):
+        read(
+            tmp_path,
+            ["time,T °C"],
+            lambda m, t, i: f"{m.replace(year=2026 if i > 1 else 2000):%Y-%m-%d %H:%M},{t}",
+        )
 
 
 def test_a_time_of_unknown_form_is_shown(tmp_path):

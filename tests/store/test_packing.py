@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,29 @@ def test_rounding_is_as_stated():
     assert error.std() == pytest.approx(POINT_QUANTUM_PX / np.sqrt(12), rel=0.05)
     assert kept.sigmas == pytest.approx(seen.sigmas, rel=6e-8)
     assert np.array_equal(kept.targets, seen.targets)
+
+
+def test_points_of_five_decimals_are_exact():
+    """The numbers of observations.csv are returned digit by digit."""
+    seen = observations(5000)
+    points = np.array([[float(f"{v:.5f}") for v in p] for p in seen.points])
+    kept = unpack_observations(pack_observations(replace(seen, points=points)))
+    assert np.array_equal(kept.points, points)
+
+
+def test_an_epoch_of_too_many_numbers_is_refused_and_the_next_is_stored(
+    store_path, head, field, make_epoch, make_result
+):
+    """Its details would take the place of the next epoch's."""
+    quality = {f"q{i}": np.zeros(100) for i in range(3000)}
+    large = replace(make_epoch(2), observations=replace(observations(100), quality=quality))
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        with pytest.raises(StoreError, match="observations are too many to store"):
+            store.append(series, large, make_result(2))
+        store.append(series, make_epoch(3), make_result(3))
+        assert [one.epoch.number for one in store.epochs(series)] == [3]
+        assert not store.examine().damaged
 
 
 def test_what_does_not_fit_is_kept_otherwise():

@@ -57,6 +57,20 @@ def test_digits_beyond_ours_are_kept(recording_path):
     assert "word 3" in csv.read_text()
 
 
+@pytest.mark.parametrize("kind", ["uint8", "uint32", "int16"])
+def test_names_of_targets_may_be_categories(recording_path, kind):
+    """Polars writes a dictionary with unsigned indices, pandas one with signed ones."""
+    before = read_recording(recording_path)
+    convert(recording_path, "parquet")
+    path = recording_path / "observations.parquet"
+    table = parquet.read_table(path)
+    names = table["target"].combine_chunks().dictionary_encode()
+    codes = pyarrow.DictionaryArray.from_arrays(names.indices.cast(kind), names.dictionary)
+    place = table.schema.get_field_index("target")
+    parquet.write_table(table.set_column(place, "target", codes), path)
+    same(before, read_recording(recording_path))
+
+
 def test_text_that_cannot_be_read_is_not_converted(recording_path):
     csv = recording_path / "observations.csv"
     head, first, *rest = csv.read_text().splitlines()

@@ -97,7 +97,7 @@ class StoredRecording:
 
     @cached_property
     def columns(self) -> EpochColumns:
-        """Times and temperatures, without the paths of frames, for which see `framed`."""
+        """Times and temperatures, without the paths of frames."""
         channels = list(self.head.channels)
         names = ["epoch", "frame_time", "temperature_time", *channels]
         found = self.store.series_columns(self.series, names)

@@ -262,7 +262,7 @@ def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Arra
     return found
 
 
-def _draw(sensor: Sensor, points: Array, vectors: Array, title: str = "") -> Figure:
+def _draw(sensor: Sensor, points: Array, vectors: Array, title: str) -> Figure:
     """Draw vectors (n, 2) px at image points (n, 2) px, enlarged."""
     from thermocald.figures import Arrows, draw_arrows
 
@@ -270,7 +270,7 @@ def _draw(sensor: Sensor, points: Array, vectors: Array, title: str = "") -> Fig
     axis = axes[0, 0]
     draw_arrows(axis, Arrows(points, vectors, (sensor.width, sensor.height)))
     axis.set(xlabel="x in px", ylabel="y in px, down")
-    axis.set_title(title, loc="left")
+    axis.set_title(title, loc="left", pad=20, wrap=True)  # above the scale arrow
     return figure
 
 
@@ -406,7 +406,8 @@ class CameraDifference(Result):
     def plot(self) -> Figure:
         """Draw the shifts over the image, enlarged."""
         every = np.arange(_GRID**2).reshape(_GRID, _GRID)[::2, ::2].ravel()
-        return _draw(self.first.sensor, self._grid[every], self.shifts[every])
+        title = "Shifts, second minus first"
+        return _draw(self.first.sensor, self._grid[every], self.shifts[every], title)
 
     @cached_property
     def _grid(self) -> Array:

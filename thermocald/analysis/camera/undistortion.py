@@ -2,8 +2,8 @@
 
 `camera_model.rays` is exact for any point and any number of cameras. For a million points of one
 camera this module is several times faster and as exact: a polynomial inverts the radial distortion
-so well that two Newton steps are enough, in blocks that stay in the processor's cache. Blocks that
-do not converge to 1e-9 px are passed to `rays`, which raises an error if there is no solution.
+so well that a few Newton steps are enough, in blocks that stay in the processor's cache. Blocks
+that do not converge to 1e-9 px are passed to `rays`, which raises an error if there is no solution.
 
 Images are resampled from one interior orientation to another with maps for `cv2.remap`, whose
 shifts are computed at nodes and interpolated: within 1e-4 px of those computed for every pixel.
@@ -40,7 +40,7 @@ def image_grid(sensor: Sensor, size: int = 3) -> Array:
 
 _BLOCK = 8192
 _DEGREE = 6
-_STEP_PX = 3e-6  # a step below this leaves less than 1e-9 px
+_STEP_PX = 1e-9  # the last step; what is left is no larger, even if the steps shrink slowly
 _STEPS = 30
 
 

@@ -179,6 +179,8 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     covariance = [] if result.covariance is None else [(0, pack_covariance(result.covariance))]
     packed = b"" if seen is None else pack_observations(seen)
     cuts = range(0, len(packed), _PART_BYTES)
+    if seen is not None and len(cuts) >= _PARTS:
+        raise StoreError(f"epoch {epoch.number}: {len(seen)} observations are too many to store")
     parts = [*covariance, *((1 + i, packed[c : c + _PART_BYTES]) for i, c in enumerate(cuts))]
     row: dict[str, Any] = {
         "series_id": series,

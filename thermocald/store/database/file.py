@@ -359,7 +359,7 @@ def _backup_version(connection: sqlite3.Connection, path: Path, version: int) ->
     except (OutputError, sqlite3.Error) as error:
         raise StoreError(
             f"{path}: is of version {version} and must be backed up before its upgrade, but "
-            f"{copy} cannot be written ({error}); nothing was changed"
+            f"{copy} cannot be written ({error.__cause__ or error}); nothing was changed"
         ) from error
     known = len(schema.FILE_STEPS)
     log.info("%s: is upgraded from version %d to %d; backup: %s", path, version, known, copy)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import os
 import re
 import struct
 import warnings
@@ -180,7 +181,8 @@ def find_copies(paths: Sequence[Path]) -> dict[int, int]:
     """
     first: dict[bytes, int] = {}
     copies = {}
-    sizes = [path.stat().st_size if path.is_file() else -1 for path in paths]
+    # False, too, in a closed folder
+    sizes = [os.path.getsize(path) if os.path.isfile(path) else -1 for path in paths]
     alike = Counter(sizes)
     for i, path in enumerate(paths):
         if alike[sizes[i]] == 1:

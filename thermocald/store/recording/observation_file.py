@@ -351,7 +351,8 @@ class ColumnChunk(Chunk):
     def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:
         encoded = self._batch.column(name).dictionary_encode()
         known = [index.get(str(word), -1) for word in encoded.dictionary.to_pylist()]
-        rows = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+        # the indices of other programs may be unsigned
+        rows = encoded.indices.cast(_pyarrow().int64()).fill_null(-1).to_numpy()
         found: NDArray[np.int64] = np.array([*known, -1], dtype=np.int64)[rows]
         return found
 
@@ -368,7 +369,8 @@ def _parse_once(table: Table) -> Table:
         folder = _cache()
         copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
         if copy.exists():
-            os.utime(copy)
+            with suppress(OSError):  # a cache that is read-only
+                os.utime(copy)
         else:
             for old in folder.glob("*.parquet"):
                 with suppress(OSError):

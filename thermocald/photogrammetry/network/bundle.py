@@ -475,8 +475,8 @@ def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Arra
     A, B, D, a, d = normals
     trace = np.trace(D, axis1=1, axis2=2)
     # a target without any weight is held
-    weight = np.where(trace == 0, 1.0, damping * trace)
-    inverses = np.linalg.inv(D + weight[:, None, None] * np.eye(3))
+    weight = np.where(trace == 0, 1.0, damping * trace)[:, None, None]
+    inverses = np.asarray(np.linalg.inv(D + weight * np.eye(3)), dtype=np.float64)
     B3 = B.reshape(len(B), len(inverses), 3)
     BD = np.einsum("umi,mij->umj", B3, inverses).reshape(B.shape)
     return A - BD @ B.T, a - BD @ d.ravel(), inverses

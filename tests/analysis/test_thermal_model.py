@@ -134,10 +134,12 @@ def test_events_and_phases_differ_between_series():
     assert abs(cyclic.values["P"] - 143.0) < 4 * cyclic.sds["P"]
     assert abs(slip.values["time"] - 405.0) <= 5.0
     assert abs(f.fitted["sigma0"] - 1.0) < 0.03
+    slip_first = replace(f.model, effects=f.model.effects[::-1])
     for s, fitted in zip(series, f.fitted["series"], strict=True):
-        error = predicted_error(f.model, s, fitted.thermometer_sd)
-        assert error.rms_px <= 1.1 * error.floor_px
-        assert 0.93 <= error.coverage <= 0.97
+        for model in (f.model, slip_first):
+            error = predicted_error(model, s, fitted.thermometer_sd)
+            assert error.rms_px <= 1.1 * error.floor_px
+            assert 0.93 <= error.coverage <= 0.97
 
 
 def test_a_kink_between_two_readings_is_no_signal():

@@ -11,7 +11,9 @@ import pytest
 
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
+    InteriorOrientation,
     partials,
+    rays,
 )
 from thermocald.photogrammetry.epoch.adjustment import (
     AdjustmentSettings,
@@ -19,6 +21,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     cold_start,
 )
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.orientation import approximate_orientation
 
 FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
 TRUTH = scene.TRUTH
@@ -137,6 +140,20 @@ def test_gross_errors_are_rejected_without_initial_values(nominal):
     assert set(obs.targets[bad].tolist()) <= set(a.rejected)
     assert len(a.rejected) <= 15 + 3
     assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
+
+
+@pytest.mark.parametrize("view_deg", [9.0, 50.0, 112.0, 130.0])
+def test_cold_starts_of_narrow_and_wide_lenses(view_deg):
+    """Without a data sheet c is within a twentieth, and all targets fit."""
+    rng = np.random.default_rng(0)
+    width, height = scene.SENSOR.width, scene.SENSOR.height
+    c = 0.5 * width * scene.SENSOR.pixel_pitch / np.tan(np.radians(view_deg / 2))
+    image = rng.uniform(0.05, 0.95, (25, 2)) * [width, height]
+    directions = rays(scene.SENSOR, InteriorOrientation(c).as_array(), image)
+    points = directions * rng.uniform(1000.0, 1500.0, (25, 1))
+    found, _, fits = approximate_orientation(scene.SENSOR, points, image)
+    assert found.c == pytest.approx(c, rel=0.05)
+    assert fits.all()
 
 
 def test_one_plane_seen_frontally_is_weak():

@@ -215,6 +215,22 @@ def test_a_foreign_photograph_and_one_of_another_focus_are_left_out_and_named(zo
 
 
 @pytest.mark.slow
+def test_bad_photographs_in_a_small_network_are_refused():
+    """Regression: a target with one ray in front of a camera stopped the iteration unexplained."""
+    field = cases.bent_sheet(5, 4)
+    names = [f"t{i}" for i in range(len(field))]
+    for seed in (0, 4):
+        rng = np.random.default_rng(seed)
+        stations = cases.convergent_stations(field, 5)
+        photos, _ = cases.photographs(field, stations, 0.1, rng, loss=0.3)
+        for shown in photos.values():
+            wrong = rng.random(len(shown)) < 0.08
+            shown.points[wrong] += rng.normal(size=(wrong.sum(), 2)) * 200
+        distances = [Distance("t0", "t19", float(np.linalg.norm(field[19] - field[0])), 0.01)]
+        with pytest.raises(GeometryError, match="contradict each other"):
+            adjust_network(cases.SENSOR, photos, names, distances, interior=cases.INTERIOR)
+
+
 def test_photographs_of_a_moving_field_are_refused():
     """Each photograph shows another random field; chance agreement is refused."""
     rng = np.random.default_rng(8)

@@ -131,6 +131,7 @@ def test_text_and_tree_convert_without_loss():
         ("eval(temperature)", "no operator 'eval'"),
         ("lag(temperature)", "takes 2 arguments, not 1"),
         ("lag(temperature, [1])", "neither a number nor a name"),
+        ("lag(temperature, {[]: 1})", "neither a number nor a name"),
         ("product(above(temperature, k), above(board, k))", "a name of its own"),
         ("square(wave(temperature, P, phi))", "phi is a parameter of the camera"),
         ("square(" * 20 + "temperature" + ")" * 20, "more than 8 nested operators"),

@@ -34,6 +34,8 @@ from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array, Mask
@@ -41,7 +43,7 @@ if TYPE_CHECKING:
 FLIP = np.diag([1.0, -1.0, -1.0])
 """Our camera axes to OpenCV's, whose camera looks along +Z with y down."""
 
-_FIELDS_OF_VIEW_DEG = (9.0, 13.0, 18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
+_FIELDS_OF_VIEW_DEG = (9, 13, 18, 25, 33, 42, 52, 62, 73, 85, 98, 110, 121, 131)
 _TOLERANCE = 0.005  # of the image width, as the distortion is still unknown
 _MANY = 8  # so many pairs do not fit a pose of three of them by chance
 _MINIMUM = 4  # pairs
@@ -106,7 +108,7 @@ def _interiors(
     return [InteriorOrientation(c * f) for f in (1.0, 0.96, 1.04, 0.92, 1.08, 0.88, 1.12)]
 
 
-def _distances(sensor: Sensor, views_deg: tuple[float, ...]) -> list[float]:
+def _distances(sensor: Sensor, views_deg: Sequence[float]) -> list[float]:
     """Return the principal distances, mm, of cameras with these fields of view."""
     half_mm = sensor.width * sensor.pixel_pitch / 2
     found: list[float] = (half_mm / np.tan(np.radians(views_deg) / 2)).tolist()

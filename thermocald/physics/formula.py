@@ -282,7 +282,7 @@ def _parse_node(tree: ast.expr, text: str, depth: int) -> Node:
 def _parse_constant(tree: ast.expr, text: str) -> str | float:
     if isinstance(tree, ast.Name):
         return tree.id
-    with suppress(ValueError):
+    with suppress(ValueError, TypeError):
         number = ast.literal_eval(tree)
         if type(number) in (int, float):
             return float(number)

@@ -238,7 +238,8 @@ def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
         return model
     fitter = HypothesisFitter([series])
     fit = fitter.fit(())
-    for effect in listed:
+    # events last: what another effect moves would be taken for their step
+    for effect in sorted(listed, key=lambda e: catalogue.get(e.name).is_event):
         fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search=False)))
     fit = fitter.fit(without_chance_events(fitter, fit))
     own = {

@@ -440,7 +440,7 @@ class BundleAdjustment:
 
         Raises GeometryError if the matrix is not positive definite.
         """
-        S, s, inverses = _reduce(normals)
+        S, s, inverses = _reduce(normals, _DAMPING if self.known is None else 0.0)
         if self.known is None:
             null, _ = null_space(bundle.centres, bundle.points, len(self.free))
             scaled, scales, _ = _regularise(S, null)
@@ -467,11 +467,16 @@ def _sum_at(shape: tuple[int, ...], index: tuple[Index, ...], values: Array) -> 
     return np.asarray(sums.reshape(shape), dtype=np.float64)
 
 
-def _reduce(normals: _Normals) -> tuple[Array, Array, Array]:
-    """Return the matrix and right-hand side with targets eliminated, and the inverse blocks."""
+def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Array]:
+    """Return the matrix and right-hand side with targets eliminated, and the inverse blocks.
+
+    damping: share of its weight that holds a target, which in a bad start one ray alone may show.
+    """
     A, B, D, a, d = normals
-    held = np.trace(D, axis1=1, axis2=2) == 0  # a target without any weight
-    inverses = np.linalg.inv(D + held[:, None, None] * np.eye(3))
+    trace = np.trace(D, axis1=1, axis2=2)
+    # a target without any weight is held
+    weight = np.where(trace == 0, 1.0, damping * trace)[:, None, None]
+    inverses = np.asarray(np.linalg.inv(D + weight * np.eye(3)), dtype=np.float64)
     B3 = B.reshape(len(B), len(inverses), 3)
     BD = np.einsum("umi,mij->umj", B3, inverses).reshape(B.shape)
     return A - BD @ B.T, a - BD @ d.ravel(), inverses

@@ -25,6 +25,7 @@ updates as Févotte and Idier (2011), Neural Computation 23, 2421-2456.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,6 +58,7 @@ _DEGREE = 6
 _LEAST_FAST = 120  # frequencies of a drift's removal; with fewer too much movement would be lost
 _MOST_BENDS = 4
 _MOST_BENDS_TRIED = 400
+_TOGETHER = 200_000  # epochs of all bends that are tried at once: 100 MB
 _LEAST_BEND = 8  # epochs from either end
 _BY_CHANCE = 1e-3  # probability of a bend too many, which costs three of the frequencies
 _END = 15  # epochs at each end that give the slope there
@@ -159,19 +161,30 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
     basis = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
     fast = fast - basis @ (basis.T @ fast)
     rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
-    after = np.clip(u - u[rows, 0], 0.0, None)
-    bends = np.stack([_cosines(after**k)[low:].T for k in (1, 2, 3)], axis=-1)  # (bends, m, 3)
+    parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
     needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
     for _ in range(_MOST_BENDS):
-        inside = bends - basis @ (basis.T @ bends)
-        inside = np.linalg.qr(inside / np.linalg.norm(inside, axis=1, keepdims=True))[0]
-        left = fast - inside @ (np.swapaxes(inside, 1, 2) @ fast)
-        likelihood = _likelihood(left, low)
-        best = int(np.argmax(likelihood))
-        if likelihood[best] - _likelihood(fast, low) < needed:
+        tried = (_best_bend(fast, basis, u - u[part, 0], low) for part in parts)
+        likelihood, left, bend = max(tried, key=itemgetter(0))
+        if likelihood - _likelihood(fast, low) < needed:
             break
-        fast, basis = left[best], np.column_stack([basis, inside[best]])
+        fast, basis = left, np.column_stack([basis, bend])
     return np.concatenate([coefficients[:low], fast])
+
+
+def _best_bend(fast: Array, basis: Array, after: Array, low: int) -> tuple[float, Array, Array]:
+    """Return the likelihood with the best of some bends, the coefficients left, and its basis.
+
+    fast (m, k): coefficients without `basis` (m, ·); after (E, bends): time after each bend.
+    """
+    after = np.clip(after, 0.0, None)
+    bends = np.stack([_cosines(after**k)[low:].T for k in (1, 2, 3)], axis=-1)  # (bends, m, 3)
+    inside = bends - basis @ (basis.T @ bends)
+    inside = np.linalg.qr(inside / np.linalg.norm(inside, axis=1, keepdims=True))[0]
+    left = fast - inside @ (np.swapaxes(inside, 1, 2) @ fast)
+    likelihood = _likelihood(left, low)
+    best = int(np.argmax(likelihood))
+    return float(likelihood[best]), left[best], inside[best]
 
 
 def _likelihood(coefficients: Array, low: int) -> Array:
@@ -331,6 +344,7 @@ _SPIKE = 6.0  # robust standard deviations beyond which a deviation is a passer-
 _WEAK = 3.0  # times the usual variance of the pose, beyond which an epoch is interpolated
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
+_LEAST_NOISE = 0.2  # variance with correlated errors, whose estimate may even be negative
 _FOLLOWED = 1e-9  # share of a movement that the free parameters follow, beyond rounding
 _PERIODS = 2.5  # periods that a series must have to show a drift
 
@@ -384,7 +398,7 @@ def estimate_movement(
     if correlated is not None:
         inverse = np.linalg.inv(root)
         noise += inverse.T @ correlated @ inverse
-    whiten = symmetric_power(noise, -0.5, 1e-3)
+    whiten = symmetric_power(noise, -0.5, _LEAST_NOISE)
     trajectory = _fill(trajectory @ whiten, weak)
     back = np.linalg.inv(root) @ np.linalg.inv(whiten)
     # the pose by the perspective alone, the interior orientation eliminated

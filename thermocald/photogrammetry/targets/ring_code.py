@@ -134,7 +134,7 @@ def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
 ANGLES = 84  # a multiple of 12 and of 14
 COARSE_ANGLES = 28
 _PROFILE_ANGLES = 42
-_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.15, 0.45
+_PROFILE, _PROFILE_STEP, _PROFILE_REACH = (0.5, 3.55), 0.1, 0.45
 _INSIDE = 0.6  # level of a sample, 0 background, 1 ink
 
 
@@ -221,7 +221,7 @@ def in_perspective(
 
 
 RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
-_BLUR_PX = 1.0  # with which a code is drawn
+_BLURS_PX = (1.0, 1.6)  # with which a code is drawn
 # Largest RMS of the samples against the drawn code, in levels; less for large targets, whose edges
 # are a smaller part of the ring.
 _MISFIT = 0.13
@@ -235,7 +235,7 @@ def ring_misfit(
     which: NDArray[np.int64],
     within: Array,
 ) -> Array:
-    """Return the RMS (n,) of samples against the ring that was read, drawn with a usual blur.
+    """Return the RMS (n,) of samples against the ring that was read, drawn with one of two blurs.
 
     level (n, radii, angles): samples at `RADII`, 0 background, 1 ink; ones (n, bits): the code that
     was read; which, within (n, angles): the segment of each angle, and its place in it, 0 to 1.
@@ -253,12 +253,15 @@ def ring_misfit(
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
     across, side = px.astype(np.float32), (angle * along).astype(np.float32)
     rho = np.array(RADII, dtype=np.float32)[:, None]
-    scale = (across / np.float32(_BLUR_PX))[:, None]
-    drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
-    drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
-    drawn -= np.float32(1)
-    drawn *= normal_cdf(rho * (side / np.float32(_BLUR_PX))[:, None])
-    rms: Array = np.sqrt(np.mean((level - drawn) ** 2, axis=(1, 2), dtype=float))
+    misfits = []
+    for blur in map(np.float32, _BLURS_PX):
+        scale = (across / blur)[:, None]
+        drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
+        drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
+        drawn -= np.float32(1)
+        drawn *= normal_cdf(rho * (side / blur)[:, None])
+        misfits.append(np.mean((level - drawn) ** 2, axis=(1, 2), dtype=float))
+    rms: Array = np.sqrt(np.min(misfits, axis=0))
     return rms
 
 

@@ -401,7 +401,7 @@ def _rms(series: ReducedSeries, model: ThermalModel) -> float:
     mean, _, moved = average_residuals(series, prediction)
     left = series.source.grid.points - project_targets(series, prediction) - mean
     use = (series.weights[..., :2] > 0) & ~moved[:, None]
-    return float(np.sqrt(np.sum(left[use] ** 2) / max(use.sum(), 1)))
+    return float(np.sqrt(np.sum(left[use] ** 2) / max(int(use.sum()), 1)))
 
 
 def _with_event_sd(effect: ModelEffect, series: ReducedSeries) -> ModelEffect:

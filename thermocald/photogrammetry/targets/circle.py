@@ -115,7 +115,7 @@ def blurred_disc(
     other = determinant / slope
     kappa = 0.5 * other * other / slope
     d = (1 - rho) / slope
-    z = d / width - kappa * width
+    z = (d / width - kappa * width).astype(np.float32, copy=False)
     phi = normal_cdf(z)
     light = 1 + gx * ex + gy * ey
     reflect = b + a * phi

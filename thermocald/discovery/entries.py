@@ -22,8 +22,8 @@ from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
 from thermocald.physics.formula import known_together
 from thermocald.physics.model import ModelEffect
+from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.hypothesis import coefficients_of
-from thermocald.thermal.noise import CLEAR
 from thermocald.thermal.scan import normals_of_term
 
 if TYPE_CHECKING:
@@ -301,6 +301,6 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound
         "next_best_gain": growth.other_gain,
     }
     statement = effect.sentence(estimates)
-    if growth.gain <= growth.other_gain + CLEAR:
+    if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
         statement += f"; it follows {parameter_label(growth.other)} equally well"
     return EffectFound(effect.name, statement, where, estimates, evidence, [])

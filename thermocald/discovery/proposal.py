@@ -20,9 +20,10 @@ from thermocald.discovery.validation import SurrogateTest
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import explained
 from thermocald.physics.formula import parse
+from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
-from thermocald.thermal.scan import SIGNIFICANT, examine_all, normals_of_term, relinearise
+from thermocald.thermal.scan import examine_all, normals_of_term, relinearise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -157,7 +158,7 @@ def _fit(
 
 def _leaves_nothing(fitter: HypothesisFitter, fit: Fit) -> bool:
     """Test whether no smooth trajectory remains significant, however small."""
-    return all(a.significance < SIGNIFICANT for a in examine_all(fitter, fit))
+    return all(a.significance < noise_criteria.SIGNIFICANT for a in examine_all(fitter, fit))
 
 
 def _simplify(base: Solution, best: Solution) -> Solution:

@@ -28,6 +28,7 @@ from thermocald.photogrammetry.linalg import (
     subtract_level,
     symmetric_power,
 )
+from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.likelihood import whiten
 from thermocald.thermal.series import Movement, waves
@@ -39,11 +40,6 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.series import ReducedSeries
 
-# a "scored" limit has the meaning that it has in `discovery.criteria`
-_LEAP = 10.0  # times the usual squared deviation of an epoch from its neighbours
-_UNUSUAL = 1.7  # times a variance known to 13 %, from 170 second differences: five sd
-_BEYOND = 1.15  # times the largest eigenvalue due to noise (Marchenko, Pastur). Scored
-_FEWEST = 60  # epochs for an estimate of a series' jumps: of their variance, to 25 %
 _WAVES = 24
 _LEAST = 0.2  # variance of a half-wave, in units of the image noise, from which it is a state
 _TINY = 1e-6
@@ -160,7 +156,7 @@ def weight_leaps_down(fitter: HypothesisFitter, fit: Fit, W: Array) -> list[Redu
         padded = np.pad(y, ((2, 2), (0, 0)), mode="edge")
         calm = np.median(np.stack([padded[k : k + len(y)] for k in range(5)]), axis=0)
         leap = np.einsum("ei,eij,ej->e", y - calm, normal, y - calm)
-        limit = _LEAP * float(np.median(leap[e.n > 0]))
+        limit = criteria.LEAP * float(np.median(leap[e.n > 0]))
         factor = np.where(leap > limit, limit / np.maximum(leap, 1e-9), 1.0)
         if np.any(factor != 1.0):
             e = replace(e.weighted(factor), weights=e.weights * factor[:, None, None])
@@ -310,7 +306,7 @@ def _find_directions(
     _, U = np.linalg.eigh(covariance - carried)
     own = np.einsum("ji,jk,ki->i", U, covariance, U)
     expected = white + np.einsum("ji,jk,ki->i", U, carried, U)
-    clear = own > _UNUSUAL * edge * expected
+    clear = own > criteria.UNUSUAL * edge * expected
     if not clear.any():
         return None
     # `carried` is an upper bound, as the trajectories are smoothed
@@ -319,7 +315,7 @@ def _find_directions(
 
 def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeries | None:
     """Return the series with unusual jumps as part of its noise; None if there are none."""
-    factors = np.where(factors > _UNUSUAL, factors, 1.0)
+    factors = np.where(factors > criteria.UNUSUAL, factors, 1.0)
     if np.all(factors == 1.0):
         return None
     inverse = np.linalg.inv(W)
@@ -352,10 +348,10 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
             M -= left * np.outer(along, along)
         edge = (1.0 + np.sqrt(len(M) / (len(e.times) - _count_waves(e)))) ** 2
         factors, U = np.linalg.eigh(M)
-        clear = factors > _BEYOND * edge  # more than so few half-waves show by chance
+        clear = factors > criteria.BEYOND * edge  # more than so few half-waves show by chance
         D = W @ (U[:, clear] * np.sqrt(factors[clear] - 1.0))
         rest = np.diag(M - (U[:, clear] * (factors[clear] - 1.0)) @ U[:, clear].T)
-        more = rest > _UNUSUAL
+        more = rest > criteria.UNUSUAL
         D = np.column_stack([D, W[:, more] * np.sqrt(rest[more] - 1.0)])
         out.append(replace(e, tremble=D) if D.shape[1] else e)
     return out
@@ -363,7 +359,7 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
 
 def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
     """Return the series with remaining jumps as part of their noise; None if there are none."""
-    if any(len(e.times) < _FEWEST for e in fitter.series):
+    if any(len(e.times) < criteria.FEWEST for e in fitter.series):
         return None
     out = [
         weight_jumps_down(e, *measure_jumps(fitter, fit, s)) for s, e in enumerate(fitter.series)

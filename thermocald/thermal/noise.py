@@ -31,6 +31,7 @@ from thermocald.photogrammetry.linalg import (
     scaled_solve,
     symmetric_power,
 )
+from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import detect_tremble, weight_jumps_down
 from thermocald.thermal.scan import ORDERS
@@ -44,8 +45,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
     from thermocald.thermal.hypothesis import Fit, Term
 
-GROWTH = 40.0  # least gain in -2 log L of noise that follows the temperature. Scored
-CLEAR = 10.0  # -2 log L by which one trajectory of the noise excludes another: odds of 1 to 150
 _JUMP_SD = 4.0  # standard deviations of the images' slope, from which its change is a jump
 
 _LEAST = 0.005  # least noise, as a fraction of that at T0
@@ -85,15 +84,15 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
             trajectory = [e.history.temperature(name) for e in series]
             others.append((_estimate_slope([c - c.mean() for c in trajectory], data)[1], name))
     # two thermometers of a camera rise together: only a clearly better one excludes the reference
-    if others and gain < max(others)[0] - CLEAR:
+    if others and gain < max(others)[0] - criteria.CLEAR:
         return None
     time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
     by_time = _estimate_slope(time, data)[1]
     other_gain, other = max([*others, (by_time, "time")])
-    if gain < GROWTH or gain < by_time + CLEAR:
+    if gain < criteria.GROWTH or gain < by_time + criteria.CLEAR:
         return None
     growth = estimate_noise_slope(series)
-    if growth.gain < GROWTH:
+    if growth.gain < criteria.GROWTH:
         return None
     return replace(growth, other_gain=other_gain * growth.gain / gain, other=other)
 

@@ -47,6 +47,7 @@ from thermocald.photogrammetry.series.normals import (
     sums_of_squares,
 )
 from thermocald.physics.history import History
+from thermocald.thermal import criteria
 from thermocald.thermal.series import (
     ReducedSeries,
     SeriesInput,
@@ -65,17 +66,6 @@ if TYPE_CHECKING:
     from thermocald.physics.model import Distortion
 
 
-# what a series must contain
-MIN_EPOCHS = 20  # with a result: each of six blocks, left out in turn, has three epochs
-LEAST_EPOCHS = 3  # for a fit of known effects
-MIN_TARGETS = 12  # for 19 unknowns and five redundant coordinates
-MIN_DURATION = 120.0  # s: heat needs minutes to reach a camera
-LEAST_CHANGE_K = 1.0  # of the temperature; also at least LEAST_CHANGE times its noise
-LEAST_CHANGE = 8.0
-GROSS = 4.5  # sd of a residual from its neighbours in time: 7 in 10⁶ by chance
-SPIKE = 7.0  # the same before any adjustment, relative to the neighbours' median
-
-
 def require(source: SeriesInput, strict: bool) -> None:
     """Raise DataError if temperature, epochs, duration or field do not suffice for a discovery.
 
@@ -90,29 +80,29 @@ def require(source: SeriesInput, strict: bool) -> None:
         )
     seen = source.grid.observed.sum(axis=1)
     if not strict:
-        if np.sum(seen >= MIN_TARGETS) < LEAST_EPOCHS:
+        if np.sum(seen >= criteria.MIN_TARGETS) < criteria.LEAST_EPOCHS:
             raise DataError(
-                f"{source.name}: fewer than {LEAST_EPOCHS} epochs show "
-                f"{MIN_TARGETS} targets or more"
+                f"{source.name}: fewer than {criteria.LEAST_EPOCHS} epochs show "
+                f"{criteria.MIN_TARGETS} targets or more"
             )
         return
     reference = next(iter(source.readings))
-    if np.isfinite(source.readings[reference]).sum() < MIN_EPOCHS and (
-        len(source.frame_times) >= MIN_EPOCHS
+    if np.isfinite(source.readings[reference]).sum() < criteria.MIN_EPOCHS and (
+        len(source.frame_times) >= criteria.MIN_EPOCHS
     ):
         raise _no_temperature(source, reference)
-    good = int(np.sum(seen >= MIN_TARGETS))
-    if good < MIN_EPOCHS:
+    good = int(np.sum(seen >= criteria.MIN_TARGETS))
+    if good < criteria.MIN_EPOCHS:
         raise DataError(
-            f"{source.name}: {good} of {len(seen)} epochs have {MIN_TARGETS} targets or "
-            f"more; discovery needs {MIN_EPOCHS} such epochs, better 100"
+            f"{source.name}: {good} of {len(seen)} epochs have {criteria.MIN_TARGETS} targets or "
+            f"more; discovery needs {criteria.MIN_EPOCHS} such epochs, better 100"
         )
     duration = float(source.frame_times[-1] - source.frame_times[0])
-    if duration < MIN_DURATION:
+    if duration < criteria.MIN_DURATION:
         raise DataError(
             f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
             "camera, and a faster movement is not a thermal effect. Record at least "
-            f"{MIN_DURATION:.0f} s, better half an hour"
+            f"{criteria.MIN_DURATION:.0f} s, better half an hour"
         )
     rows = source.grid.observed.any(axis=0)
     if plane_fit(source.field.points[rows])[2]:
@@ -126,7 +116,7 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
     """Make the error for a reference temperature with too few readings."""
     return DataError(
         f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
-        f"than {MIN_EPOCHS} readings. Record the camera's temperature with its frames"
+        f"than {criteria.MIN_EPOCHS} readings. Record the camera's temperature with its frames"
     )
 
 
@@ -168,7 +158,7 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
     size = np.max(np.abs(np.nan_to_num(d)), axis=2)
     finite = own[np.isfinite(own)]
     level = float(np.median(finite)) if len(finite) else 0.0
-    limit = SPIKE * np.fmax(np.nan_to_num(own), level)
+    limit = criteria.SPIKE * np.fmax(np.nan_to_num(own), level)
     return np.asarray(seen & (size > limit[:, None]))
 
 
@@ -184,7 +174,7 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
     around = running_median(np.where(bad[..., None], np.nan, v), _HALF)
     size = np.max(np.abs(np.nan_to_num(v - around)) * root, axis=2)
     level = MAD_TO_SD * float(np.median(kept[np.isfinite(kept)]))
-    limit = GROSS * np.fmax(np.nan_to_num(own), level)
+    limit = criteria.GROSS * np.fmax(np.nan_to_num(own), level)
     return np.asarray(seen & (size > limit[:, None]))
 
 
@@ -247,7 +237,7 @@ def reduce_series(
 
     Raises DataError, which states what is missing, if the data do not suffice.
     """
-    least = MIN_EPOCHS if strict else LEAST_EPOCHS
+    least = criteria.MIN_EPOCHS if strict else criteria.LEAST_EPOCHS
     require(source, strict)
     times = source.frame_times - source.frame_times[0]
     reading_times = source.reading_times - source.frame_times[0]
@@ -277,7 +267,9 @@ def reduce_series(
         source.polygons(),
     )
     change = float(np.ptp(trajectory))
-    least_change = max(LEAST_CHANGE_K, LEAST_CHANGE * instruments[reference].noise)
+    least_change = max(
+        criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * instruments[reference].noise
+    )
     if strict and change < least_change:
         raise DataError(
             f"{source.name}: the temperature {reference!r} is constant within "
@@ -345,10 +337,10 @@ def _reduce(
     # one offset per target is estimated too
     loss = 1.0 - 2 * int(used.sum()) / max(2 * int(count.sum()), 1)
     sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
-    enough = count >= MIN_TARGETS
+    enough = count >= criteria.MIN_TARGETS
     if not enough.any():
         raise DataError(
-            f"{source.name}: without gross errors, no epoch has {MIN_TARGETS} targets or "
+            f"{source.name}: without gross errors, no epoch has {criteria.MIN_TARGETS} targets or "
             "more; use a field with more targets in the image"
         )
     variance = float(np.median(sigma0[enough]) ** 2)

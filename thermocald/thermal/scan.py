@@ -33,6 +33,7 @@ from thermocald.photogrammetry.linalg import (
     scaled_solve,
 )
 from thermocald.physics import catalogue
+from thermocald.thermal import criteria
 from thermocald.thermal.hypothesis import BASE, Candidate, Fit, Term, make_candidate
 from thermocald.thermal.series import ReducedSeries, cosines, solve, unit_directions
 
@@ -285,8 +286,6 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
 _RIDGE = 1e-12  # of a unit diagonal
 _FAINT = 1e-6  # χ² of a trajectory of unit size, below which it is negligible
 
-SIGNIFICANT = 6.0  # sd by which a model's misfit must exceed its expectation
-NEGLIGIBLE_PX = 0.004  # RMS of a smooth misfit that does not matter: a tenth of a point's noise
 ORDERS = 14
 
 
@@ -316,7 +315,7 @@ class Adequacy:
     @property
     def adequate(self) -> bool:
         """Whether the misfit is insignificant or negligible."""
-        return self.significance < SIGNIFICANT or self.misfit_px < NEGLIGIBLE_PX
+        return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX
 
 
 def examine_all(fitter: HypothesisFitter, fit: Fit) -> tuple[Adequacy, ...]:

@@ -24,6 +24,7 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid, recut
 from thermocald.store.recording.reader import Recording
+from thermocald.thermal import criteria
 from thermocald.thermal.reduce import take_median
 from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.thermometer import estimate_reading_noise
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
     from thermocald.store.sources import StoredRecording
 
-_GROSS_OF_MEAN = 6.0  # sd from the median of the epochs of a short mean
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
 _FEWEST, _MOST = 2_000, 10_000  # rows
 _COARSE = 0.8  # share of the rows that are long means
@@ -220,7 +220,7 @@ def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.boo
     off = np.abs(off - take_median(off, 1)[:, None])
     known = np.isfinite(off)
     scale = float(mad_sd(off[known])) if known.any() else 0.0
-    out[:n] |= (np.where(known, off, 0.0) > _GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
+    out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
     return out
 
 

@@ -18,7 +18,7 @@ from thermocald.physics.formula import say_together
 from thermocald.physics.model import SURE
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 from thermocald.store.recording.sense import doubt_lines
-from thermocald.thermal.scan import NEGLIGIBLE_PX, SIGNIFICANT
+from thermocald.thermal.criteria import NEGLIGIBLE_PX, SIGNIFICANT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

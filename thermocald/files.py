@@ -314,10 +314,11 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     Raises `error`, which names the file and if possible the line, if the file is missing, is no
     YAML, holds a key twice, or holds something other than a mapping with text keys.
     """
-    if os.path.exists(path) and not os.path.isfile(path):  # False, too, in a closed folder
-        raise error(f"{path}: is not a file")
-    if os.path.exists(path) and path.stat().st_size > _MOST_BYTES:
-        raise error(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB")
+    if os.path.exists(path):  # False, too, in a closed folder
+        if not os.path.isfile(path):
+            raise error(f"{path}: is not a file")
+        if path.stat().st_size > _MOST_BYTES:
+            raise error(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as cause:

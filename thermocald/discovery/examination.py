@@ -306,24 +306,23 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         # if single targets wander much, one series alone names no effect
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
     elif len(best.terms) > kept:
-        complete = complete and not _own_rates_do_better(base, best)
+        complete = complete and not _own_rates_do_better(search, base, best)
     return Examination(
         base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
         complete, tuple(blocks), surrogates=tests,
     )  # fmt: skip
 
 
-def _own_rates_do_better(base: Solution, best: Solution) -> bool:
+def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool:
     """Test whether rates of its own for each further series do better than the effects found.
 
     The series then contradict each other, as those of two cameras do.
     """
-    fitter, count = best.fitter, len(best.fitter.series)
+    count = len(search.fitter.series)
     own = [make_own_rates(s, count) for s in range(1, count)]
-    fit = fitter.refine(fitter.fit((*base.terms, *own)))
-    coefficients = len(own) * len(BASE)
-    penalty = sum(base.penalties) + coefficients * np.log(sum(len(e.times) for e in fitter.series))
-    return bool(fit.objective + penalty < best.score - criteria.BAND)
+    penalty = len(BASE) * float(np.log(search.epochs))
+    other = search.refine((*base.terms, *own), (*base.penalties, *[penalty] * len(own)))
+    return other.score < best.score - criteria.BAND
 
 
 def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ...]:

@@ -180,6 +180,13 @@ def correlation_matrix(covariance: Array) -> Array:
     return covariance * np.outer(scale, scale)
 
 
+def rigid_motion(points: Array) -> Array:
+    """Return the derivatives (n, 3, 6) of points (n, 3) by shifts, then by rotations."""
+    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    turns = np.swapaxes(np.cross(np.eye(3), points[:, None]), 1, 2)
+    return np.concatenate([shifts, turns], axis=2)
+
+
 def mad_sd(values: NDArray[np.floating[Any]], axis: int | None = None) -> Any:
     """Return a robust standard deviation of residuals, whose mean is 0; NaN is ignored."""
     return MAD_TO_SD * np.nanmedian(np.abs(values), axis=axis)

@@ -35,7 +35,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
-from thermocald.photogrammetry.linalg import median_variance, scaled_inverse, unit_diagonal
+from thermocald.photogrammetry.linalg import (
+    median_variance,
+    rigid_motion,
+    scaled_inverse,
+    unit_diagonal,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -404,8 +409,7 @@ class BundleAdjustment:
         root = np.sqrt(np.where(in_front, weights, 0.0))[:, None, None] * rays.whitening
         by_point = np.nan_to_num(by_point[:, 0])
         # q = Rᵀ d: a rotation about an object axis e acts as a movement of the point by d × e
-        d = points - bundle.centres[rays.photo]
-        cross = np.swapaxes(np.cross(d[:, None], np.eye(3)), 1, 2)
+        cross = -rigid_motion(points - bundle.centres[rays.photo])[:, :, 3:]
         by_interior = np.nan_to_num(by_parameter[:, 0, :, :_N_IOP])[:, :, self.free]
         by_camera = np.concatenate([by_interior, by_point @ cross, -by_point], axis=2)
         v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
@@ -554,9 +558,7 @@ def null_space(centres: Array, points: Array, n_interior: int) -> tuple[Array, A
     """
 
     def motion(x: Array) -> Array:
-        shifts = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-        turns = np.swapaxes(np.cross(np.eye(3), x[:, None]), 1, 2)
-        return np.concatenate([shifts, turns, x[:, :, None]], axis=2)
+        return np.concatenate([rigid_motion(x), x[:, :, None]], axis=2)
 
     cameras = np.zeros((len(centres), 6, 7))
     cameras[:, :3, 3:6] = np.eye(3)

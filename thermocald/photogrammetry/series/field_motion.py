@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import FEWEST_ON_A_SHEET
-from thermocald.photogrammetry.linalg import inverse_of_determined
+from thermocald.photogrammetry.linalg import inverse_of_determined, rigid_motion
 from thermocald.photogrammetry.series.normals import ObservationGrid
 
 if TYPE_CHECKING:
@@ -417,10 +417,7 @@ def _rigid(s: FieldSeries, rows: Index) -> Array:
     """Return ∂ image points / ∂ shifts, rotations (2k, 6), px/mm; rotations at the board's size."""
     X = s.points[rows] - s.points[rows].mean(axis=0)
     X /= max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
-    shifts = np.broadcast_to(np.eye(3), (len(X), 3, 3))
-    turns = np.swapaxes(np.cross(np.eye(3), X[:, None]), 1, 2)
-    motion = np.concatenate([shifts, turns], axis=2)
-    out: Array = (s.B[rows] @ motion).reshape(-1, 6)
+    out: Array = (s.B[rows] @ rigid_motion(X)).reshape(-1, 6)
     return out
 
 

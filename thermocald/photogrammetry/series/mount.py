@@ -163,12 +163,13 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
     rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
     parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
     needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
+    likelihood = float(_likelihood(fast, low))
     for _ in range(_MOST_BENDS):
         tried = (_best_bend(fast, basis, u - u[part, 0], low) for part in parts)
-        likelihood, left, bend = max(tried, key=itemgetter(0))
-        if likelihood - _likelihood(fast, low) < needed:
+        better, left, bend = max(tried, key=itemgetter(0))
+        if better - likelihood < needed:
             break
-        fast, basis = left, np.column_stack([basis, bend])
+        likelihood, fast, basis = better, left, np.column_stack([basis, bend])
     return np.concatenate([coefficients[:low], fast])
 
 

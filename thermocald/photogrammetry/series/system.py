@@ -161,7 +161,7 @@ class SeriesSystem:
     weights (E, T, 3): a priori; use (E, T): points in use; N (E, 16, 16): empty without common
     unknowns; Q (E, p, p): cofactors of the epochs' own parameters, the common ones held; good (E,):
     epochs that determine their parameters; Q_common (q, q), or with offsets (q + 2T, q + 2T): empty
-    before `solved`; alike: epochs with the same matrices, from the function, None if outdated;
+    before `solved`; alike: epochs with the same matrices (`alike` below), None if outdated;
     coupled: the result of `couplings`, if it needs little memory.
     """
 

@@ -217,6 +217,7 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
         (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),
         (b"time,T (F)\n2026-06-14 12:00,20 C\n2026-06-14 12:01,20 C\n", {}, "at once.*--unit"),
+        (b"time,T\n2026-06-14 12:00,20.5\n2026-06-14 12:01,69F\n", {}, "only 1 of 2.*--unit"),
         (b"time,a,b\n2026-06-14 12:00,20,21\n2026-06-14 12:01,20,21\n", {}, "--temperature-column"),
         (PLAIN.replace("21.75", "2_5.0"), {"temperatures": ("temperature",)}, "is not a number"),
         (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),

@@ -138,7 +138,7 @@ class Store(SeriesReader):
         file: SQLite's library crashes if a connection is closed during a statement.
         """
         whole = not first and last is None
-        missing, size, first = 0, _EPOCHS_AT_ONCE, first or 1
+        missing, size, following = 0, _EPOCHS_AT_ONCE, 1
         while size == _EPOCHS_AT_ONCE:
             with self._reads("epochs") as connection:
                 rows = columns.read_epochs(connection, series.id, first, last)
@@ -147,11 +147,11 @@ class Store(SeriesReader):
                 page = list(islice(found, _EPOCHS_AT_ONCE))
                 del found, rows
             for stored in page:
-                missing += max(0, stored.epoch.number - first)
-                first = stored.epoch.number + 1
+                missing += max(0, stored.epoch.number - following)
+                first = following = stored.epoch.number + 1
                 yield stored
             size = len(page)
-        if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - first)):
+        if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - following)):
             log.warning(
                 "%s: %d epochs of series %s are missing; `thermocald check` lists them",
                 self.path, missing, series.name,

@@ -422,7 +422,13 @@ def _find_unit(table: _Table, name: str) -> tuple[str | None, str]:
     found: dict[str, str] = {}
     if unit := stated_unit(name):
         found[unit] = "its head"
-    for unit in table.units[name]:
+    readings = int(np.isfinite(table.values[name]).sum())
+    for unit, count in table.units[name].items():
+        if unit not in ("", "degC", *found) and count < readings:
+            raise DataError(
+                f"{file.path}, column {name!r}: only {count} of {counted(readings, 'reading')} "
+                f"are in {unit}; give --unit, or correct them"
+            )
         if unit:
             found.setdefault(unit, "each reading")
     for column in file.names:

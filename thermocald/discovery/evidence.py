@@ -226,6 +226,23 @@ def _keep_whole_markers(
     return out
 
 
+_GROSS_CHI2 = 25.0  # the most that one point says about the time of a step
+
+
+def _date_step(times: Array, later: Array) -> tuple[float, float]:
+    """Return the time of a step and its sd, s.
+
+    later (E,): χ² of each epoch's points if they are before the step, minus that if they are after.
+    A step in an interval is as probable as the likelihood times the interval's length.
+    """
+    gain, length = -np.cumsum(later)[:-1], np.diff(times)
+    share = length * np.exp(0.5 * (gain - gain.max()))
+    share /= share.sum()
+    middle = 0.5 * (times[:-1] + times[1:])
+    time = float(share @ middle)
+    return time, float(np.sqrt(share @ ((middle - time) ** 2 + length**2 / 12.0)))
+
+
 def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) -> list[Displaced]:
     """Measure the steps against the camera from the other targets; one group per time."""
     rows = np.array(sorted(jumps))
@@ -244,22 +261,24 @@ def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) ->
     for group in groups:
         first = int(np.median(firsts[group]))
         steps, vectors, sds = [], [], []
+        later = np.zeros(len(v))
         for k in group:
             b, a = v[:first, k], v[first:, k]
             b, a = b[np.isfinite(b[:, 0])], a[np.isfinite(a[:, 0])]
-            step = np.median(a, axis=0) - np.median(b, axis=0)
+            levels = np.median(b, axis=0), np.median(a, axis=0)
+            off = [np.sum((v[:, k] - level) ** 2, axis=1) / sigma**2 for level in levels]
+            later += np.nan_to_num(np.subtract(*np.minimum(off, _GROSS_CHI2)))
+            step = levels[1] - levels[0]
             variance = (np.pi / 2) * sigma**2 * (1 / max(len(a), 1) + 1 / max(len(b), 1))
             B = cleaned.at.B[rows[k]]
             inverse = np.linalg.pinv(B)
             steps.append(step)
             vectors.append(inverse @ step)
             sds.append(np.sqrt(np.diag(inverse @ inverse.T) * variance))
-        t = cleaned.times
         out.append(
             Displaced(
                 rows[group],
-                float(0.5 * (t[first - 1] + t[first])),
-                float((t[first] - t[first - 1]) / np.sqrt(12.0)),
+                *_date_step(cleaned.times, later),
                 np.array(vectors),
                 np.array(sds),
                 np.array(steps),

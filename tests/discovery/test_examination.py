@@ -13,6 +13,7 @@ import thermocald as tc
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
+from tests.blind.score import discover_case, judge_discovery
 from tests.marks import mostly_slow
 from thermocald.discovery import examination
 from thermocald.discovery.entries import estimate_term
@@ -41,6 +42,18 @@ def test_what_shows_in_the_image_is_named(evidence_of, effect):
         true, said = truth["effects"][0][0], found.effects[0].estimates
         assert [int(v) for v in said["targets"]["value"]] == [t + 1 for t in true["targets"]]
         assert said["time"]["value"] == pytest.approx(true["time"], abs=10)
+
+
+@pytest.mark.slow
+def test_the_time_of_a_weak_displacement_is_as_accurate_as_stated():
+    """Regression: the sd was that of one interval; errors were twice that."""
+    pulls = []
+    for seed in range(7000, 7030):
+        case = Case(("target_displacement",), seed=seed, strength_px=0.1, epochs=33, with_m2=False)
+        found, truth, series = discover_case(case)
+        pulls += (judge_discovery(case, found, truth, series).pulls or {}).values()
+    assert len(pulls) >= 25
+    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.3
 
 
 def test_no_effect_no_name(evidence_of):

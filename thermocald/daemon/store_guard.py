@@ -508,8 +508,10 @@ class StoreGuard:
         except StoreError as error:
             self._mark_out(error, batch[0].utc)
             return
-        for _ in batch:
-            self._readings.popleft()
+        for reading in batch:
+            # readings that arrive meanwhile may push the oldest out of a full queue
+            if self._readings and self._readings[0] is reading:
+                self._readings.popleft()
         self._mark_back()
 
     def status(self) -> dict[str, Any]:

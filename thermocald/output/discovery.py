@@ -480,19 +480,20 @@ def _left_px(d: Discovery, fit: Fit) -> float:
 def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str:
     x = d.examination
     best = x.best.names[len(x.base.terms) :]
-    worse = s.score - x.best.score
-    score = f"(−2 log L plus penalty) is {worse:,.0f} worse"
     if x.adequate and name.split(" ")[0] in best:
         if len(best) > 1:
             return f"named, together with {enumerated([n for n in best if n != name])}."
         return f"named: its misfit of {left:.3f} px is the noise."
-    if any(name.split(" ")[0] in r.names for r in x.rivals):
-        return f"cannot be excluded: its score {score} only."
+    if rivals := [r.score for r in x.rivals if name.split(" ")[0] in r.names]:
+        beside = min(rivals) - x.best.score
+        than = "worse" if beside >= 0 else "better"
+        return f"cannot be excluded: the best solution with it scores {abs(beside):,.1f} {than}."
     if left > _AT_NOISE * noise:
         text = f"misfit {left:.3f} px, {left / noise:.1f} times the noise"
         if "omega" in s.terms[-1].parameters:
             text += "; a moving mount shifts near targets more than far ones, which is not observed"
         return f"{text}."
+    score = f"(−2 log L plus penalty) is {s.score - x.best.score:,.0f} worse"
     return f"misfit at the noise on M1, but over all recordings its score {score}: excluded."
 
 

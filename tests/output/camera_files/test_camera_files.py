@@ -413,6 +413,20 @@ def test_covariance_comes_back(tmp_path, name):
     assert np.sqrt(np.diag(back)) == pytest.approx(sd, rel=2e-2, abs=1e-7)
 
 
+@pytest.mark.parametrize("to", ["json", "aicon", "opencv"])
+def test_what_was_held_keeps_no_standard_deviation(tmp_path, to):
+    """Regression: rounding left a negative variance; the next file got NaN, or was not written."""
+    for held in (slice(8, 10), slice(5, 10), slice(3, 10)):
+        Q = _covariance()
+        Q[held], Q[:, held] = 0, 0
+        first, second = tmp_path / "first.yml", tmp_path / f"second-{to}"
+        camera_files.write(_camera(), first, "opencv", Q)
+        camera_files.convert(first, second, to, pixel_pitch=SENSOR.pixel_pitch)
+        sds = np.sqrt(np.diag(camera_files.read(second).covariance))
+        assert sds[[8, 9]].tolist() == [0.0, 0.0]
+        assert np.isfinite(sds).all()
+
+
 def test_aicon_states_standard_deviations(tmp_path):
     path = tmp_path / "camera.ior"
     Q = _covariance()

@@ -96,7 +96,7 @@ class Validity:
                         f"{self.high:g} °C; convert it"
                     )
                 raise UsageError(
-                    f"{self.place(T)}; set `extrapolate` to predict there nevertheless"
+                    f"{self.place(T)}; set `extrapolate` (--extrapolate) to predict there"
                 )
             warnings.warn(
                 f"{self.place(T)}; standard deviations are widened",

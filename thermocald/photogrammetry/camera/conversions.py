@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 EXACT_PX = 1e-7
 _GRID = (41, 31)
 _CHECK_GRID = (97, 73)
+_ROUNDING = 1e-8  # share of the uncertainty in the image
 _STEP = 1e-30j
 """All families are polynomial or rational: a complex step gives a derivative without a difference.
 """
@@ -115,6 +116,10 @@ def convert(
         scales[scales == 0] = 1.0  # a parameter without effect is 0
         J = np.linalg.lstsq(G / scales, F, rcond=1e-14)[0] / scales[:, None]
         propagated = J @ covariance @ J.T
+        # what a fixed parameter keeps is rounding, and may be negative
+        moved = scales**2 * np.diag(propagated)
+        fixed = moved <= _ROUNDING**2 * moved.max()
+        propagated[fixed] = propagated[:, fixed] = 0.0
     size = np.linalg.norm(residual, axis=1)
     return result, propagated, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
 

@@ -105,6 +105,8 @@ def test_the_camera_at_35_degrees_as_a_ros_file(model, tmp_path):
     read = camera_files.read(tmp_path / "own.json")
     assert np.sqrt(read.covariance[0, 0]) == pytest.approx(document["sd_c"], rel=1e-9)
     assert "at 35 °C" in own.stdout
+    refused = call("camera", "diff", tmp_path / "own.json", model)
+    assert (refused.returncode, "`thermocald camera at` writes" in refused.stderr) == (2, True)
     # far outside its range it is refused
     assert call("camera", "at", model, "--temperature", 90, "-o", tmp_path / "x").returncode == 2
     assert not (tmp_path / "x").exists()

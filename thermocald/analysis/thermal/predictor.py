@@ -106,7 +106,7 @@ class Predictor:
         covariance = camera.covariance + np.outer(unknown, unknown)
         drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > GAP_S else 0.0)
         covariance = covariance + drifted**2 * np.outer(rates, rates)
-        beyond, far = self.thermal.validity.beyond(T), self.thermal.validity.is_far(T)
+        beyond, far = float(self.thermal.validity.beyond(T)), self.thermal.validity.is_far(T)
         covariance = covariance + np.diag((rates * beyond) ** 2)
         model = self.thermal.model
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)

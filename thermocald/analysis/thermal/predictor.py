@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.photogrammetry.camera.camera_model import IOP, partials, rays
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.thermal.thermal_camera import LiveCamera, ThermalCamera
     from thermocald.arrays import Array
 
@@ -40,8 +40,7 @@ class PredictedCamera:
 
     age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age and
     the excess over the limits of the fit; unknown (10,): one standard deviation due to the unknown
-    past, and unknown_px, its largest effect in the image; far: whether the temperature is so far
-    outside those of the fit that nothing should be predicted.
+    past, and unknown_px, its largest effect in the image.
     """
 
     camera: Camera
@@ -49,7 +48,6 @@ class PredictedCamera:
     temperature_sd: float
     unknown: Array
     unknown_px: float
-    far: bool
 
 
 class Predictor:
@@ -103,16 +101,13 @@ class Predictor:
             camera, age = self._free.along(times, rows, [time])[0], 0.0
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
-        covariance = camera.covariance + np.outer(unknown, unknown)
         drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > GAP_S else 0.0)
-        covariance = covariance + drifted**2 * np.outer(rates, rates)
-        beyond, far = float(self.thermal.validity.beyond(T)), self.thermal.validity.is_far(T)
-        covariance = covariance + np.diag((rates * beyond) ** 2)
-        model = self.thermal.model
-        now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
+        beyond = float(self.thermal.validity.beyond(T))
+        covariance = camera.covariance + np.outer(unknown, unknown)
+        covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
+        now = replace(camera, covariance=covariance, extrapolated=beyond)
         shift = self._largest_px(camera.values, unknown)
-        spread = math.hypot(drifted, beyond)
-        return PredictedCamera(now, age, spread, unknown, shift, far)
+        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, shift)
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""

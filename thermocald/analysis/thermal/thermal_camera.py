@@ -127,18 +127,11 @@ class ThermalCamera(Result):
         thermometers are taken to be as warm.
         """
         T = np.linspace(*self._limits, 60)
-
-        def at(t: float) -> tuple[Array, Array, Array]:
-            alike = dict.fromkeys(self.channels, t)
-            return steady_camera(self.model, self.parameters, alike, t)
-
-        base, _, J0 = at(self.model.T0)
-        values, _, J = zip(*map(at, T.tolist()), strict=True)
-        changes, by = np.array(values) - base, np.array(J) - J0  # the level cancels in a change
-        sds = np.sqrt(np.einsum("epi,ij,epj->ep", by, self.covariance, by))
+        found = [self.steady_change(self.model.T0, t) for t in T.tolist()]
         figure, axes = new_figure(3)
         for k, axis in enumerate(axes[:, 0]):
-            y, band = 1e3 * changes[:, k], 1e3 * BAND * sds[:, k]
+            y = 1e3 * np.array([change[k] for change, _ in found])
+            band = 1e3 * BAND * np.sqrt([covariance[k, k] for _, covariance in found])
             axis.plot(T, y)
             axis.fill_between(T, y - band, y + band, alpha=0.3)
             axis.set_ylabel(f"change of {parameter_label(IOP_NAMES[k])} in µm")
@@ -146,6 +139,17 @@ class ThermalCamera(Result):
         axes[0, 0].set_title(f"{self.model.camera}, from {self.model.T0:g} °C")
         axes[-1, 0].set_xlabel("temperature in °C")
         return figure
+
+    def steady_change(self, since: float, T: float) -> tuple[Array, Array]:
+        """Return the change (10,) of the steady camera from one temperature to another, °C.
+
+        Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
+        """
+        (then, _, J0), (now, _, J) = (
+            steady_camera(self.model, self.parameters, dict.fromkeys(self.channels, t), t)
+            for t in (since, T)
+        )
+        return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
         """Return a camera that follows a thermometer, reading by reading.

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.photogrammetry.camera.camera_model import IOP, partials, rays
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,7 +61,6 @@ class Predictor:
         self._now: tuple[Camera, Camera] | None = None
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
         self._since_begin = 0
-        self._across: Array | None = None
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
         """Take readings {channel: °C}, the reference first; failed ones are NaN or missing.
@@ -106,8 +104,10 @@ class Predictor:
         covariance = camera.covariance + np.outer(unknown, unknown)
         covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
         now = replace(camera, covariance=covariance, extrapolated=beyond)
-        shift = self._largest_px(camera.values, unknown)
-        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, shift)
+        alone = replace(camera, covariance=np.outer(unknown, unknown))
+        variance = alone.point_covariance(image_grid(camera.sensor)).trace(axis1=1, axis2=2)
+        largest = math.sqrt(variance.max())
+        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest)
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""
@@ -160,14 +160,3 @@ class Predictor:
         span = self.thermal.validity.high - self.thermal.validity.low
         spread = (span if math.isfinite(span) else _USUAL_RANGE_K) / math.sqrt(12.0)
         return spread * math.sqrt(-math.expm1(-2.0 * seconds / _CORRELATED_S))
-
-    def _largest_px(self, values: Array, shift: Array) -> float:
-        """Return the largest shift of an image point, px, for a change of interior orientation."""
-        if not shift.any():
-            return 0.0
-        if self._across is None:  # rays of a grid, which temperature hardly changes
-            sensor = self.thermal.model.sensor
-            across = rays(sensor, values, image_grid(sensor))
-            self._across = across / -across[:, 2:]
-        J = partials(self.thermal.model.sensor, values, np.zeros(6), self._across)[1][..., IOP]
-        return float(np.linalg.norm(J @ shift, axis=1).max())

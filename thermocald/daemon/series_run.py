@@ -166,13 +166,12 @@ class SeriesRun:
             from thermocald.analysis.online.observer import OnlineObserver
 
             return OnlineObserver(plan.sensor, plan.testfield, self._report)
-        from thermocald.analysis.thermal.gauge import GaugeObserver
-
         # the readings of many, since effects have a memory; the details of the most recent
         detailed = max(0, self.first - 1 - _DETAILED)
         earlier = self.read(detailed - _LATEST, detailed, details=False)
         plan.calibrator.remember([*earlier, *self.read(detailed + 1)])
-        return GaugeObserver(plan.calibrator, self._report)
+        plan.calibrator.tell = self._report
+        return plan.calibrator
 
     def _report(self, kind: str, text: str, utc: float, epoch: int) -> None:
         log.warning("camera %s: %s", self.plan.name, text, extra={"event": kind})

@@ -335,9 +335,11 @@ def require_series(series: Sequence[Series]) -> None:
     for i, one in enumerate(series):
         for other in series[:i]:
             if one is other or one.place == other.place:
+                same = f"is the same series as {other.source}"
+                fault = "is given twice" if one.source == other.source else same
                 raise UsageError(
-                    f"{one.source} is the same series as {other.source}; give each series once (a "
-                    "copy would count as a second measurement that agrees perfectly)"
+                    f"{one.source} {fault}; give each series once (a copy would count as a second "
+                    "measurement that agrees perfectly)"
                 )
 
 
@@ -366,6 +368,8 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
                 f"--free: {name!r} is no parameter of the interior orientation; give some of "
                 f"{choices}, or none"
             )
+        if names.count(name) > 1:
+            raise UsageError(f"--free: {name} is given twice")
     return tuple(name for name in IOP_NAMES if name in names)
 
 

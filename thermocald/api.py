@@ -142,8 +142,9 @@ def calibrate(
         file = unknown_camera(paths, pixel_pitch)
     settings = AdjustmentSettings(free=free_names(free))
     field = read_testfield(testfield)
-    photographs = calibrate_photographs(paths, field, file, settings, progress)
-    return Calibration(photographs, file, camera is None and pixel_pitch is None)
+    photographs = vars(calibrate_photographs(paths, field, file, settings, progress))
+    assumed = camera is None and pixel_pitch is None
+    return Calibration(**photographs, file=file, pitch_assumed=assumed)
 
 
 def study(

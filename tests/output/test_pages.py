@@ -25,7 +25,7 @@ from tests.daemon.conftest import make_recording
 from tests.pictures import from_five_places
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.analysis.series.drift import with_drifts
-from thermocald.analysis.series.recorded import recorded_table
+from thermocald.analysis.series.recorded import series_epochs
 from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
@@ -194,7 +194,7 @@ def _fleet(**_):
 def _epochs(tmp_path_factory, **_):
     folder = tmp_path_factory.mktemp("epochs")
     recording = open_recording(make_recording(folder / "small", 60))
-    epochs = with_drifts(recorded_table(recording, AdjustmentSettings(), "auto"))
+    epochs = with_drifts(series_epochs(recording, AdjustmentSettings(), "auto"))
     return epochs.report(folder / "epochs.html").read_text(encoding="utf-8")
 
 

@@ -72,7 +72,7 @@ def calibrate(
         written.append(f"written: {result.report(report)}")
     show(result, json, result, *written)
     if not (result.status == "ok" or result.poses):
-        raise DataError(f"no photograph has a result: {result.photographs.reason}")
+        raise DataError(f"no photograph has a result: {result.reason}")
 
 
 _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"

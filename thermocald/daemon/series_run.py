@@ -328,10 +328,11 @@ class SeriesRun:
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
         """Store a deferred calibration; delete a frame that was stored only for it."""
-        assert self._series is not None
         epoch = calibrated.epoch
         result = EpochResult.from_adjustment(calibrated.adjustment)
         try:
+            if self._series is None:
+                raise StoreError(f"series {self.plan.series} has not begun")
             self._guard.amend(self._series, calibrated, result)
         except StoreError as error:
             # that the store is away was logged once

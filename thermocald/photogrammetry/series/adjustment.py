@@ -109,7 +109,7 @@ def choose_exterior(
     if movement.memory:
         part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
         slowly = f"over about {movement.memory:.0f} epochs"
-        how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
+        how = f", {100 * part:.0f} % of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
         at = f"at row {', '.join(map(str, movement.jumps))}"
         how += f", with jumps {'in a sample of the epochs' if series.windows else at}"

@@ -1,7 +1,6 @@
 """The outlines of discs, coded rings and markers in object space; arithmetic equal on all machines.
 
-Outlines are polygons in the target's plane that move with the target. The plane of a circle is not
-in the test field's file: it is the plane through the target that contains most other targets.
+Outlines are polygons in the target's plane that move with the target.
 
 Mathematical libraries, fused multiply-add and vectorised sums differ in their last bits between
 machines, and a pixel value on the verge of rounding would flip. IEEE 754 defines only addition,
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import Sensor, distort, image_to_px
+from thermocald.photogrammetry.field.testfield import plane_fit, target_normals
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
 
@@ -106,7 +106,6 @@ def gaussian_kernel(sigma: float) -> Array:
 
 _CIRCLE_EDGES = 96
 _EDGES_PER_MODULE = 3  # as the distortion bends a straight edge
-_NEIGHBOURS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,40 +146,16 @@ class Shape:
 
 
 def surface_normals(field: TestField) -> Array:
-    """Find the unit normals (n, 3) of the targets' planes; their sign is arbitrary.
+    """Return the unit normals (n, 3) of the targets' planes; their sign is arbitrary.
 
-    Candidates are the planes through a target and two of its neighbours. The one that contains most
-    targets is chosen; of several, the one whose targets are nearest.
+    A target on no board has the normal of the plane through all targets.
     """
-    p = field.points
-    n = len(p)
-    if n < 3:
-        return np.tile([0.0, 0.0, 1.0], (n, 1))
-    spread = float(np.linalg.norm(np.ptp(p, axis=0)))
-    tolerance = 0.002 * spread + 3.0 * float(np.nanmax(field.sigmas, initial=0.0))
-    normals = np.zeros((n, 3))
-    for i in range(n):
-        distance = np.linalg.norm(p - p[i], axis=1)
-        near = np.argsort(distance, kind="stable")[1 : _NEIGHBOURS + 1]
-        first, second = np.triu_indices(len(near), 1)
-        u, v = p[near[first]] - p[i], p[near[second]] - p[i]
-        cross = np.cross(u, v)
-        size = np.linalg.norm(cross, axis=1)
-        good = size > 0.2 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
-        if not good.any():
-            normals[i] = (0.0, 0.0, 1.0)
-            continue
-        candidates = cross[good] / size[good, None]
-        inside = np.abs((p - p[i]) @ candidates.T) < tolerance
-        score = inside.sum(axis=0) - 1e-3 * (inside * (distance / spread)[:, None]).mean(axis=0)
-        best = candidates[int(np.argmax(score))]
-        members = p[inside[:, int(np.argmax(score))]]
-        # fitted to all targets of the plane: grid planes are exact to the coordinates' last digits
-        _, _, axes = np.linalg.svd(members - members.mean(axis=0))
-        refined = axes[2] * np.sign(axes[2] @ best)
-        # rounded, as the last bits of the decomposition differ between machines
-        normals[i] = np.round(refined, 9)
-    return normals
+    normals = target_normals(field.points)
+    if len(field) < 3:
+        normals[:] = (0.0, 0.0, 1.0)
+    normals[np.isnan(normals[:, 0])] = plane_fit(field.points)[1][2]
+    # rounded, as the last bits of the decomposition differ between machines
+    return np.round(normals, 9)
 
 
 def _lay_arc(turns: Array) -> Array:

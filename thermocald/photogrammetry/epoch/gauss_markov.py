@@ -243,7 +243,7 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     u, sensor = problem.unknowns, problem.sensor
     observed = problem.observations.points.T
     whitened = np.empty((len(u) + 1, *observed.shape))
-    values, last, near = start, float("inf"), False
+    values, last = start, float("inf")
     whitening: Whitening | None = None
     for _ in range(_ITERATIONS):
         predicted, A, B = partials(sensor, values[IOP], values[EOP], problem.points)
@@ -257,21 +257,18 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         N, gradient, squares = problem.sums(whitened, use, values)
         if not isfinite(squares):
             raise NoConvergenceError("targets came to lie behind the camera during the iteration")
-        # Close to the solution this is most likely the last iteration, which needs the cofactors.
-        root = cofactor_root(N, u) if near else None
-        whole, size = _whole_step(N, gradient, u, root)
+        root = cofactor_root(N, u)
+        whole, size = _whole_step(gradient, root)
         if size < _SMALL:
-            solution = Solution(
-                values, whitened, whitening, cofactor_root(N, u) if root is None else root
-            )
-            return _apply_step(solution, u, whole)
-        near, last = size < _LINEAR and size < 0.5 * last, size
-        if near:
+            return _apply_step(Solution(values, whitened, whitening, root), u, whole)
+        if size < _LINEAR and size < 0.5 * last:
             values = values.copy()
             values[u] += whole
+            last = size
             continue
+        last = size
         cost = problem.cost(whitened[-1][:, use], values)
-        for step in _trial_steps(N, u, gradient):
+        for step in _trial_steps(N, u, gradient, whole):
             trial = values.copy()
             trial[u] += step
             residuals = observed - project(sensor, trial[IOP], trial[EOP], problem.points).T
@@ -284,49 +281,29 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
 
 
-def _whole_step(N: Array, gradient: Array, u: Index, root: Array | None) -> tuple[Array, float]:
-    """Return the Gauss-Newton step (u,) and its size in standard deviations.
-
-    From the cofactors' root if given; otherwise the equations are solved, in half the time. Raises
-    GeometryError.
-    """
-    diagonal = N.diagonal()
-    if root is None and np.minimum.reduce(diagonal) > 0:
-        scale = 1.0 / np.sqrt(diagonal)
-        try:
-            step = scale * np.linalg.solve(N * scale * scale[:, None], scale * gradient)
-        except np.linalg.LinAlgError:
-            step = np.full(len(u), np.nan)
-        square = float(gradient @ step)
-        if 0.0 <= square < _LINEAR**2:
-            return step, sqrt(square)
-    if root is None:
-        root = cofactor_root(N, u)
+def _whole_step(gradient: Array, root: Array) -> tuple[Array, float]:
+    """Return the Gauss-Newton step (u,) and its size in standard deviations."""
     half = gradient @ root
     return root @ half, sqrt(half @ half)
 
 
-def _trial_steps(N: Array, u: Index, gradient: Array) -> Iterator[Array]:
+def _trial_steps(N: Array, u: Index, gradient: Array, whole: Array) -> Iterator[Array]:
     """Yield steps to try in turn.
 
     First shortened Gauss-Newton steps, which follow the narrow valleys of correlated parameters,
     then damped ones (Levenberg-Marquardt).
     """
-    root = cofactor_root(N, u)
-    whole = root @ (root.T @ gradient)
-    yield whole
-    for shortened in (0.5, 0.25, 0.1, 0.03):
+    for shortened in (1.0, 0.5, 0.25, 0.1, 0.03):
         yield shortened * whole
     for damping in (1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6):
-        damped = cofactor_root(N, u, damping)
-        yield damped @ (damped.T @ gradient)
+        yield _whole_step(gradient, cofactor_root(N, u, damping))[0]
 
 
 def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
     """Solve with other observations in use, by the same partials if the solution hardly moves."""
     N, gradient, _ = problem.sums(solution.whitened, use, solution.values)
     root = cofactor_root(N, problem.unknowns)
-    step, size = _whole_step(N, gradient, problem.unknowns, root)
+    step, size = _whole_step(gradient, root)
     if size > _LINEAR:
         return solve(problem, solution.values, use)
     renewed = Solution(solution.values, solution.whitened.copy(), solution.whitening, root)

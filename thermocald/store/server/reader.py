@@ -19,12 +19,7 @@ from uuid import UUID, uuid5
 import numpy as np
 
 from thermocald import __version__
-from thermocald.store.database.epochs import (
-    latest_epochs,
-    series_row,
-    unpack_covariance,
-    unpack_rows,
-)
+from thermocald.store.database.epochs import latest_epochs, series_row, unpack_covariance
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.schema import COLUMN_NAMES, EPOCH_NUMBERS, EPOCH_TEXTS, sql_name
@@ -40,7 +35,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.store.database.epochs import KeptFrame
-    from thermocald.store.recording.observation_file import ObservationRows
 
 
 _EPOCHS = 500  # epochs fetched at a time by a server-side cursor
@@ -132,14 +126,6 @@ class ServerStore(Connected, SeriesReader):
             (dict(zip(names, values, strict=True)) for values in rows),
             _details if details else None,
         )
-
-    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        statement = (
-            "SELECT number, observations FROM epoch WHERE series = %s AND number >= %s "
-            "AND number <= %s AND observations IS NOT NULL ORDER BY number, revision"
-        )
-        rows = self._stream(statement, (_key(series), first, last))
-        return unpack_rows({number: bytes(data) for number, data in rows if data})
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """Return the clock steps of the series' station, oldest first."""

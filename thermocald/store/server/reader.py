@@ -206,13 +206,6 @@ class ServerWriter(Connected):
         self.station = station
         self.store = UUID(store)
         self._sent: set[UUID] = set()
-        # {table: {column: type}} on the server, read once as every batch needs it
-        self._tables: dict[str, dict[str, str]] = {}
-        for table, column, kind in self._query(
-            "SELECT table_name, column_name, udt_name FROM information_schema.columns "
-            "WHERE table_schema = 'public' ORDER BY ordinal_position"
-        ):
-            self._tables.setdefault(table, {})[column] = kind
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
@@ -262,11 +255,10 @@ class ServerWriter(Connected):
             connection.execute("SELECT thermocald_report(%s, %s, %s, %s, %s, %s)", values)
 
     def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
-        columns = self._tables[table]
         ready: dict[str, Any] = {}
-        if table == "epoch" or "series" in columns:
+        if "series_id" in row:
             ready["series"] = keys.get(row["series_id"]) if row["series_id"] is not None else None
-        if "station" in columns:
+        if table != "epoch":
             ready["station"] = self.station
         for name, value in row.items():
             if name in _LOCAL[table]:
@@ -281,20 +273,10 @@ class ServerWriter(Connected):
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]
     ) -> None:
         """Insert rows by one statement, which skips those that exist."""
-        kinds = self._tables[table]
-        names = list(rows[0])
-        columns = ", ".join(f'"{name}"' for name in names)
-        arrays = ", ".join(f"%b::{kinds[name]}[]" for name in names)
-        values = tuple([_convert(kinds[name], row[name]) for row in rows] for name in names)
+        columns = ", ".join(f'"{name}"' for name in rows[0])
+        places = ", ".join([f"({', '.join(['%b'] * len(rows[0]))})"] * len(rows))
         connection.execute(
-            f'INSERT INTO "{table}" ({columns}) SELECT * FROM unnest({arrays}) '
             # naming a conflict target would need permission to read
-            "ON CONFLICT DO NOTHING",
-            values,
+            f'INSERT INTO "{table}" ({columns}) VALUES {places} ON CONFLICT DO NOTHING',
+            [value for row in rows for value in row.values()],
         )
-
-
-def _convert(kind: str, value: Any) -> Any:
-    """Convert a value to the column's type, since an array must hold one type only."""
-    of = {"float8": float, "int4": int, "int8": int}.get(kind)
-    return value if value is None or of is None else of(value)

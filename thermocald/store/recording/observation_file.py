@@ -8,22 +8,22 @@ same to the bit. It needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk
 interface of a CSV table's chunk, so both pass the same checks.
 
 A CSV file that is too long for memory is read several times by an analysis. Its text is parsed only
-once, into a Parquet copy in the user's cache, found by the text's path, inode, size and time.
+once, into a Parquet copy in the folder of the user's cache.
 """
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import shutil
-import time
+import weakref
 from bisect import bisect_left, bisect_right
-from contextlib import suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -52,7 +52,6 @@ _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 LONG_FROM_BYTES = 100_000_000
 _ROWS = 1 << 18
 _TEXT_BLOCK = 1 << 24  # bytes of text that are parsed at a time
-_KEPT_DAYS = 14.0  # since a copy was last read
 
 log = logging.getLogger(__name__)
 
@@ -96,18 +95,6 @@ class ObservationRows:
         low, high = np.searchsorted(self.epochs, [begin, end])
         return self.rows(slice(int(low), int(high)))
 
-    def of_epoch(self, epoch: int) -> Observations:
-        """Return the observations of an epoch, as views; rows must be sorted by epoch."""
-        return self.between(epoch, epoch + 1).seen
-
-    def grid(self, begin: int, end: int, targets: int) -> ObservationGrid:
-        """Return the grid of epochs `begin` to `end` (exclusive), to which all rows belong."""
-        seen = self.seen
-        return ObservationGrid.from_rows(
-            (end - begin, targets), self.epochs - begin, seen.targets, seen.points, seen.sigmas,
-            seen.covariances,
-        )  # fmt: skip
-
 
 def grid_runs(epochs: int, targets: int, windows: Sequence[slice] | None) -> Iterator[slice]:
     """Yield the slices of epochs that make the grids of a series, or of some windows of it."""
@@ -136,9 +123,8 @@ class ObservationFile:
     def _whole(self) -> ObservationRows:
         """All observations sorted by epoch; the file may have them in any order."""
         parts = [self._read(chunk, self._quality) for chunk in self._table.chunks()]
-        whole = ObservationRows.join(parts) if parts else self._no_rows()
+        whole = self._single(ObservationRows.join(parts) if parts else self._no_rows())
         del parts
-        self._refuse_duplicates(whole)
         if np.any(np.diff(whole.epochs) < 0):
             whole = whole.rows(np.argsort(whole.epochs, kind="stable"))
         return whole
@@ -149,38 +135,40 @@ class ObservationFile:
         A long file is read in constant memory. Raises RecordingError if its rows are not in the
         order of their epochs.
         """
-        if not self.is_long:
-            yield from map(self._whole.of_epoch, range(window.start, window.stop))
-            return
         for rows, first, stop in self._blocks([window], self._quality):
-            self._refuse_duplicates(rows)
             for epoch in range(first, stop):
-                yield rows.of_epoch(epoch)
+                yield rows.between(epoch, epoch + 1).seen
 
     def grids(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
         """Yield observations as grids of consecutive epochs, each with its first epoch (from 0).
 
-        windows: only the epochs of these slices, ascending; of a Parquet file only they are read.
+        windows: only the epochs of these slices, ascending; of a long Parquet file only they are
+        read. Raises the error of `stream`.
         """
+        targets = len(self._field)
         for rows, first, stop in self._blocks(windows, []):
-            for run in grid_runs(stop, len(self._field), [slice(first, stop)]):
+            for run in grid_runs(stop, targets, [slice(first, stop)]):
                 part = rows.between(run.start, run.stop)
-                grid = part.grid(run.start, run.stop, len(self._field))
-                if np.count_nonzero(grid.observed) < len(part.epochs):
-                    self._refuse_duplicates(part)
-                yield run.start, grid
+                seen = part.seen
+                yield run.start, ObservationGrid.from_rows(
+                    (run.stop - run.start, targets), part.epochs - run.start, seen.targets,
+                    seen.points, seen.sigmas, seen.covariances,
+                )  # fmt: skip
 
     def _blocks(
         self, windows: Sequence[slice] | None, quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
         """Yield rows of whole epochs, in order, with the first wanted one and the end."""
+        every = windows or [slice(0, len(self._numbers))]
+        if not self.is_long:
+            yield from ((self._whole, window.start, window.stop) for window in every)
+            return
         columns = [*REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
-        every = [slice(0, len(self._numbers))]
         # text is read once for all windows
         seeks = isinstance(self._table, ParquetTable)
-        parts = [[w] for w in windows or every] if seeks else [list(windows or every)]
+        parts = [[window] for window in every] if seeks else [every]
         for part in parts:
             low, high = self._numbers[[part[0].start, part[-1].stop - 1]].tolist()
             chunks = self._table.chunks(
@@ -213,9 +201,9 @@ class ObservationFile:
             last = int(rows.epochs[-1])
             cut = int(np.searchsorted(rows.epochs, last))
             pending = rows.rows(slice(cut, len(rows.epochs)))
-            yield rows.rows(slice(0, cut)), done, last
+            yield self._single(rows.rows(slice(0, cut))), done, last
             done = last
-        yield pending, done, len(self._numbers)
+        yield self._single(pending), done, len(self._numbers)
 
     def _no_rows(self) -> ObservationRows:
         quality = {name: np.empty(0) for name in self._quality}
@@ -257,7 +245,8 @@ class ObservationFile:
         seen = Observations(targets, points, sigmas, covariances, extras)
         return ObservationRows(epochs, seen, chunk.first)
 
-    def _refuse_duplicates(self, rows: ObservationRows) -> None:
+    def _single(self, rows: ObservationRows) -> ObservationRows:
+        """Return rows as they are. Raises RecordingError for a target twice in one epoch."""
         targets = rows.seen.targets
         keys = rows.epochs * len(self._field) + targets
         order = np.argsort(keys, kind="stable")
@@ -269,6 +258,7 @@ class ObservationFile:
             self._table.fail(
                 rows.first + row, "target", f"target {name!r} is duplicated in epoch {number}"
             )
+        return rows
 
 
 class ParquetTable(Table):
@@ -358,46 +348,28 @@ class ColumnChunk(Chunk):
 
 
 def _parse_once(table: Table) -> Table:
-    """Return the binary copy of a text table from the user's cache; write it if there is none.
+    """Return a binary copy of a text table, in a file without a name that ends with its reader.
 
     Without pyarrow or space on the disk, or if pyarrow's parser refuses the text, the table itself
     is returned: reading it then reports what is wrong.
     """
     try:
-        found = table.path.stat()
-        key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
-        folder = _cache()
-        copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
-        if copy.exists():
-            with suppress(OSError):  # a cache that is read-only
-                os.utime(copy)
-        else:
-            for old in folder.glob("*.parquet"):
-                with suppress(OSError):
-                    if old.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
-                        old.unlink()
-            if shutil.disk_usage(folder).free < 2 * found.st_size:
-                return table
-            partial = copy.with_name(f"{copy.stem}-{os.getpid()}.parquet")
-            try:
-                _parse(table, partial)
-                partial.replace(copy)
-            finally:
-                partial.unlink(missing_ok=True)
-        return ParquetTable(copy, REQUIRED, table)
+        # /tmp may be in memory
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thermocald"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < 2 * table.path.stat().st_size:
+            return table
+        with ExitStack() as kept:
+            path = Path(f"/dev/fd/{kept.enter_context(TemporaryFile(dir=folder)).fileno()}")
+            _parse(table, path)
+            copy = ParquetTable(path, REQUIRED, table)
+            weakref.finalize(copy, kept.pop_all().close)
+            return copy
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
     except (OSError, RuntimeError, ValueError, RecordingError) as cause:  # pyarrow, or no home
         log.debug("%s has no binary copy: %s", table.path, cause)
     return table
-
-
-def _cache() -> Path:
-    """Return the user's folder of copies. Raises OSError or RuntimeError if there is none."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "thermocald"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    return folder
 
 
 def _parse(table: Table, target: Path) -> None:

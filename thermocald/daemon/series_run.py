@@ -175,7 +175,8 @@ class SeriesRun:
         return GaugeObserver(plan.calibrator, self._report)
 
     def _report(self, kind: str, text: str, utc: float, epoch: int) -> None:
-        log.warning("camera %s: %s", self.plan.name, text, extra={"event": kind})
+        text = f"camera {self.plan.name}: {text}"
+        log.warning(text, extra={"event": kind})
         self.record(utc, kind, text, epoch)
 
     def record(self, utc: float, kind: str, text: str, epoch: int | None = None) -> None:

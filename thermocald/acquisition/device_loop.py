@@ -252,14 +252,13 @@ class DeviceLoop:
 
     link: Link
     action: Callable[[], object]
-    clock: Clock
-    period_s: float
     begin: float
     free_running: bool = False
     idle: Callable[[], bool] = lambda: False
 
     def __post_init__(self) -> None:
-        self.schedule = Schedule(self.clock, self.period_s, self.begin)
+        self.clock = self.link.clock
+        self.schedule = Schedule(self.clock, self.link.period_s, self.begin)
         self.lost = 0
         self._stop = threading.Event()
         self._busy_since: float | None = None

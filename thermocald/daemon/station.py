@@ -68,9 +68,8 @@ class CameraLine:
             runtime.free_running,
         )  # fmt: skip
         self.loop = DeviceLoop(
-            self.link, self._capture, runtime.clock, plan.config.period_s, self.begin,
-            runtime.free_running, lambda: not self.taking,
-        )  # fmt: skip
+            self.link, self._capture, self.begin, runtime.free_running, lambda: not self.taking
+        )
         self.take(plan.config.series, runtime.start_condition)
 
     def identity(self) -> dict[str, Any]:
@@ -228,13 +227,10 @@ class Station:
             for plan in plan_cameras(config, clock)
         ]  # fmt: skip
         self._readers = {
-            one.name: DeviceLoop(
-                self.thermometers.links[one.name], partial(self._read, one.name), clock,
-                one.period_s, begin,
-            )
-            for one in config.thermometers
-            if one.name not in self.thermometers.with_frames
-        }  # fmt: skip
+            name: DeviceLoop(link, partial(self._read, name), begin)
+            for name, link in self.thermometers.links.items()
+            if name not in self.thermometers.with_frames
+        }
         self._loops = [*self._readers.values(), *(camera.loop for camera in self.cameras)]
         self._retention = threading.Thread(target=self._retain, name="retention", daemon=True)
 

@@ -59,7 +59,6 @@ class I2cThermometer(support.CheckedThermometer):
 
     chip: ClassVar[str]
     addresses: ClassVar[range | tuple[int, ...]]
-    range_c: ClassVar[tuple[float, float]]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -71,7 +70,6 @@ class I2cThermometer(support.CheckedThermometer):
                 f"address: 0x{chosen:02x} is not an address of a {self.chip} ({known})"
             )
         self.where = f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.options.bus}"
-        self.checked = support.Channels(self.clock, *self.range_c)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
@@ -106,11 +104,11 @@ class I2cThermometer(support.CheckedThermometer):
 
     def read(self) -> Reading:
         self.opened()
-        return self.checked.reading({self.options.channel: (self.where, self._checked)})
+        return self.reading({self.options.channel: (self.where, self._judged)})
 
-    def _checked(self) -> float:
+    def _judged(self) -> float:
         value, idle = self._measure()
-        return self.checked.judge("", value, self.where, idle)
+        return self.judge("", value, self.where, idle)
 
     def _identify(self) -> None:
         """Check the chip's identity and make it convert; WrongDevice if it is another chip."""

@@ -31,7 +31,7 @@ from thermocald.store.database.store import Store
 @pytest.mark.parametrize("fast", [True, False])
 def test_what_a_recording_lacks_does_not_shift_the_rest(tmp_path, fast):
     """Regression: six missing readings left all later epochs without temperature."""
-    source = make_recording(tmp_path / "R", 24, interval=0.1)
+    source = make_recording(tmp_path / "R", 24, interval=0.05)
     rows = [line.split(",") for line in (source / "epochs.csv").read_text().splitlines()]
     column = rows[0].index("temperature")
     for row in rows[10:16]:

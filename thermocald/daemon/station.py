@@ -44,7 +44,7 @@ _FROZEN = 2  # repeats from which a camera counts as frozen
 
 @dataclass(eq=False)
 class CameraLine:
-    """A camera and the series it takes; only the service's thread changes the series."""
+    """A camera and the series it takes; one thread at a time changes the series."""
 
     plan: CameraPlan
     runtime: Runtime

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from tests.daemon.test_page_attacks import resident_mb
 from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
@@ -61,10 +62,7 @@ def test_a_daemon_that_waits_keeps_to_88_mb(daemon, replayed, tmp_path):
     while len(daemon.results()) < 12:
         assert daemon.process.poll() is None
         time.sleep(0.2)
-    status = Path(f"/proc/{daemon.process.pid}/status").read_text()
-    resident_mb = int(status.split("VmRSS:")[1].split()[0]) / 1024
-    print(f"{resident_mb:.1f} MB resident")
-    assert resident_mb < 88.0
+    assert resident_mb(daemon.process.pid) < 88.0
     assert daemon.stop() == 0
 
 

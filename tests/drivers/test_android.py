@@ -151,7 +151,7 @@ def test_a_file_that_grows_is_awaited(server, phone):
     assert frame.encoded.endswith(b"\xff\xd9")
 
 
-SOON = {"timeout_s": 0.5}
+SOON = {"timeout_s": 0.3}
 REFUSED = {
     "never ends": (
         {"shoot": lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])}, SOON,

@@ -159,20 +159,20 @@ class SeriesRun:
 
     def _make_observer(self) -> Any:
         """Return the camera's online estimate; None if the camera is not calibrated."""
-        plan = self.plan
-        if plan.sensor is None or plan.testfield is None or plan.calibrator is None:
+        calibrator = self.plan.calibrator
+        if calibrator is None:
             return None
-        if isinstance(plan.calibrator, Calibrator):
+        if isinstance(calibrator, Calibrator):
             from thermocald.analysis.online.observer import OnlineObserver
 
-            return OnlineObserver(plan.sensor, plan.testfield, self._report)
+            return OnlineObserver(calibrator.sensor, calibrator.testfield, self._report)
         from thermocald.analysis.thermal.gauge import GaugeObserver
 
         # the readings of many, since effects have a memory; the details of the most recent
         detailed = max(0, self.first - 1 - _DETAILED)
         earlier = self.read(detailed - _LATEST, detailed, details=False)
-        plan.calibrator.remember([*earlier, *self.read(detailed + 1)])
-        return GaugeObserver(plan.calibrator, self._report)
+        calibrator.remember([*earlier, *self.read(detailed + 1)])
+        return GaugeObserver(calibrator, self._report)
 
     def _report(self, kind: str, text: str, utc: float, epoch: int) -> None:
         text = f"camera {self.plan.name}: {text}"

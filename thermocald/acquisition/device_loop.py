@@ -87,7 +87,6 @@ class Schedule:
             "ticks": self._ticks,
             "skipped": self._skipped,
             "late_p99_s": late[math.ceil(0.99 * len(late)) - 1],
-            "late_max_s": late[-1],
         }
 
 

@@ -115,7 +115,7 @@ class SeriesRun:
     def __post_init__(self) -> None:
         plan, names = self.plan, self.plan.config.thermometers
         self.last: dict[str, Any] = {}
-        self.stored = self.kept_frames = 0
+        self.stored = 0
         self._guard = self.runtime.guard
         self._series = self._guard.find(plan.name, plan.series)
         self._backlog: list[Epoch] = []
@@ -271,7 +271,6 @@ class SeriesRun:
         path = None
         if self.frames.wanted(epoch.number, eventful) or deferred:
             path = self.frames.keep(plan.name, plan.series, epoch.number, acquired.frame)
-            self.kept_frames += path is not None
         if calibrated is not None:
             result = EpochResult.from_adjustment(calibrated.adjustment)
             extra |= calibrated.extra
@@ -345,7 +344,6 @@ class SeriesRun:
         frame = next((s.epoch.frame for s in self.read(epoch.number, epoch.number)), None)
         if frame is not None and not self.frames.wanted(epoch.number, failed):
             self.frames.delete(frame)
-            self.kept_frames -= 1
         else:
             self._correct(frame, calibrated)
 

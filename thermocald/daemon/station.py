@@ -196,7 +196,6 @@ class CameraLine:
             "deferred": 0 if pipeline is None else pipeline.dropped,
             "caught_up": 0 if pipeline is None else pipeline.caught_up,
             "stored": 0 if run is None else run.stored,
-            "frames_kept": 0 if run is None else run.kept_frames,
             "last": {} if run is None else run.last,
         }
 
@@ -213,7 +212,6 @@ class Station:
         self.config, self.runtime = config, runtime
         clock = runtime.clock
         self.frames = FrameFolder(config.frames)
-        self.logged = 0  # readings stored apart from epochs
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
@@ -340,7 +338,6 @@ class Station:
                 }
                 for output in self.outputs
             },
-            "readings_logged": self.logged,
             "frames": {
                 "keep": self.config.frames.keep,
                 "paused": self.frames.paused,
@@ -366,7 +363,6 @@ class Station:
         if not in_epochs:
             trusted = self.runtime.clock.trusted()
             self.runtime.guard.reading(LoggedReading(name, reading.utc, reading.values, trusted))
-            self.logged += 1
 
     def retain(self) -> list[str]:
         """Delete expired frames; return sentences on what was deleted."""

@@ -513,7 +513,6 @@ class StoreGuard:
     def status(self) -> dict[str, Any]:
         """Return the store's part of the status document."""
         return {
-            "path": str(self.path),
             "state": "out" if self.away else "results_only" if self.thin else "ok",
             "why": self.away,
             "waiting": self.waiting,

@@ -161,9 +161,9 @@ def export(
 def study(
     inputs: list[str] | None = typer.Argument(
         None,
-        metavar="[LABEL=]RECORDING_OR_STORE…",
-        help="Recordings (folders) and stores (files). Series with the same label belong to one "
-        "camera; default label: the camera's name.",
+        metavar="RECORDING_OR_STORE",
+        help="Recordings (folders) and stores (files), also as LABEL=RECORDING_OR_STORE: series "
+        "with the same label belong to one camera; default label: the camera's name.",
     ),
     json: JsonOption = None,
     report: Path | None = typer.Option(None, help="Write the report to an HTML file."),
@@ -289,7 +289,7 @@ def discover(
 def fit(
     inputs: list[str] = typer.Argument(
         ...,
-        metavar="RECORDING_OR_STORE…",
+        metavar="RECORDING_OR_STORE",
         help="Recordings and stores; or JSON files of `calibrate`, each with its temperature, °C: "
         "21.5=cold.json.",
     ),

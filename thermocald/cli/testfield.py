@@ -127,7 +127,7 @@ def print_(
 def import_(
     source: Path | None = typer.Argument(
         None,
-        metavar="[FILE]",
+        metavar="FILE",
         help="Kalibr's target.yaml, OpenCV's board parameters, a calib.io file, or a target list.",
     ),
     out: Path = typer.Option(
@@ -226,7 +226,7 @@ def survey(
 
 def check(
     field: Path | None = typer.Argument(
-        None, metavar="[FIELD]", help="A testfield.csv; default: the field that `print` would draw."
+        None, metavar="FIELD", help="A testfield.csv; default: the field that `print` would draw."
     ),
     paper: Paper = "A3",
     flat: Flat = False,

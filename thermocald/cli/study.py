@@ -66,9 +66,9 @@ def replay(
     """
     from thermocald.store.recording.sense import doubt_lines
 
-    if model is not None and log is None:
-        raise UsageError("--model and --log go together")
-    if model is not None and log is not None:
+    if model is not None:
+        if log is None:
+            raise UsageError("--model and --log go together")
         from thermocald.store.logger.photographs import find_photographs
 
         camera, pictures = tc.load_camera(model), find_photographs([recording])

@@ -8,22 +8,22 @@ same to the bit. It needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk
 interface of a CSV table's chunk, so both pass the same checks.
 
 A CSV file that is too long for memory is read several times by an analysis. Its text is parsed only
-once, into a Parquet copy in the folder of the user's cache.
+once, into a Parquet copy in the user's cache, found by the text's path, inode, size and time.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import shutil
-import weakref
+import time
 from bisect import bisect_left, bisect_right
-from contextlib import ExitStack
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -52,6 +52,7 @@ _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 LONG_FROM_BYTES = 100_000_000
 _ROWS = 1 << 18
 _TEXT_BLOCK = 1 << 24  # bytes of text that are parsed at a time
+_KEPT_DAYS = 14.0  # since a copy was last read
 
 log = logging.getLogger(__name__)
 
@@ -348,28 +349,46 @@ class ColumnChunk(Chunk):
 
 
 def _parse_once(table: Table) -> Table:
-    """Return a binary copy of a text table, in a file without a name that ends with its reader.
+    """Return the binary copy of a text table from the user's cache; write it if there is none.
 
     Without pyarrow or space on the disk, or if pyarrow's parser refuses the text, the table itself
     is returned: reading it then reports what is wrong.
     """
     try:
-        # /tmp may be in memory
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thermocald"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if shutil.disk_usage(folder).free < 2 * table.path.stat().st_size:
-            return table
-        with ExitStack() as kept:
-            path = Path(f"/dev/fd/{kept.enter_context(TemporaryFile(dir=folder)).fileno()}")
-            _parse(table, path)
-            copy = ParquetTable(path, REQUIRED, table)
-            weakref.finalize(copy, kept.pop_all().close)
-            return copy
+        found = table.path.stat()
+        key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
+        folder = _cache()
+        copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
+        if copy.exists():
+            with suppress(OSError):  # a cache that is read-only
+                os.utime(copy)
+        else:
+            for old in folder.glob("*.parquet"):
+                with suppress(OSError):
+                    if old.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
+                        old.unlink()
+            if shutil.disk_usage(folder).free < 2 * found.st_size:
+                return table
+            partial = copy.with_name(f"{copy.stem}-{os.getpid()}.parquet")
+            try:
+                _parse(table, partial)
+                partial.replace(copy)
+            finally:
+                partial.unlink(missing_ok=True)
+        return ParquetTable(copy, REQUIRED, table)
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
     except (OSError, RuntimeError, ValueError, RecordingError) as cause:  # pyarrow, or no home
         log.debug("%s has no binary copy: %s", table.path, cause)
     return table
+
+
+def _cache() -> Path:
+    """Return the user's folder of copies. Raises OSError or RuntimeError if there is none."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "thermocald"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return folder
 
 
 def _parse(table: Table, target: Path) -> None:

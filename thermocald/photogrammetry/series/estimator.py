@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, settle
 from thermocald.photogrammetry.linalg import MEDIAN_CHI2, median_known
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (

@@ -4,7 +4,7 @@ A `Design` defines the unknowns and their priors. Own parameters are those of an
 common ones those of the series (q parameters, then the offsets in x and in y of the T targets). A
 parameter may be both: an epoch's own part is then drawn to the common one, as a random effect.
 Arrays only; `covariances` gives the accuracy. Data snooping tests every point against its own
-epoch, as `epoch.snooping` does, for all epochs at once.
+epoch, as `epoch.gauss_markov` does, for all epochs at once.
 
 Source: the reduction of common unknowns as Helmert blocking, Wolf, H. (1978): The Helmert block
 method.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, limit_2d
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, limit_2d
 from thermocald.photogrammetry.linalg import MEDIAN_CHI2, inverse_of_determined
 from thermocald.photogrammetry.series.normals import (
     Partials,
@@ -373,7 +373,7 @@ def snoop_series(
     typical: float,
     freedom: Array | None,
 ) -> Mask:
-    """Return the mask (E, T) of image points to keep, by the rule of `epoch.snooping.snoop`.
+    """Return the mask (E, T) of image points to keep, by the rule of `epoch.gauss_markov.snoop`.
 
     typical: variance of unit weight of the series, for epochs too poor to estimate theirs; freedom
     (T,): degrees of freedom of each target's noise, None if the noise is as stated.

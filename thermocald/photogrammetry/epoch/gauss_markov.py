@@ -1,9 +1,9 @@
 """Gauss-Markov least squares on the image points of one epoch: iteration, cofactors, snooping.
 
-The numerical half of `adjustment`, on arrays. Adding the object
-coordinates' covariance to the image point's eliminates these coordinates; multiplication by the
-inverse Cholesky factors then gives all observations unit weight. An epoch has so few points that
-calls cost more than arithmetic: constants are computed once, and in place where that is safe.
+The numerical half of `adjustment`, on arrays. Adding the object coordinates' covariance to the
+image point's eliminates these coordinates; multiplication by the inverse Cholesky factors then
+gives all observations unit weight. An epoch has so few points that calls cost more than arithmetic:
+constants are computed once, and in place where that is safe.
 
 Data snooping is Baarda's test on the two coordinates of a point together, with noise estimated from
 the residuals.

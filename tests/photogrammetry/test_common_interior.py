@@ -75,9 +75,7 @@ def errors(draws: int, seed: int, **drawn):
                 look_at(c.tolist(), [150, 180, 160], i * 1.6) for i, c in enumerate(centres)
             ]
         known, measured = photographs(rng, 0.05, stations=stations, **drawn)
-        r = adjust_common_interior(
-            scene.SENSOR, known, measured, InteriorOrientation(3.0), stations
-        )
+        r = adjust_common_interior(scene.SENSOR, known, measured, scene.INTERIOR, stations)
         sd = np.sqrt(np.diag(r.covariance))[PRINCIPAL]
         yield r, stations, (r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / sd
 

@@ -120,29 +120,24 @@ def _adjust(photos, **options):
 
 
 @pytest.mark.parametrize(
-    ("field", "stations", "reason"),
+    ("field", "stations", "distances", "reason"),
     [
-        (_BENT, cases.convergent_stations(_BENT)[:2], "2 photographs"),
-        (_FLAT, _parallel(_FLAT, (-180, 0, 180), (-130, 0, 130)),
+        (_BENT, cases.convergent_stations(_BENT)[:2], None, "2 photographs"),
+        (_FLAT, _parallel(_FLAT, (-180, 0, 180), (-130, 0, 130)), None,
          "principal distance is uncertain"),
         (_BENT, [cases.looking_at(np.add(_SPOT, (0, 0, 900)), np.add(_SPOT, (10 * i, 0, 0)), i)
-                 for i in range(6)], "rays meet at|oriented to each other"),
-        (_BENT[:6], cases.convergent_stations(_BENT[:6]), "6 targets"),
+                 for i in range(6)], None, "rays meet at|oriented to each other"),
+        (_BENT[:6], cases.convergent_stations(_BENT[:6]), None, "6 targets"),
+        (_BENT, cases.convergent_stations(_BENT), [], "--scale"),
+        (_BENT, cases.convergent_stations(_BENT), [Distance("t0", "elsewhere", 100.0, 0.1)],
+         "elsewhere"),
     ],
-    ids=["two photographs", "flat and parallel", "one place", "six targets"],
+    ids=["two photographs", "flat and parallel", "one place", "six targets", "no scale",
+         "scale elsewhere"],
 )  # fmt: skip
-def test_weak_networks_are_refused(field, stations, reason):
+def test_weak_networks_and_those_without_a_scale_are_refused(field, stations, distances, reason):
     with pytest.raises(GeometryError, match=reason):
-        _survey(field, stations, 0.05, seed=0)
-
-
-@pytest.mark.parametrize(
-    ("distances", "reason"),
-    [([], "--scale"), ([Distance("t0", "elsewhere", 100.0, 0.1)], "elsewhere")],
-)
-def test_a_missing_scale_is_refused(distances, reason):
-    with pytest.raises(GeometryError, match=reason):
-        _survey(_BENT, cases.convergent_stations(_BENT), 0.05, 0, distances)
+        _survey(field, stations, 0.05, 0, distances)
 
 
 def test_sigmas_twice_too_small_show_in_sigma0_and_twenty_times_are_refused():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import fdtrc
 
-from thermocald.photogrammetry.epoch.snooping import limit_2d
+from thermocald.photogrammetry.epoch.gauss_markov import limit_2d
 from thermocald.photogrammetry.series.target_noise import neighbours_variance, noise_ratios
 
 TARGETS = 150

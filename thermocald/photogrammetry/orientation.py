@@ -312,8 +312,8 @@ def refine(
     prior[:7] = (_KNOWN_BETTER if known else 1.0) ** 2 / prior_sd**2
     nominal = np.concatenate([interior.as_array(), exterior.as_array()])
     p, last = nominal.copy(), np.inf
-    uv, A, _ = partials(sensor, p[:10], p[10:], points)
     for _ in range(_ITERATIONS):
+        uv, A, _ = partials(sensor, p[:10], p[10:], points)
         r = np.nan_to_num(image_points - uv, nan=1e3)
         distance = np.abs(r).max(axis=1)
         scale = max(float(mad_sd(r)), _LEAST_SD_PX)
@@ -327,16 +327,11 @@ def refine(
         p[free] += step
         if p[0] <= 0 or not np.isfinite(p).all():
             p = nominal.copy()
-            uv, A, _ = partials(sensor, p[:10], p[10:], points)
             break
-        uv, A, _ = partials(sensor, p[:10], p[10:], points)
         # Within one standard deviation of the solution is close enough for a prediction.
         in_sds = np.abs(step) * np.sqrt(np.diag(N))
         if abs(last - scale) < 0.1 * scale and in_sds.max() < 1.0:
             break
         last = scale
-    return Orientation(
-        CameraModel(sensor, InteriorOrientation.from_array(p[:10])),
-        ExteriorOrientation.from_array(p[10:]),
-        np.nan_to_num(image_points - uv, nan=1e6),
-    )
+    i, e = InteriorOrientation.from_array(p[:10]), ExteriorOrientation.from_array(p[10:])
+    return Orientation(CameraModel(sensor, i), e, _residuals(sensor, i, e, points, image_points))

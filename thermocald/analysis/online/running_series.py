@@ -31,7 +31,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     project,
 )
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY
 from thermocald.photogrammetry.field.testfield import find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.field_motion import taken_off

@@ -40,19 +40,17 @@ from thermocald.photogrammetry.camera.camera_model import (
     rotation,
 )
 from thermocald.photogrammetry.epoch.gauss_markov import (
+    TRUSTED_REDUNDANCY,
     NoConvergenceError,
     Problem,
     Solution,
-    resolve,
-    solve,
-)
-from thermocald.photogrammetry.epoch.snooping import (
-    TRUSTED_REDUNDANCY,
     fails_global_test,
     most_rejected,
     point_tests,
+    resolve,
     settle,
     snoop,
+    solve,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.orientation import approximate_orientation, resection

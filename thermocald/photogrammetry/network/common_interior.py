@@ -31,7 +31,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     obliqueness_deg,
     uncertain,
 )
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, settle
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (

@@ -31,7 +31,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     free_columns,
 )
 from thermocald.photogrammetry.epoch.adjustment import weaknesses
-from thermocald.photogrammetry.epoch.snooping import (
+from thermocald.photogrammetry.epoch.gauss_markov import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
     most_rejected,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, settle
 from thermocald.photogrammetry.linalg import MEDIAN_CHI2, median_known
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
@@ -263,7 +263,10 @@ class SeriesEstimator:
             left = self._residuals(there, planes(2, *system.use.shape))
             if system.step(left, there).size < step.size:
                 return step
-            step = step.halved()
+            step = replace(
+                step, d_own=step.d_own / 2, d_common=step.d_common / 2,
+                d_offsets=step.d_offsets / 2,
+            )  # fmt: skip
         return None
 
     def snoop(self, estimate: Estimate, offered: Mask) -> Estimate:
@@ -365,7 +368,6 @@ class SeriesEstimator:
                 getattr(whole, name)[rows] = getattr(last, name)
             for name in ("use", "Q", "good"):
                 getattr(system, name)[rows] = getattr(last.system, name)
-            system.alike = None
         return whole
 
     def _linearised(self, values: Array, use: Mask, variance: float) -> SeriesSystem:

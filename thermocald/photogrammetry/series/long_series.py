@@ -236,14 +236,13 @@ class KnownSeries:
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
         held = replace(series, grid=series.grid[:0], held=at, unit=unit, windows=())
-        known = cls(
-            held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
+        mean = np.zeros((len(design.own), design.width))
+        for part, C in system.couplings():
+            mean += (system.Q[part] @ C).sum(axis=0) / system.good.sum()
+        return cls(
+            held, design, estimate.offsets, estimate.pose, system.Q_common, mean,
             system.common_share, sample.excess_sd**2, middle, sample.pairs, sample.movement, slow,
         )  # fmt: skip
-        sums = CommonSums(design)
-        right = np.zeros((len(sample.values), len(design.own)))
-        sums.add(0, system, estimate.residuals, right)
-        return replace(known, mean=sums.solved(known)[0].mean)
 
     def adjusted(
         self, grid: ObservationGrid, epochs: int, line: Array

@@ -58,18 +58,14 @@ class ObservationGrid:
         shape = (len(epochs), len(field))
         if not present:
             return cls(np.full((*shape, 2), np.nan), np.zeros((*shape, 3)))
-        xy = None
-        if any(obs.covariances is not None for _, obs in present):
-            xy = np.concatenate(
-                [np.zeros(len(o)) if o.covariances is None else o.covariances for _, o in present]
-            )
+        xy = [np.zeros(len(o)) if o.covariances is None else o.covariances for _, o in present]
         return cls.from_rows(
             shape,
             np.repeat([e for e, _ in present], [len(obs) for _, obs in present]),
             np.concatenate([obs.targets for _, obs in present]),
             np.concatenate([obs.points for _, obs in present]),
             np.concatenate([obs.sigmas for _, obs in present]),
-            xy,
+            np.concatenate(xy),
         )
 
     @classmethod

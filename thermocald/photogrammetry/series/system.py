@@ -4,7 +4,7 @@ A `Design` defines the unknowns and their priors. Own parameters are those of an
 common ones those of the series (q parameters, then the offsets in x and in y of the T targets). A
 parameter may be both: an epoch's own part is then drawn to the common one, as a random effect.
 Arrays only; `covariances` gives the accuracy. Data snooping tests every point against its own
-epoch, as `epoch.snooping` does, for all epochs at once.
+epoch, as `epoch.gauss_markov` does, for all epochs at once.
 
 Source: the reduction of common unknowns as Helmert blocking, Wolf, H. (1978): The Helmert block
 method.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, limit_2d
+from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, limit_2d
 from thermocald.photogrammetry.linalg import MEDIAN_CHI2, inverse_of_determined
 from thermocald.photogrammetry.series.normals import (
     Partials,
@@ -148,11 +148,6 @@ class Step:
     size: float
     sizes: Array
 
-    def halved(self) -> Step:
-        """Return half the step; the sizes stay, as the solution is as far away as before."""
-        own, common, offsets = self.d_own / 2, self.d_common / 2, self.d_offsets / 2
-        return Step(own, common, offsets, self.size, self.sizes)
-
 
 @dataclass(eq=False)
 class SeriesSystem:
@@ -161,8 +156,7 @@ class SeriesSystem:
     weights (E, T, 3): a priori; use (E, T): points in use; N (E, 16, 16): empty without common
     unknowns; Q (E, p, p): cofactors of the epochs' own parameters, the common ones held; good (E,):
     epochs that determine their parameters; Q_common (q, q), or with offsets (q + 2T, q + 2T): empty
-    before `solved`; alike: epochs with the same matrices (`alike` below), None if outdated;
-    coupled: the result of `couplings`, if it needs little memory.
+    before `solved`; coupled: the result of `couplings`, if it needs little memory.
     """
 
     design: Design
@@ -172,23 +166,18 @@ class SeriesSystem:
     Q: Array
     good: Mask
     Q_common: Array
-    alike: tuple[Index, Index] | None
     coupled: list[tuple[Index, Array]] | None = None
 
     @classmethod
     def formed(cls, design: Design, weights: Array, use: Mask) -> SeriesSystem:
         """Form the normal equations and invert those of the epochs' own parameters."""
         own, A = design.own, design.at.A
-        first, of = alike(weights, use)
-        w = weights[first] * use[first][..., None]
+        w = weights * use[..., None]
         separate = design.width == 0
         N = normal_matrices(w, A[..., own] if separate else A)
         Q, good = cofactors((N if separate else N[:, own[:, None], own]) + design.own_prior)
-        good &= use[first].any(axis=1)
-        if len(first) < len(of):
-            Q, good = Q[of], good[of]
-        N = N[:0] if separate else N[of]
-        return cls(design, weights, use, N, Q, good, np.empty((0, 0)), (first, of))
+        good &= use.any(axis=1)
+        return cls(design, weights, use, N[:0] if separate else N, Q, good, np.empty((0, 0)))
 
     def solved(self) -> SeriesSystem:
         """Return the system with the cofactors of the common unknowns."""
@@ -318,35 +307,17 @@ class SeriesSystem:
         return float(np.trace(held)), float(np.einsum("ij,ji->", held, held))
 
 
-def alike(weights: Array, use: Mask) -> tuple[Index, Index]:
-    """Find epochs with the same points in use with the same weights, and so the same matrices.
-
-    Returns representatives (M,) and the one of each epoch (E,); each its own if few are alike.
-    """
-    rng = np.random.default_rng(0)  # sums with random factors differ if rows do
-    rows = (np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))
-    mark = np.sum([row @ rng.random(row.shape[1]) for row in rows], axis=0)
-    _, first, of = np.unique(mark, return_index=True, return_inverse=True)
-    each = np.arange(len(mark))
-    return (each, each) if 2 * len(first) > len(mark) else (first, of)
-
-
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
     """Return the test (E, T) of every image point against its epoch: χ² with 2 degrees of freedom.
 
     Points not in use are tested as check points. The common unknowns count as error-free, as they
     come from all epochs.
     """
-    first, of = system.alike or alike(system.weights, system.use)
-    E, T = residuals.shape[:2]
     pairs = products(system.design.at.A[..., system.design.own])
-    shared = _test_weights(system, first, pairs) if len(first) < E else None
+    E, T = residuals.shape[:2]
     test = np.empty((E, T))
     for part in chunks(E, T):
-        if shared is None:
-            xx, yy, xy = _test_weights(system, part, pairs)
-        else:
-            xx, yy, xy = shared if len(first) == 1 else shared[:, of[part]]
+        xx, yy, xy = _test_weights(system, part, pairs)
         x, y = residuals[part, :, 0], residuals[part, :, 1]
         out = np.multiply(xx, x, out=test[part])
         out += xy * y
@@ -357,7 +328,7 @@ def point_tests(system: SeriesSystem, residuals: Array) -> Array:
 
 
 def _test_weights(
-    system: SeriesSystem, epochs: slice | Index, products: tuple[Array, Array, Array]
+    system: SeriesSystem, epochs: slice, products: tuple[Array, Array, Array]
 ) -> Array:
     """Return the residuals' inverse covariance (3, M, T): xx, yy, twice xy; 0 without a test."""
     weights = system.weights[epochs]
@@ -402,7 +373,7 @@ def snoop_series(
     typical: float,
     freedom: Array | None,
 ) -> Mask:
-    """Return the mask (E, T) of image points to keep, by the rule of `epoch.snooping.snoop`.
+    """Return the mask (E, T) of image points to keep, by the rule of `epoch.gauss_markov.snoop`.
 
     typical: variance of unit weight of the series, for epochs too poor to estimate theirs; freedom
     (T,): degrees of freedom of each target's noise, None if the noise is as stated.

@@ -124,6 +124,16 @@ def test_without_a_drift_none_is_reported():
     assert sum(claims) <= 1
 
 
+def test_many_epochs_are_averaged():
+    """The standard deviations of all epochs once caused an exception."""
+    n = 250_000
+    rng = np.random.default_rng(5)
+    sd = np.full((n, 16), 1e-4)
+    values = rng.normal(0, 1e-4, (n, 16))
+    values[:, 1] += 3e-4 * np.sin(np.linspace(0, 20, n))
+    assert [c.drifts for c in courses(table_of(values, sd, "series"))] == [False, True, False]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("coloured", "phi", "epochs"), [(1.0, 0.97, 150), (0.5, 0.97, 150), (1.0, 0.9, 30)]

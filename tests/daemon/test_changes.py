@@ -108,11 +108,3 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
     assert (columns["status"] == "ok").all()
     moved = columns["X0"][-1] - columns["X0"][WHEN - 2]
     assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))
-
-
-@pytest.mark.slow  # on a virtual clock in test_virtual_clock
-def test_the_mock_at_half_a_second_tells_nothing(daemon, devices):
-    daemon.run("--epochs", "300", **devices(period_s=0.5))
-    assert daemon.wait(400.0) == 0
-    assert daemon.events() == ["started", "series_begun", "stopped"]
-    assert len(daemon.stored()[0]) == 300

@@ -19,8 +19,8 @@ DAY = 8640
 
 
 @pytest.mark.slow
-def test_the_file_stays_small_when_chunks_merge(tmp_path):
-    assert benchmark.size_ratio(tmp_path, 150, 16_500) <= benchmark.BOUNDS["size"]
+def test_the_file_stays_small(tmp_path):
+    assert benchmark.size_ratio(tmp_path, 150, 4_200) <= benchmark.BOUNDS["size"]
 
 
 READ = textwrap.dedent(

@@ -88,6 +88,10 @@ def test_a_damaged_row_does_not_stop_new_ones(whole, store_path, make_epoch, mak
             store.append(series, make_epoch(i), make_result(i))
         assert store.last_epoch(series) == EPOCHS + 19
         found = store.examine()
+        kept = store.epochs(series)
+        assert [next(kept).epoch.number for _ in range(35)] == list(range(1, 36))
+        with pytest.raises(StoreError, match="epoch 36 is damaged"):
+            next(kept)
     assert found.damaged == ("rpi/M1, epoch 36",)
 
 

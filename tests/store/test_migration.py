@@ -11,7 +11,6 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from tests.commands import call
 from tests.fleet.conftest import address, cluster, server, template  # noqa: F401
 from thermocald.errors import OutputError, ServerError, StoreError, StoreVersionError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
@@ -113,22 +112,6 @@ def test_without_room_for_the_copy_nothing_is_changed(version_1, version_2, monk
     with pytest.raises(StoreError, match="nothing was changed"):
         Store.open(version_1, "append")
     assert version(version_1) == 1
-
-
-@pytest.mark.parametrize("mode", ["read", "append"])
-def test_a_store_of_an_earlier_development_state_is_refused_with_the_way_out(version_1, mode):
-    with closing(sqlite3.connect(version_1)) as database:
-        database.execute(
-            "CREATE TABLE late_epoch (epoch_id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL)"
-        )
-        database.execute("ALTER TABLE column_chunk DROP COLUMN last_id")
-    before = dump(version_1)
-    with pytest.raises(StoreVersionError, match="the program that wrote it, then `th"):
-        Store.open(version_1, mode)
-    assert dump(version_1) == before
-    done = call("check", version_1)
-    assert done.returncode == 1
-    assert "damaged" not in done.stderr
 
 
 def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, monkeypatch):  # noqa: F811

@@ -149,4 +149,4 @@ def test_damage_is_found(path):
     with Store.open(path) as store:
         (series,) = store.all_series()
         with pytest.raises(StoreError, match="is damaged"):
-            store.observation_rows(series, 0, 2 * EPOCHS)
+            list(StoredRecording(store, series).blocks())

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.head import Head
-    from thermocald.store.recording.observation_file import ObservationRows
 
 NOT_CALIBRATED = "not_calibrated"  # status of an epoch that is not adjusted yet
 _LISTED = 20
@@ -175,10 +174,6 @@ class SeriesReader(ABC):
     @abstractmethod
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """Return covariances (E, 16, 16) of the epochs `numbers`, NaN without a result."""
-
-    @abstractmethod
-    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """Return the observations of epochs `first` to `last` (numbers), without their quality."""
 
     @abstractmethod
     def _epochs(

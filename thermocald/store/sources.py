@@ -6,7 +6,7 @@ A store holds times as stamped; analyses get them corrected where the clock was 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from thermocald.errors import StoreError
 from thermocald.files import is_database
+from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.observation_file import grid_runs
 from thermocald.store.recording.reader import EpochColumns
 from thermocald.store.server.connection import ServerAddress, is_server
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.store.recording.head import Head
     from thermocald.store.series import SeriesReader, StoredSeries
 
@@ -136,9 +136,10 @@ class StoredRecording:
         """Yield grids of consecutive epochs, each with its first epoch (from 0), within windows."""
         numbers = self.columns.numbers
         for run in grid_runs(len(self), len(self.testfield), windows):
-            wanted = numbers[run]
-            found = self.store.observation_rows(self.series, int(wanted[0]), int(wanted[-1]))
-            # leaves out epochs that were stored since `columns` was read
-            found = found.rows(np.isin(found.epochs, wanted))
-            found = replace(found, epochs=np.searchsorted(numbers, found.epochs))
-            yield run.start, found.grid(run.start, run.stop, len(self.testfield))
+            wanted = numbers[run].tolist()
+            found = {
+                stored.epoch.number: stored.epoch.observations
+                for stored in self.store.epochs(self.series, wanted[0], wanted[-1])
+            }
+            seen = [found.get(number) for number in wanted]
+            yield run.start, ObservationGrid.from_observations(self.testfield, seen)

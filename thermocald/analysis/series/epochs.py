@@ -276,6 +276,11 @@ class Epochs(Result):
                     f"; the targets moved against one another before epoch {moved}: it cannot be "
                     "decided which of them, and the standard deviations allow for all"
                 )
+            elif self.adjustment is not None and not self.adjustment.noise_shown:
+                cause = (
+                    "; so few observations show the errors of the test field rather than theirs, "
+                    "so that the stated standard deviations are kept, untested"
+                )
             elif sigma0 > 1.0 + MATERIAL:
                 cause = f"; {CAUSES_OF_SIGMA0}"
                 if self.adjustment is not None and np.isfinite(self.adjustment.offsets).any():

@@ -83,7 +83,6 @@ _ITERATIONS = 30
 _SMALL = 0.3  # standard deviations; after a last step below it, c, x0, y0 are good to 1e-3 px
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
 _SINGULAR = 1e-8  # of a correlation matrix's eigenvalues
-_NO_PRIORS = np.empty(0)
 
 
 class NoConvergenceError(Exception):
@@ -96,7 +95,7 @@ class Problem:
 
     points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
     unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight (u, u), prior_value (u,): parameters
-    observed beforehand, with weight 0 for the others; both empty if there are no priors.
+    observed beforehand, with weight 0 for the others.
     """
 
     sensor: Sensor
@@ -120,7 +119,7 @@ class Problem:
 
         known: values (16,) and covariance (16, 16) of parameters that were observed beforehand.
         """
-        weight = value = _NO_PRIORS
+        weight, value = np.zeros((len(unknowns), len(unknowns))), np.zeros(len(unknowns))
         if known is not None:
             value = known[0][unknowns]
             weight = _weight_of(known[1][np.ix_(unknowns, unknowns)])
@@ -148,9 +147,8 @@ class Problem:
         # flat @ flat.T would be NumPy's symmetric product, three times as slow at this size.
         products = flat[:-1] @ flat.T
         N, gradient = products[:, :-1], products[:, -1]
-        if len(self.prior_weight):
-            N += self.prior_weight
-            gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
+        N += self.prior_weight
+        gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
         return N, gradient, float(residuals @ residuals)
 
     def cost(self, v: Array, values: Array) -> float:
@@ -158,12 +156,8 @@ class Problem:
 
         v: whitened residuals of the points in use; values (16,).
         """
-        flat = v.ravel()
-        square = float(flat @ flat)
-        if len(self.prior_weight):
-            difference = values[self.unknowns] - self.prior_value
-            square += float(difference @ self.prior_weight @ difference)
-        return square
+        flat, difference = v.ravel(), values[self.unknowns] - self.prior_value
+        return float(flat @ flat + difference @ self.prior_weight @ difference)
 
 
 def _weight_of(covariance: Array) -> Array:
@@ -243,7 +237,7 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     u, sensor = problem.unknowns, problem.sensor
     observed = problem.observations.points.T
     whitened = np.empty((len(u) + 1, *observed.shape))
-    values, last, near = start, float("inf"), False
+    values, last = start, float("inf")
     whitening: Whitening | None = None
     for _ in range(_ITERATIONS):
         predicted, A, B = partials(sensor, values[IOP], values[EOP], problem.points)
@@ -257,21 +251,17 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         N, gradient, squares = problem.sums(whitened, use, values)
         if not isfinite(squares):
             raise NoConvergenceError("targets came to lie behind the camera during the iteration")
-        # Close to the solution this is most likely the last iteration, which needs the cofactors.
-        root = cofactor_root(N, u) if near else None
-        whole, size = _whole_step(N, gradient, u, root)
+        root = cofactor_root(N, u)
+        whole, size = _whole_step(gradient, root)
         if size < _SMALL:
-            solution = Solution(
-                values, whitened, whitening, cofactor_root(N, u) if root is None else root
-            )
-            return _apply_step(solution, u, whole)
+            return _apply_step(Solution(values, whitened, whitening, root), u, whole)
         near, last = size < _LINEAR and size < 0.5 * last, size
         if near:
             values = values.copy()
             values[u] += whole
             continue
         cost = problem.cost(whitened[-1][:, use], values)
-        for step in _trial_steps(N, u, gradient):
+        for step in _trial_steps(N, u, gradient, whole):
             trial = values.copy()
             trial[u] += step
             residuals = observed - project(sensor, trial[IOP], trial[EOP], problem.points).T
@@ -284,49 +274,29 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
 
 
-def _whole_step(N: Array, gradient: Array, u: Index, root: Array | None) -> tuple[Array, float]:
-    """Return the Gauss-Newton step (u,) and its size in standard deviations.
-
-    From the cofactors' root if given; otherwise the equations are solved, in half the time. Raises
-    GeometryError.
-    """
-    diagonal = N.diagonal()
-    if root is None and np.minimum.reduce(diagonal) > 0:
-        scale = 1.0 / np.sqrt(diagonal)
-        try:
-            step = scale * np.linalg.solve(N * scale * scale[:, None], scale * gradient)
-        except np.linalg.LinAlgError:
-            step = np.full(len(u), np.nan)
-        square = float(gradient @ step)
-        if 0.0 <= square < _LINEAR**2:
-            return step, sqrt(square)
-    if root is None:
-        root = cofactor_root(N, u)
+def _whole_step(gradient: Array, root: Array) -> tuple[Array, float]:
+    """Return the Gauss-Newton step (u,) and its size in standard deviations."""
     half = gradient @ root
     return root @ half, sqrt(half @ half)
 
 
-def _trial_steps(N: Array, u: Index, gradient: Array) -> Iterator[Array]:
+def _trial_steps(N: Array, u: Index, gradient: Array, whole: Array) -> Iterator[Array]:
     """Yield steps to try in turn.
 
     First shortened Gauss-Newton steps, which follow the narrow valleys of correlated parameters,
     then damped ones (Levenberg-Marquardt).
     """
-    root = cofactor_root(N, u)
-    whole = root @ (root.T @ gradient)
-    yield whole
-    for shortened in (0.5, 0.25, 0.1, 0.03):
+    for shortened in (1.0, 0.5, 0.25, 0.1, 0.03):
         yield shortened * whole
     for damping in (1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6):
-        damped = cofactor_root(N, u, damping)
-        yield damped @ (damped.T @ gradient)
+        yield _whole_step(gradient, cofactor_root(N, u, damping))[0]
 
 
 def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
     """Solve with other observations in use, by the same partials if the solution hardly moves."""
     N, gradient, _ = problem.sums(solution.whitened, use, solution.values)
     root = cofactor_root(N, problem.unknowns)
-    step, size = _whole_step(N, gradient, problem.unknowns, root)
+    step, size = _whole_step(gradient, root)
     if size > _LINEAR:
         return solve(problem, solution.values, use)
     renewed = Solution(solution.values, solution.whitened.copy(), solution.whitening, root)

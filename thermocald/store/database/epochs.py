@@ -18,7 +18,9 @@ import logging
 import math
 import sqlite3
 import struct
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -32,20 +34,21 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.store.database.columns import (
     KEPT,
+    DamageError,
     checked_chunks,
+    examined_epochs,
     examined_rows,
     insert_row,
     require_checksum,
     row_checksum,
 )
 from thermocald.store.recording.head import head_document, parse_head
-from thermocald.store.recording.observation_file import ObservationRows
 from thermocald.store.recording.testfield_file import parse_testfield, testfield_csv
 from thermocald.store.schema import sql_name
 from thermocald.store.series import EpochResult, StoredEpoch, StoredSeries
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
@@ -102,74 +105,30 @@ def pack_observations(seen: Observations) -> bytes:
 
 def unpack_observations(data: bytes) -> Observations:
     """Invert `pack_observations`. Raises StoreError for other bytes."""
-    flags, n, start = _read_header(data)
-    seen = _unpack(flags, [(0, n, start, data)]).seen
-    try:
-        names = data[_HEADER.size : start].decode()
-        end = start + n * sum(_sizes(flags))
-        quality = {
-            name: np.frombuffer(data, "<f4", n, end + 4 * n * i).astype(np.float64)
-            for i, name in enumerate(filter(None, names.split("\n")))
-        }
-    except ValueError as cause:
-        raise StoreError(f"observations in the store are broken: {cause}") from cause
-    return replace(seen, quality=quality)
-
-
-def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
-    """Return the observations of many epochs {number: bytes}, without their quality.
-
-    The bytes of all epochs of one layout are converted at once. Raises StoreError for other bytes.
-    """
-    kinds: dict[int, list[tuple[int, int, int, bytes]]] = {}
-    for number, data in packed.items():
-        flags, n, start = _read_header(data)
-        kinds.setdefault(flags, []).append((number, n, start, data))
-    return ObservationRows.join(
-        [_unpack(flags, epochs) for flags, epochs in kinds.items()] or [_unpack(0, [])]
-    )
-
-
-def _read_header(data: bytes) -> tuple[int, int, int]:
-    """Return the flags of packed observations, their number, and the offset of the first."""
     if len(data) < _HEADER.size or data[0] != _LAYOUT:
         raise StoreError("observations in the store are broken: their layout is unknown")
     _, flags, n, names_size = _HEADER.unpack_from(data)
-    return flags, n, _HEADER.size + names_size
+    at = _HEADER.size + names_size
 
+    def column(kind: str, width: int = 1) -> Array:
+        nonlocal at
+        found = np.frombuffer(data, kind, n * width, at)
+        at += found.nbytes
+        return found.astype(np.float64)
 
-def _sizes(flags: int) -> list[int]:
-    """Return the sizes in bytes of a target, a point, its standard deviations, any covariance.
-
-    The quality follows, column by column.
-    """
-    sizes = [2, 16 if flags & _FLOAT_POINTS else 8, 8]
-    return [*sizes, 4] if flags & _COVARIANCES else sizes
-
-
-def _unpack(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
-    """Unpack epochs of one layout, each given as its number, rows, offset and bytes."""
-    sizes = _sizes(flags)
-    columns: list[list[bytes]] = [[] for _ in sizes]
-    for _, n, position, data in epochs:
-        if len(data) < position + n * sum(sizes):
-            raise StoreError("observations in the store are broken: some are missing")
-        for column, size in zip(columns, sizes, strict=True):
-            column.append(data[position : position + n * size])
-            position += n * size
-    whole = [b"".join(column) for column in columns]
-    points = np.frombuffer(whole[1], "<f8" if flags & _FLOAT_POINTS else "<i4").astype(np.float64)
-    if not flags & _FLOAT_POINTS:
-        # division by 1e5 gives the double nearest to the decimal; a product with 1e-5 would not
-        points /= round(1 / POINT_QUANTUM_PX)
-    numbers, counts = (np.array([e[k] for e in epochs], dtype=np.int64) for k in (0, 1))
-    seen = Observations(
-        np.frombuffer(whole[0], "<u2").astype(np.int64),
-        points.reshape(-1, 2),
-        np.frombuffer(whole[2], "<f4").astype(np.float64).reshape(-1, 2),
-        np.frombuffer(whole[3], "<f4").astype(np.float64) if flags & _COVARIANCES else None,
-    )
-    return ObservationRows(np.repeat(numbers, counts), seen)
+    try:
+        names = data[_HEADER.size : at].decode()
+        targets = column("<u2").astype(np.int64)
+        points = column("<f8" if flags & _FLOAT_POINTS else "<i4", 2)
+        if not flags & _FLOAT_POINTS:
+            # division by 1e5 gives the double nearest to the decimal; a product with 1e-5 would not
+            points /= round(1 / POINT_QUANTUM_PX)
+        sigmas = column("<f4", 2)
+        covariances = column("<f4") if flags & _COVARIANCES else None
+        quality = {name: column("<f4") for name in filter(None, names.split("\n"))}
+    except ValueError as cause:
+        raise StoreError(f"observations in the store are broken: {cause}") from cause
+    return Observations(targets, points.reshape(-1, 2), sigmas.reshape(-1, 2), covariances, quality)
 
 
 def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> None:
@@ -220,10 +179,13 @@ def latest_epochs(
     """Yield each epoch in its latest revision from rows of a file or a server.
 
     rows: by number and revision; details: gives a row's packed covariance, observations; or None.
+    Raises DamageError at a damaged epoch, after those before it.
     """
     for _, revisions in groupby(rows, key=itemgetter("number")):
         covariance = seen = b""
         every = list(revisions)
+        if damage := next(filter(None, (row.get("damage") for row in every)), ""):
+            raise DamageError(damage)
         if details is not None:
             # a later calibration of the same observations does not store them again
             measured = next((r for r in every[::-1] if r["measured"] is not None), every[-1])
@@ -257,49 +219,27 @@ def latest_epochs(
         )
 
 
-def select_observations(
-    connection: sqlite3.Connection, series: int, first: int, last: int
-) -> ObservationRows:
-    """Return the observations of epochs `first` to `last` (numbers), without their quality.
-
-    Raises StoreError if they are damaged; the epochs' other columns are not read.
-    """
-    parts = connection.execute(
-        "SELECT epoch.id, epoch.number, measured, detail_checksum, "
-        "detail.id - epoch.id * :parts, data "
-        "FROM epoch LEFT JOIN detail ON detail.id >= epoch.id * :parts "
-        "AND detail.id < (epoch.id + 1) * :parts WHERE series_id = :series "
-        "AND epoch.number BETWEEN :first AND :last ORDER BY epoch.number, revision, detail.id",
-        {"parts": _PARTS, "series": series, "first": first, "last": last},
-    )
-    packed: dict[int, bytes] = {}
-    for (_, number, measured, checksum), rows in groupby(parts, key=itemgetter(0, 1, 2, 3)):
-        _, seen = _join_parts(
-            number, checksum, [(part, data) for *_, part, data in rows if data is not None]
-        )
-        if measured is not None or number not in packed:
-            packed[number] = seen
-    return unpack_rows({number: data for number, data in packed.items() if data})
+def select_epochs(
+    connection: sqlite3.Connection, series: int, first: int, last: int | None, details: bool
+) -> Generator[StoredEpoch, None, None]:
+    """Yield epochs `first` to `last` (numbers). Raises the errors of `latest_epochs`."""
+    with closing(examined_epochs(connection, series, first, last)) as rows:
+        yield from latest_epochs(rows, partial(read_details, connection) if details else None)
 
 
 def read_details(connection: sqlite3.Connection, row: Mapping[str, Any]) -> tuple[bytes, bytes]:
     """Read the packed covariance and observations of a row, empty if it has none.
 
-    Raises StoreError if they are damaged.
+    Raises DamageError if they are damaged.
     """
     parts = connection.execute(
         "SELECT id - :low, data FROM detail WHERE id >= :low AND id < :high ORDER BY id",
         {"low": row["id"] * _PARTS, "high": (row["id"] + 1) * _PARTS},
     ).fetchall()
-    return _join_parts(row["number"], row["detail_checksum"], parts)
-
-
-def _join_parts(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[bytes, bytes]:
-    """Join covariance and observations from their parts. Raises DamageError."""
     covariance = b"".join(bytes(data) for part, data in parts if part == 0)
     seen = b"".join(bytes(data) for part, data in parts if part)
-    what = f"epoch {number}: its covariance or its observations"
-    require_checksum(kept, what, (), data=covariance + seen)
+    what = f"epoch {row['number']}: its covariance or its observations"
+    require_checksum(row["detail_checksum"], what, (), data=covariance + seen)
     return covariance, seen
 
 

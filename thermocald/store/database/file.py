@@ -51,8 +51,6 @@ log = logging.getLogger(__name__)
 Mode = Literal["read", "append"]
 
 _APPLICATION_ID = 0x74686572  # "ther": distinguishes a store from other SQLite files
-# a table of version 1 before its release
-_EARLIER_TABLE = "SELECT 1 FROM sqlite_master WHERE name = 'late_epoch'"
 # A page of 4 KiB would hold one row of 2.1 to 4 kB and be half empty.
 _PAGE_SIZE = 8192
 _BUSY_S = 10.0
@@ -232,8 +230,7 @@ def _name(cause: sqlite3.Error) -> str:
 def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
     """Open the file, or create it to append; an older version is upgraded.
 
-    Raises StoreError; StoreVersionError for a file of a newer version, or of one before the first
-    release.
+    Raises StoreError; StoreVersionError for a file of a newer version.
     """
     if mode == "read" and not path.is_file():
         raise StoreError(f"{path}: there is no such store")
@@ -318,12 +315,6 @@ def _version(connection: sqlite3.Connection, path: Path) -> int:
         raise StoreVersionError(
             f"{path}: is a store of version {version}, but this program reads up to {known}; "
             f"update thermocald{older}"
-        )
-    if connection.execute(_EARLIER_TABLE).fetchone():
-        raise StoreVersionError(
-            f"{path}: was written by a version of this program before its release; to keep its "
-            f"data, run `thermocald archive {path} --to FOLDER` with the program that wrote it, "
-            "then `thermocald replay` with --store for each recording in FOLDER"
         )
     return int(version)
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Self
 
@@ -54,7 +53,6 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.recording.head import Head
-    from thermocald.store.recording.observation_file import ObservationRows
 
 log = logging.getLogger(__name__)
 
@@ -138,36 +136,34 @@ class Store(SeriesReader):
         file: SQLite's library crashes if a connection is closed during a statement.
         """
         whole = not first and last is None
-        missing, size, following = 0, _EPOCHS_AT_ONCE, 1
-        while size == _EPOCHS_AT_ONCE:
-            with self._reads("epochs") as connection:
-                rows = columns.read_epochs(connection, series.id, first, last)
-                detail = partial(epochs.read_details, connection) if details else None
-                found = epochs.latest_epochs(rows, detail)
-                page = list(islice(found, _EPOCHS_AT_ONCE))
-                del found, rows
+        missing, following, more = 0, 1, True
+        while more:
+            page: list[StoredEpoch] = []
+            try:
+                with self._reads("epochs") as connection:
+                    found = epochs.select_epochs(connection, series.id, first, last, details)
+                    with closing(found):
+                        page.extend(islice(found, _EPOCHS_AT_ONCE))
+                more = len(page) == _EPOCHS_AT_ONCE
+            except StoreError:
+                if not page:  # else the next page begins with the damage
+                    raise
             for stored in page:
                 missing += max(0, stored.epoch.number - following)
                 first = following = stored.epoch.number + 1
                 yield stored
-            size = len(page)
         if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - following)):
             log.warning(
                 "%s: %d epochs of series %s are missing; `thermocald check` lists them",
                 self.path, missing, series.name,
             )  # fmt: skip
 
-    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        with self._reads("observations") as connection:
-            return epochs.select_observations(connection, series.id, first, last)
-
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         result = np.full((len(numbers), 16, 16), np.nan)
-        with self._reads("covariances") as connection:
-            for i, number in enumerate(map(int, numbers)):
-                for row in columns.read_epochs(connection, series.id, number, number):
-                    covariance, _ = epochs.read_details(connection, row)
-                    result[i] = epochs.unpack_covariance(covariance) if covariance else np.nan
+        for i, number in enumerate(map(int, numbers)):
+            for stored in self._epochs(series, number, number, details=True):
+                if stored.result.covariance is not None:
+                    result[i] = stored.result.covariance
         return result
 
     def stamped_columns(
@@ -381,8 +377,8 @@ class Store(SeriesReader):
     ) -> None:
         """Store a later calibration of an epoch; observations: None if unchanged; extra: added."""
         with self._transaction(f"the calibration of epoch {number} was not stored"):
-            rows = columns.read_epochs(self._db, series.id, number, number)
-            if (then := next(epochs.latest_epochs(rows, None), None)) is None:
+            found = epochs.select_epochs(self._db, series.id, number, number, details=False)
+            if (then := next(found, None)) is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
             stored = StoredEpoch(
                 replace(then.epoch, observations=observations),

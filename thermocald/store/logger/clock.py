@@ -90,45 +90,37 @@ class DeviceClock:
         where: names the place of moment i. Raises DataError for a time without a zone, for one that
         does not exist, and for one that exists twice if it is not known which one is meant.
         """
-        seconds = np.empty(len(moments))
-        twice: list[int] = []
+        early, late = np.empty((2, len(moments)))  # differ where the clock was put back or forward
         for i, moment in enumerate(moments):
-            if moment.tzinfo is not None and not self.forced:
-                seconds[i] = moment.timestamp()
-                continue
-            if self.zone is None:
-                raise DataError(
-                    f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} has no time zone: give it with "
-                    f"{self.option}, such as {self.option} Europe/Berlin or {self.option} UTC"
-                )
-            local = moment.replace(tzinfo=self.zone, fold=0)
-            seconds[i] = local.timestamp()
-            if local.utcoffset() != local.replace(fold=1).utcoffset():
-                back = local.astimezone(UTC).astimezone(self.zone)
-                if back.replace(tzinfo=None) != local.replace(tzinfo=None):
+            local = moment
+            if moment.tzinfo is None or self.forced:
+                if self.zone is None:
                     raise DataError(
-                        f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} does not exist in {self.zone}: "
-                        "clocks were put forward. For a device that does not change its clock, "
-                        # fold 0 has the offset from before the change
-                        f"give a fixed zone: {self.option} {local.isoformat()[-6:]}"
+                        f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} has no time zone: give it with "
+                        f"{self.option}, such as {self.option} Europe/Berlin or {self.option} UTC"
                     )
-                twice.append(i)
-        if twice:
-            repeated = [moments[i] for i in twice]
-            seconds[twice] = self._choose(repeated, seconds[twice], where(twice[0]))
-        return seconds - self.ahead
+                local = moment.replace(tzinfo=self.zone)
+            early[i], late[i] = (local.replace(fold=k).timestamp() for k in (0, 1))
+            if early[i] > late[i]:
+                raise DataError(
+                    f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} does not exist in {self.zone}: "
+                    "clocks were put forward. For a device that does not change its clock, "
+                    # fold 0 has the offset from before the change
+                    f"give a fixed zone: {self.option} {local.replace(fold=0).isoformat()[-6:]}"
+                )
+        twice = np.flatnonzero(early < late)
+        if len(twice) and self.ambiguous != "earlier":
+            again = f"{where(twice[0])}: {moments[twice[0]]:%Y-%m-%d %H:%M:%S} exists twice"
+            early[twice] = self._choose(early[twice], late[twice], f"{again} in {self.zone}")
+        return early - self.ahead
 
-    def _choose(self, moments: Sequence[datetime], earlier: Array, where: str) -> Array:
-        """Return the times (n,) s that moments mean which exist twice; earlier: the first ones."""
-        again = f"{where}: {moments[0]:%Y-%m-%d %H:%M:%S} exists twice in {self.zone}"
+    def _choose(self, earlier: Array, later: Array, again: str) -> Array:
+        """Return the times (n,) s that are meant of those which exist twice."""
         if self.ambiguous == "refuse":
             raise DataError(
                 f"{again} (clocks were put back): give --ambiguous order if the rows are in the "
                 "order of time, else --ambiguous earlier or later"
             )
-        if self.ambiguous == "earlier":
-            return earlier
-        later = np.array([m.replace(tzinfo=self.zone, fold=1).timestamp() for m in moments])
         if self.ambiguous == "later":
             return later
         back = np.flatnonzero(np.diff(earlier) < 0) + 1

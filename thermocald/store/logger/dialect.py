@@ -16,6 +16,7 @@ import codecs
 import csv
 import re
 from collections import Counter, deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, time
 from itertools import islice
@@ -255,29 +256,17 @@ def _detect_encoding(path: Path) -> str:
                 return "utf-16"
             if b"\0" in head:
                 raise DataError(f"{path}: is not text; save it as CSV in UTF-8")
-            for name in ("utf-8", "gb18030", "cp1252"):
-                file.seek(0)
-                if _is_text(iter(lambda: file.read(_CHUNK), b""), name):
-                    return name
+            file.seek(0)
+            # GB 18030 writes 温度 in pairs of high bytes; ° and ä of Latin-1 are single bytes
+            pairs = re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", file.read(_CHUNK))
+        chinese: tuple[str, ...] = () if any(len(run) % 2 for run in pairs) else ("gb18030",)
+        for name in ("utf-8", *chinese, "cp1252"):
+            with suppress(UnicodeDecodeError), path.open(encoding=name) as text:
+                deque(text, 0)
+                return name
     except OSError as cause:
         raise DataError(f"{path}: cannot be read: {cause.strerror}") from cause
     return "latin-1"
-
-
-def _is_text(chunks: Iterator[bytes], encoding: str) -> bool:
-    decoder = codecs.getincrementaldecoder(encoding)()
-    try:
-        for number, chunk in enumerate(chunks):
-            # GB 18030 writes 温度 in pairs of high bytes; ° and ä of Latin-1 are single bytes
-            if encoding == "gb18030" and number == 0:
-                runs = re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", chunk)
-                if any(len(run) % 2 for run in runs):
-                    return False
-            decoder.decode(chunk)
-        decoder.decode(b"", final=True)
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def _detect_separator(path: Path, lines: list[str]) -> str:

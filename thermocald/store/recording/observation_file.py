@@ -96,18 +96,6 @@ class ObservationRows:
         low, high = np.searchsorted(self.epochs, [begin, end])
         return self.rows(slice(int(low), int(high)))
 
-    def of_epoch(self, epoch: int) -> Observations:
-        """Return the observations of an epoch, as views; rows must be sorted by epoch."""
-        return self.between(epoch, epoch + 1).seen
-
-    def grid(self, begin: int, end: int, targets: int) -> ObservationGrid:
-        """Return the grid of epochs `begin` to `end` (exclusive), to which all rows belong."""
-        seen = self.seen
-        return ObservationGrid.from_rows(
-            (end - begin, targets), self.epochs - begin, seen.targets, seen.points, seen.sigmas,
-            seen.covariances,
-        )  # fmt: skip
-
 
 def grid_runs(epochs: int, targets: int, windows: Sequence[slice] | None) -> Iterator[slice]:
     """Yield the slices of epochs that make the grids of a series, or of some windows of it."""
@@ -136,9 +124,8 @@ class ObservationFile:
     def _whole(self) -> ObservationRows:
         """All observations sorted by epoch; the file may have them in any order."""
         parts = [self._read(chunk, self._quality) for chunk in self._table.chunks()]
-        whole = ObservationRows.join(parts) if parts else self._no_rows()
+        whole = self._single(ObservationRows.join(parts) if parts else self._no_rows())
         del parts
-        self._refuse_duplicates(whole)
         if np.any(np.diff(whole.epochs) < 0):
             whole = whole.rows(np.argsort(whole.epochs, kind="stable"))
         return whole
@@ -149,38 +136,40 @@ class ObservationFile:
         A long file is read in constant memory. Raises RecordingError if its rows are not in the
         order of their epochs.
         """
-        if not self.is_long:
-            yield from map(self._whole.of_epoch, range(window.start, window.stop))
-            return
         for rows, first, stop in self._blocks([window], self._quality):
-            self._refuse_duplicates(rows)
             for epoch in range(first, stop):
-                yield rows.of_epoch(epoch)
+                yield rows.between(epoch, epoch + 1).seen
 
     def grids(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
         """Yield observations as grids of consecutive epochs, each with its first epoch (from 0).
 
-        windows: only the epochs of these slices, ascending; of a Parquet file only they are read.
+        windows: only the epochs of these slices, ascending; of a long Parquet file only they are
+        read. Raises the error of `stream`.
         """
+        targets = len(self._field)
         for rows, first, stop in self._blocks(windows, []):
-            for run in grid_runs(stop, len(self._field), [slice(first, stop)]):
+            for run in grid_runs(stop, targets, [slice(first, stop)]):
                 part = rows.between(run.start, run.stop)
-                grid = part.grid(run.start, run.stop, len(self._field))
-                if np.count_nonzero(grid.observed) < len(part.epochs):
-                    self._refuse_duplicates(part)
-                yield run.start, grid
+                seen = part.seen
+                yield run.start, ObservationGrid.from_rows(
+                    (run.stop - run.start, targets), part.epochs - run.start, seen.targets,
+                    seen.points, seen.sigmas, seen.covariances,
+                )  # fmt: skip
 
     def _blocks(
         self, windows: Sequence[slice] | None, quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
         """Yield rows of whole epochs, in order, with the first wanted one and the end."""
+        every = windows or [slice(0, len(self._numbers))]
+        if not self.is_long:
+            yield from ((self._whole, window.start, window.stop) for window in every)
+            return
         columns = [*REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
-        every = [slice(0, len(self._numbers))]
         # text is read once for all windows
         seeks = isinstance(self._table, ParquetTable)
-        parts = [[w] for w in windows or every] if seeks else [list(windows or every)]
+        parts = [[window] for window in every] if seeks else [every]
         for part in parts:
             low, high = self._numbers[[part[0].start, part[-1].stop - 1]].tolist()
             chunks = self._table.chunks(
@@ -213,9 +202,9 @@ class ObservationFile:
             last = int(rows.epochs[-1])
             cut = int(np.searchsorted(rows.epochs, last))
             pending = rows.rows(slice(cut, len(rows.epochs)))
-            yield rows.rows(slice(0, cut)), done, last
+            yield self._single(rows.rows(slice(0, cut))), done, last
             done = last
-        yield pending, done, len(self._numbers)
+        yield self._single(pending), done, len(self._numbers)
 
     def _no_rows(self) -> ObservationRows:
         quality = {name: np.empty(0) for name in self._quality}
@@ -257,7 +246,8 @@ class ObservationFile:
         seen = Observations(targets, points, sigmas, covariances, extras)
         return ObservationRows(epochs, seen, chunk.first)
 
-    def _refuse_duplicates(self, rows: ObservationRows) -> None:
+    def _single(self, rows: ObservationRows) -> ObservationRows:
+        """Return rows as they are. Raises RecordingError for a target twice in one epoch."""
         targets = rows.seen.targets
         keys = rows.epochs * len(self._field) + targets
         order = np.argsort(keys, kind="stable")
@@ -269,6 +259,7 @@ class ObservationFile:
             self._table.fail(
                 rows.first + row, "target", f"target {name!r} is duplicated in epoch {number}"
             )
+        return rows
 
 
 class ParquetTable(Table):

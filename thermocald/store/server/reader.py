@@ -19,12 +19,7 @@ from uuid import UUID, uuid5
 import numpy as np
 
 from thermocald import __version__
-from thermocald.store.database.epochs import (
-    latest_epochs,
-    series_row,
-    unpack_covariance,
-    unpack_rows,
-)
+from thermocald.store.database.epochs import latest_epochs, series_row, unpack_covariance
 from thermocald.store.recording.head import parse_head
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.schema import COLUMN_NAMES, EPOCH_NUMBERS, EPOCH_TEXTS, sql_name
@@ -40,7 +35,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.store.database.epochs import KeptFrame
-    from thermocald.store.recording.observation_file import ObservationRows
 
 
 _EPOCHS = 500  # epochs fetched at a time by a server-side cursor
@@ -133,14 +127,6 @@ class ServerStore(Connected, SeriesReader):
             _details if details else None,
         )
 
-    def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        statement = (
-            "SELECT number, observations FROM epoch WHERE series = %s AND number >= %s "
-            "AND number <= %s AND observations IS NOT NULL ORDER BY number, revision"
-        )
-        rows = self._stream(statement, (_key(series), first, last))
-        return unpack_rows({number: bytes(data) for number, data in rows if data})
-
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """Return the clock steps of the series' station, oldest first."""
         rows = self._query(
@@ -220,13 +206,6 @@ class ServerWriter(Connected):
         self.station = station
         self.store = UUID(store)
         self._sent: set[UUID] = set()
-        # {table: {column: type}} on the server, read once as every batch needs it
-        self._tables: dict[str, dict[str, str]] = {}
-        for table, column, kind in self._query(
-            "SELECT table_name, column_name, udt_name FROM information_schema.columns "
-            "WHERE table_schema = 'public' ORDER BY ordinal_position"
-        ):
-            self._tables.setdefault(table, {})[column] = kind
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
@@ -276,11 +255,10 @@ class ServerWriter(Connected):
             connection.execute("SELECT thermocald_report(%s, %s, %s, %s, %s, %s)", values)
 
     def _row(self, table: str, row: Mapping[str, Any], keys: Mapping[int, UUID]) -> dict[str, Any]:
-        columns = self._tables[table]
         ready: dict[str, Any] = {}
-        if table == "epoch" or "series" in columns:
+        if "series_id" in row:
             ready["series"] = keys.get(row["series_id"]) if row["series_id"] is not None else None
-        if "station" in columns:
+        if table != "epoch":
             ready["station"] = self.station
         for name, value in row.items():
             if name in _LOCAL[table]:
@@ -295,20 +273,10 @@ class ServerWriter(Connected):
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]
     ) -> None:
         """Insert rows by one statement, which skips those that exist."""
-        kinds = self._tables[table]
-        names = list(rows[0])
-        columns = ", ".join(f'"{name}"' for name in names)
-        arrays = ", ".join(f"%b::{kinds[name]}[]" for name in names)
-        values = tuple([_convert(kinds[name], row[name]) for row in rows] for name in names)
+        columns = ", ".join(f'"{name}"' for name in rows[0])
+        places = ", ".join([f"({', '.join(['%b'] * len(rows[0]))})"] * len(rows))
         connection.execute(
-            f'INSERT INTO "{table}" ({columns}) SELECT * FROM unnest({arrays}) '
             # naming a conflict target would need permission to read
-            "ON CONFLICT DO NOTHING",
-            values,
+            f'INSERT INTO "{table}" ({columns}) VALUES {places} ON CONFLICT DO NOTHING',
+            [value for row in rows for value in row.values()],
         )
-
-
-def _convert(kind: str, value: Any) -> Any:
-    """Convert a value to the column's type, since an array must hold one type only."""
-    of = {"float8": float, "int4": int, "int8": int}.get(kind)
-    return value if value is None or of is None else of(value)

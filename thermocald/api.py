@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -197,10 +198,9 @@ def study(
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
         thermometer_sd=thermometer_sd, jobs=jobs,
     )  # fmt: skip
-    named = [*labels, *[None] * (len(series) - len(labels))]
     measured = [
         one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
-        for label, one in zip(named, series, strict=True)
+        for label, one in zip_longest(labels, series)
     ]
     several = [(one.source, one.values) for one in measured if len(one) > 1]
     refuse_copies(several, "has the same epochs as {}; give each series once", 1e-9, 0.0)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -318,15 +319,14 @@ def check_exterior(exterior: str) -> None:
 
 def require_series(series: Sequence[Series]) -> None:
     """Raise UsageError for a series that is given twice."""
-    for i, one in enumerate(series):
-        for other in series[:i]:
-            if one is other or one.place == other.place:
-                same = f"is the same series as {other.source}"
-                fault = "is given twice" if one.source == other.source else same
-                raise UsageError(
-                    f"{one.source} {fault}; give each series once (a copy would count as a second "
-                    "measurement that agrees perfectly)"
-                )
+    for one, other in combinations(series, 2):
+        if one.place == other.place:
+            same = f"is the same series as {other.source}"
+            fault = "is given twice" if one.source == other.source else same
+            raise UsageError(
+                f"{one.source} {fault}; give each series once (a copy would count as a second "
+                "measurement that agrees perfectly)"
+            )
 
 
 def require_within(**bounds: tuple[Any, float] | tuple[Any, float, float]) -> None:

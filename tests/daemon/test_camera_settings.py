@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import make_recording, replayed_camera
+from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.acquisition.steady_clock import SteadyClock
@@ -24,6 +25,7 @@ from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, VirtualClock
+from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.physics.testfields import demonstration_field
 from thermocald.store.recording.testfield_file import write_testfield
 from thermocald.store.series import EpochResult
@@ -58,7 +60,9 @@ def keep(run, number: int, **temperatures: float) -> Epoch:
     return epoch
 
 
-def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(run):
+def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(run, caplog):
+    run.amend(CalibratedEpoch(Epoch(1, 1e9, 1e9, {}), failed("no_observations", ""), {}))
+    assert "the calibration of epoch 1 waits: series M1 has not begun" in caplog.text
     for number in (1, 2):
         keep(run, number, air=20.0)
     store = run.runtime.guard.store

@@ -150,10 +150,8 @@ def compare(camera: CameraStudy) -> list[Comparison]:
     pitch = series[0].series.sensor.pixel_pitch
     px = np.mean([np.hypot(d["x0"].change, d["y0"].change) / pitch for d in changes])
     # direction of the principal point's largest shift, degrees from right towards up
-    steps = []
-    for one in series:
-        path = one.series.path_px
-        steps.append(path[int(np.argmax(np.linalg.norm(path, axis=1)))])
+    paths = [one.series.path_px for one in series]
+    steps = [path[int(np.argmax(np.linalg.norm(path, axis=1)))] for path in paths]
     right, up = np.mean(steps, axis=0)
     where = float(np.degrees(np.arctan2(up, right)))
     c = np.mean([d["c"].change for d in changes])
@@ -165,8 +163,7 @@ def compare(camera: CameraStudy) -> list[Comparison]:
     ]  # fmt: skip
     focus = [abs(one.focus.change) for one in series if one.focus is not None]
     if focus:
-        depth = np.mean(focus)
-        rows += _about("depth of field at 1 m, change", "mm", quoted.focus_mm, depth, 1.0)
+        rows += _about("depth of field at 1 m, change", "mm", quoted.focus_mm, np.mean(focus), 1.0)
     ratio = max(one.series.sigma0.max() / one.series.sigma0[0] for one in series)
     rows += _about("σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35)
     # correlations with the temperature, and of x0 with y0

@@ -24,17 +24,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, image_grid
-from thermocald.analysis.statistics.dependence import (
+from thermocald.analysis.statistics.significance import (
     Dependence,
+    DriftTest,
     IopCorrelations,
     correlation_matrix,
     dependence,
+    drift_test,
     holm,
     median_correlations,
     moving_f_test,
     unbroken_windows,
 )
-from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.montecarlo import (
     MonteCarlo,
@@ -351,11 +352,10 @@ def _significance(
 def _corrected(tests: dict[str, _Test], **names: str) -> dict[str, _Test]:
     """Correct p-values for the number of tests (Holm); names: {corrected p-value: p-value}."""
     for name, of in names.items():
-        p = holm([getattr(test, of) for test in tests.values()])
-        changes: list[dict[str, Any]] = [{name: value} for value in p]
+        p: list[Any] = holm([getattr(test, of) for test in tests.values()])
         tests = {
-            key: replace(test, **change)
-            for (key, test), change in zip(tests.items(), changes, strict=True)
+            key: replace(test, **{name: value})
+            for (key, test), value in zip(tests.items(), p, strict=True)
         }
     return tests
 

@@ -22,10 +22,9 @@ from thermocald.acquisition.device_loop import DeviceLoop, Link, OutputLoop
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.pipeline import check_frame
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.plan import heating_outputs, plan_cameras
 from thermocald.daemon.series_run import SeriesRun
-from thermocald.errors import ConfigurationError
-from thermocald.hal import load_driver, open_device
+from thermocald.hal import open_device
 from thermocald.store.series import LoggedReading
 
 if TYPE_CHECKING:
@@ -296,14 +295,11 @@ class Station:
 
         Raises ConfigurationError if no output heats or an output rejects the programme.
         """
-        found = {
-            i: self._output(one, {**one.options, "programme": list(programme)})
-            for i, one in enumerate(self.config.outputs)
-            if load_driver("output", one.driver).heats
+        outputs = self.config.outputs
+        return {
+            i: self._output(outputs[i], {**outputs[i].options, "programme": list(programme)})
+            for i in heating_outputs(self.config, "programme")
         }
-        if not found:
-            raise ConfigurationError("programme: no output of the configuration heats")
-        return found
 
     def heat(self, programme: Sequence[Mapping[str, Any]]) -> None:
         """Start another programme on the heating outputs; raises as `heaters` does.

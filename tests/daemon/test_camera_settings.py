@@ -43,7 +43,11 @@ def run(tmp_path):
     runtime = Runtime(guard, SteadyClock(VirtualClock()), LiveState(tmp_path))
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), VirtualClock())
     frames = SimpleNamespace(wanted=lambda *_: False, root=tmp_path)
-    yield SeriesRun(plan_of(), runtime, none, frames, [], dict)
+    page = SimpleNamespace(dashboard=SimpleNamespace(enabled=False))
+    station = SimpleNamespace(
+        runtime=runtime, thermometers=none, frames=frames, outputs=[], config=page
+    )
+    yield SeriesRun(plan_of(), station, dict)
     guard.close()
 
 

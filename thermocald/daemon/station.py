@@ -46,15 +46,12 @@ class CameraLine:
     """A camera and the series it takes; one thread at a time changes the series."""
 
     plan: CameraPlan
-    runtime: Runtime
-    thermometers: Thermometers
-    frames: FrameFolder
-    outputs: list[OutputLoop]
+    station: Station
     begin: float
-    preview: bool
 
     def __post_init__(self) -> None:
-        plan, runtime = self.plan, self.runtime
+        plan, runtime = self.plan, self.station.runtime
+        self.runtime = runtime
         self.checked: tuple[list[str], str] | None = None  # the result of `check_frame`
         self.run: SeriesRun | None = None
         self._checking = False
@@ -74,7 +71,8 @@ class CameraLine:
     def identity(self) -> dict[str, Any]:
         """Return the identities that the camera and its thermometers report."""
         names = self.plan.config.thermometers
-        thermometers = {name: self.thermometers.links[name].identity() for name in names}
+        links = self.station.thermometers.links
+        thermometers = {name: links[name].identity() for name in names}
         return {**self.link.identity(), **({"thermometers": thermometers} if thermometers else {})}
 
     @property
@@ -98,10 +96,7 @@ class CameraLine:
         run = None
         if series is not None:
             plan = replace(self.plan, series=series)
-            run = SeriesRun(
-                plan, self.runtime, self.thermometers, self.frames, self.outputs, self.identity,
-                self.preview, start, limit,
-            )  # fmt: skip
+            run = SeriesRun(plan, self.station, self.identity, start, limit)
         self._replace(run, checking=False)
         if run is not None and self._started:
             run.pipeline.start()
@@ -140,7 +135,8 @@ class CameraLine:
             text = f"camera {self.plan.name}: {self._frozen()[0]}"
             log.warning(text, extra={"event": "frozen"})
             self._event(frame.utc, "frozen", text)
-        self.thermometers.read_up_to(self.plan.config.thermometers, frame.monotonic)
+        names = self.plan.config.thermometers
+        self.station.thermometers.read_up_to(names, frame.monotonic)
         if self._checking:
             found = check_frame(self.plan.name, self.plan.calibrator_of_check(), frame)
             if self._checking:
@@ -216,13 +212,7 @@ class Station:
         begin = clock.monotonic() + _LEAD_S
         self.thermometers = Thermometers(config, clock, runtime.guard.event, fast=runtime.fast)
         self.outputs = [self._output(one, one.options) for one in config.outputs]
-        self.cameras = [
-            CameraLine(
-                plan, runtime, self.thermometers, self.frames, self.outputs, begin,
-                config.dashboard.enabled,
-            )
-            for plan in plan_cameras(config, clock)
-        ]  # fmt: skip
+        self.cameras = [CameraLine(plan, self, begin) for plan in plan_cameras(config, clock)]
         self._readers = {
             name: DeviceLoop(link, partial(self._read, name), begin)
             for name, link in self.thermometers.links.items()

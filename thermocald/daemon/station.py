@@ -163,11 +163,6 @@ class CameraLine:
         run = self.run
         return 0 if run is None else run.pipeline.waiting()
 
-    def busy_s(self) -> float:
-        """Return how long the pipeline has been working on one step, s."""
-        run = self.run
-        return 0.0 if run is None else run.pipeline.busy_s()
-
     def _event(self, utc: float, kind: str, text: str) -> None:
         """Store an event of the device, with the series being taken."""
         if self.run is None:
@@ -259,7 +254,8 @@ class Station:
     def stalled(self) -> list[str]:
         """Return a sentence for each device and pipeline that hangs."""
         busy = [(loop.link.called, loop.busy_s()) for loop in self._loops]
-        busy += [(f"pipeline of {camera.plan.name}", camera.busy_s()) for camera in self.cameras]
+        runs = [camera.run for camera in self.cameras if camera.run is not None]
+        busy += [(f"pipeline of {run.plan.name}", run.pipeline.busy_s()) for run in runs]
         return [f"{name} hangs" for name, busy_s in busy if busy_s > self.runtime.hang_after_s]
 
     @property

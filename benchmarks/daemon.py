@@ -111,11 +111,12 @@ def virtual_day() -> None:
 
 def epoch_cost(epochs: int) -> None:
     """Measure the steps from an 8 MP frame to the store, on one thread."""
+    from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.acquisition.steady_clock import SteadyClock
+    from thermocald.acquisition.thermometers import Thermometers
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import mock_config, plan_cameras, running_series
     from thermocald.daemon.series_run import Runtime, SeriesRun
-    from thermocald.daemon.station import Station
     from thermocald.daemon.store_guard import StoreGuard
 
     clock = VirtualClock()
@@ -125,7 +126,8 @@ def epoch_cost(epochs: int) -> None:
         thermometer = open_device("thermometer", "mock", {"seed": 2}, clock)
         guard = StoreGuard(Path(folder) / "t.db", durable=True)
         runtime = Runtime(guard, SteadyClock(clock), LiveState(Path(folder)))
-        run = SeriesRun(plan, Station(config, runtime), dict)
+        thermometers, frames = Thermometers(config, clock), FrameFolder(config.frames)
+        run = SeriesRun(plan, runtime, thermometers, frames, [], dict)
         assert plan.sensor is not None
         assert plan.testfield is not None
         observer = OnlineObserver(plan.sensor, plan.testfield, lambda *_: None)

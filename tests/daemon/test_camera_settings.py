@@ -43,11 +43,7 @@ def run(tmp_path):
     runtime = Runtime(guard, SteadyClock(VirtualClock()), LiveState(tmp_path))
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), VirtualClock())
     frames = SimpleNamespace(wanted=lambda *_: False, root=tmp_path)
-    page = SimpleNamespace(dashboard=SimpleNamespace(enabled=False))
-    station = SimpleNamespace(
-        runtime=runtime, thermometers=none, frames=frames, outputs=[], config=page
-    )
-    yield SeriesRun(plan_of(), station, dict)
+    yield SeriesRun(plan_of(), runtime, none, frames, [], dict)
     guard.close()
 
 

@@ -26,11 +26,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from thermocald.acquisition.device_loop import OutputLoop
+    from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.acquisition.pipeline import AcquiredEpoch
     from thermocald.acquisition.steady_clock import SteadyClock
+    from thermocald.acquisition.thermometers import Thermometers
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
-    from thermocald.daemon.station import Station
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.epoch import Epoch
     from thermocald.store.series import StoredEpoch
@@ -101,15 +103,17 @@ class SeriesRun:
     """
 
     plan: CameraPlan
-    station: Station
+    runtime: Runtime
+    thermometers: Thermometers
+    frames: FrameFolder
+    outputs: Sequence[OutputLoop]
     identity: Callable[[], Mapping[str, Any]]
+    preview: bool = False
     start: str = ""
     limit: int = 0
 
     def __post_init__(self) -> None:
         plan, names = self.plan, self.plan.config.thermometers
-        self.runtime, self.frames = self.station.runtime, self.station.frames
-        thermometers = self.station.thermometers
         self.last: dict[str, Any] = {}
         self.stored = 0
         self._guard = self.runtime.guard
@@ -122,14 +126,14 @@ class SeriesRun:
         self._failed = 0  # latest epochs in a row without a result
         self._shown = self._previewed = float("-inf")
         if (stored := self.series) is not None:
-            check_series(plan, stored, thermometers.named_columns(names))
+            check_series(plan, stored, self.thermometers.named_columns(names))
         self.first = 1 if stored is None else self._guard.last_epoch(stored) + 1
         self._observer = self._make_observer()
         self._running = running_series(plan)
         self._remembered = self.first == 1
         patience_s = 0.0 if self.runtime.fast else min(PATIENCE_S, 0.5 * plan.config.period_s)
         self.pipeline = Pipeline(
-            plan.name, plan.calibrator, thermometers, names, self, self.runtime.clock,
+            plan.name, plan.calibrator, self.thermometers, names, self, self.runtime.clock,
             self.first, patience_s,
         )  # fmt: skip
 
@@ -312,15 +316,14 @@ class SeriesRun:
                 values, covariance = result.interior.as_array(), result.covariance[IOP, IOP]
                 row["opencv"] = opencv_terms(plan.sensor, values, covariance)
         self.last = {**row, "online": report}
-        for output in self.station.outputs:
+        for output in self.outputs:
             output.put(row)
         now = time.monotonic()
         if now - self._shown >= _SHOW_EVERY_S:
             self._shown = now
             live = self.runtime.live
             live.write_epoch(plan.name, self.last, acquired.calibrated, plan.testfield)
-            shown = self.station.config.dashboard.enabled
-            if shown and now - self._previewed >= _PREVIEW_EVERY_S:
+            if self.preview and now - self._previewed >= _PREVIEW_EVERY_S:
                 self._previewed = now
                 live.write_frame(plan.name, acquired.frame)
 

@@ -96,7 +96,11 @@ class CameraLine:
         run = None
         if series is not None:
             plan = replace(self.plan, series=series)
-            run = SeriesRun(plan, self.station, self.identity, start, limit)
+            own = self.station
+            run = SeriesRun(
+                plan, self.runtime, own.thermometers, own.frames, own.outputs, self.identity,
+                own.config.dashboard.enabled, start, limit,
+            )  # fmt: skip
         self._replace(run, checking=False)
         if run is not None and self._started:
             run.pipeline.start()

@@ -211,10 +211,9 @@ class Machine:
 
     def _power(self) -> _Result | None:
         text = self._read("sys/devices/platform/soc/soc:firmware/get_throttled")
-        try:
-            bits = int(text, 16) if text else None
-        except ValueError:
-            bits = None
+        bits = None
+        with contextlib.suppress(ValueError):
+            bits = int(text or "", 16)
         if bits is None:
             alarms = [
                 self._read(str((path.parent / "in0_lcrit_alarm").relative_to(self.root)))

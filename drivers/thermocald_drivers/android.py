@@ -86,6 +86,7 @@ LENS = ("f_number", "focal_length_mm", "digital_zoom")
 FOCUS = ("subject_distance_m", "focus_distance_dioptres")
 SETTINGS = (*EXPOSURE, *LENS, *FOCUS)
 """The camera settings that a photograph reports; they are stored with its epoch."""
+Point = Annotated[list[Annotated[int, Field(ge=0, le=20_000)]], Field(min_length=2, max_length=2)]
 
 
 class AndroidCamera(AdbPhone, Camera):
@@ -97,12 +98,7 @@ class AndroidCamera(AdbPhone, Camera):
         width: Annotated[int, Field(ge=64, le=20_000)]
         height: Annotated[int, Field(ge=64, le=20_000)]
         trigger: Literal["camera", "volume", "tap"] = "camera"
-        tap: (
-            Annotated[
-                list[Annotated[int, Field(ge=0, le=20_000)]], Field(min_length=2, max_length=2)
-            ]
-            | None
-        ) = None
+        tap: Point | None = None
         folder: support.Text = "/sdcard/DCIM/Camera"
         delete: bool = False
         refuse_unlocked: bool | None = None

@@ -346,7 +346,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
             state = STATE_UNIT.format(channel=channel)
             raise BadReading(f"{where}: {value.format(state=state)}")
         idle = "what an absent sensor reports" if chips.is_idle("", value) else ""
-        return self.judge(source, value, where, idle)
+        return self.judge(source, where, value, idle)
 
     def _stated(self) -> dict[str, float]:
         """Return {source: factor to °C} for the units in the stanza."""

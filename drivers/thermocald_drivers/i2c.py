@@ -104,11 +104,9 @@ class I2cThermometer(support.CheckedThermometer):
 
     def read(self) -> Reading:
         self.opened()
-        return self.reading({self.options.channel: (self.where, self._judged)})
-
-    def _judged(self) -> float:
-        value, idle = self._measure()
-        return self.judge("", value, self.where, idle)
+        where = self.where
+        measures = {self.options.channel: (where, lambda: self.judge("", where, *self._measure()))}
+        return self.reading(measures)
 
     def _identify(self) -> None:
         """Check the chip's identity and make it convert; WrongDevice if it is another chip."""

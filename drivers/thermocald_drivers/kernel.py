@@ -193,8 +193,7 @@ class _KernelThermometer(support.CheckedThermometer):
         return reading
 
     def _measure(self, folder: Path, key: str, where: str) -> float:
-        value, idle = self._convert(folder, key)
-        return self.judge(key, value, where, idle)
+        return self.judge(key, where, *self._convert(folder, key))
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:

@@ -189,7 +189,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
                 )
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
                 idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
-                return self.judge(channel, value, f"1-wire {rom}", idle)
+                return self.judge(channel, f"1-wire {rom}", value, idle)
             except BadReading as error:
                 problem = error
             except OSError as error:

@@ -201,9 +201,8 @@ class Picamera2Camera(Camera):
         if any(name not in self._held for name in open_ones):
             first = camera.capture_metadata()
             self._held = {n: first[n] for n in open_ones if first.get(n) is not None} | self._held
-        held = {name: self._held[name] for name in open_ones if name in self._held}
-        if held:
-            camera.set_controls(held)
+        if self._held:
+            camera.set_controls(self._held)
 
     def close(self) -> None:
         camera, self.handle = self.handle, None
@@ -230,8 +229,6 @@ class Picamera2Camera(Camera):
         except DeviceTimeout:
             self.close()  # a hung pipeline does not come back by itself
             raise
-        if plane is None:
-            raise BadReading(f"{self.where}: no frame that began after the call")
         for name, value in (self._held | self._stated).items():
             # libcamera applies the nearest possible setting
             if not agrees(value, got := metadata.get(name), self.options.tolerance):
@@ -263,7 +260,7 @@ class Picamera2Camera(Camera):
                 return self._plane(request.make_array("main")), metadata
             finally:
                 request.release()
-        return None, {}
+        raise BadReading(f"{self.where}: no frame that began after the call")
 
     def _plane(self, array: Any) -> Any:
         """Return the luminance of a YUV420 array: its top H rows; their stride may exceed W."""

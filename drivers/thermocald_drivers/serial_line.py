@@ -361,7 +361,7 @@ class SerialThermometer(support.CheckedThermometer):
                 "refuse_c: []"
             )
         idle = self._idle(number, decimals) if self.options.refuse_c else ""
-        return self.judge(channel, celsius, where, idle)
+        return self.judge(channel, where, celsius, idle)
 
     def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
         """Raise BadReading for a number that lost digits, since firmware always prints as many.

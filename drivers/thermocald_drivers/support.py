@@ -241,7 +241,7 @@ class CheckedThermometer(Thermometer):
                 f"{where}: {value_c:g} °C is outside the sensor's range {low_c:g} … {high_c:g} °C"
             )
 
-    def judge(self, channel: str, value_c: float, where: str, idle: str = "") -> float:
+    def judge(self, channel: str, where: str, value_c: float, idle: str = "") -> float:
         """Return a temperature that passes the checks; raise BadReading for any other.
 
         idle: why the value may not have been measured, for the message; "" for a measured value.

@@ -13,6 +13,7 @@ import logging
 import os
 import select
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -154,12 +155,9 @@ class LinuxpyStream:
                 poll.poll(left * 1000.0)
 
     def close(self) -> None:
-        for action in (self._capture.close if self._capture else None, self._device.close):
-            try:
-                if action:
-                    action()
-            except OSError:
-                continue  # an unplugged camera cannot be stopped
+        for opened in filter(None, (self._capture, self._device)):
+            with suppress(OSError):  # an unplugged camera cannot be stopped
+                opened.close()
         self._capture = None
 
 
@@ -189,11 +187,9 @@ class OpenCvStream:
         self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
         self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        got = (
-            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
-        if got != (width, height):
+        sides = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+        got = [int(self._capture.get(side)) for side in sides]
+        if got != [width, height]:
             raise WrongDevice(
                 f"{self._path}: asked for {width}×{height}, the camera gives {got[0]}×{got[1]}"
             )

@@ -96,6 +96,8 @@ def test_fast_ticks_back_off(clock, link_of):
 
 def test_what_no_retry_mends_is_given_up_and_told(clock, link_of):
     device, link, events = link_of()
+    device.warnings = lambda: ["focus: auto"]
+    assert link.status(0.0, 60.0)["warnings"] == ["focus: auto"]
     assert not link.do(lambda: _raise(WrongDevice("another camera")))
     assert link.ended
     assert events == ["device_failed"]

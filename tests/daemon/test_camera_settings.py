@@ -1,4 +1,4 @@
-"""The focus and exposure that frames report reach the store and the status."""
+"""The focus and exposure that frames report reach the store; what a start is refused for."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ import pytest
 
 from tests.daemon.conftest import make_recording, replayed_camera
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.acquisition.thermometers import Thermometers
 from thermocald.config import parse_config
-from thermocald.daemon.live_state import LiveState, status_warnings
+from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.plan import plan_cameras
 from thermocald.daemon.series_run import Runtime, SeriesRun
 from thermocald.daemon.service import Service
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
-from thermocald.hal import Camera, Frame, VirtualClock
+from thermocald.hal import Frame, VirtualClock
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.physics.testfields import demonstration_field
 from thermocald.store.recording.testfield_file import write_testfield
@@ -139,22 +138,6 @@ def test_a_long_series_does_not_keep_its_next_epochs_waiting(run, tmp_path, monk
         found.append(run.backlog(1201))
         assert len(read) <= 200
     assert [one.number for one in found if one is not None] == [1100]
-
-
-def test_a_setting_that_harms_is_in_the_status():
-    class Focusing(Camera):
-        def warnings(self):
-            return ["focus: auto lets the camera focus by itself"]
-
-    link = Link("camera", "river", Focusing(clock=VirtualClock()), VirtualClock())
-    status = link.status(0.0, 60.0)
-    document = {
-        "stalled": [], "store": {"state": "ok", "lost": 0}, "frames": {"paused": ""},
-        "clock": {"trusted": True}, "thermometers": {}, "outputs": {},
-        "cameras": {"river": {**status, "deferred": 0, "caught_up": 0}},
-    }  # fmt: skip
-    (said,) = status_warnings(document)
-    assert said == "camera river: focus: auto lets the camera focus by itself"
 
 
 def test_a_sensor_of_another_size_than_the_driver_is_refused():

@@ -97,7 +97,7 @@ def test_what_was_reported_kept_is_kept_where_a_little_room_is_left(daemon, meas
     daemon.run(**measured)
     daemon.more(2)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (16384 + room, 16384 + room))
-    daemon.until(lambda: sum(not r["stored"] for r in daemon.results()) > 2)
+    daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) > 2)
     daemon.kill()
     kept = {r["epoch"] for r in daemon.results() if r["stored"]}
     assert kept <= set(daemon.stored()[0])

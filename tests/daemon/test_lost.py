@@ -76,11 +76,13 @@ def test_a_refused_row_is_lost_for_everybody(guard, path, tmp_path, refusal, mon
     assert not well
     assert "an epoch was lost" in why
     document |= {
-        "cameras": {}, "thermometers": {}, "outputs": {}, "clock": {"trusted": True},
+        "cameras": {}, "outputs": {}, "clock": {"trusted": True},
+        "thermometers": {"air": {"device": "open", "faults": 0, "why": "", "warnings": ["slow"]}},
         "frames": {"paused": ""}, "sessions": {}, "age_s": 0.0, "utc": 1.0, "started": 0.0,
         "version": "0",
     }  # fmt: skip
     assert any("1 epoch lost" in text for text in status_warnings(document))
+    assert "thermometer air: slow" in status_warnings(document)
     monkeypatch.setattr("thermocald.cli.run.read_status", lambda *_: document)
     with pytest.raises(DataError, match="1 epoch lost"):
         status()

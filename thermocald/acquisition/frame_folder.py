@@ -100,9 +100,7 @@ class FrameFolder:
 
     def free_bytes(self) -> int:
         """Return the free space of the disk, bytes; 0 if it cannot be read."""
-        folder = self.root
-        while not folder.exists() and folder != folder.parent:
-            folder = folder.parent
+        folder = next(f for f in (self.root, *self.root.parents) if f.exists())
         try:
             return shutil.disk_usage(folder).free
         except OSError:

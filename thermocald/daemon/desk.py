@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from thermocald.config import in_words, parse_config
 from thermocald.daemon.control import DaemonBusy, ask
 from thermocald.daemon.live_state import find_state
+from thermocald.daemon.plan import heating_outputs, plan_cameras
 from thermocald.daemon.session import Session
 from thermocald.daemon.systemd import set_up_logging
 from thermocald.errors import (
@@ -30,7 +31,7 @@ from thermocald.errors import (
     UsageError,
 )
 from thermocald.files import read_yaml
-from thermocald.hal import SystemClock, load_driver, open_device
+from thermocald.hal import SystemClock, open_device
 from thermocald.numbers import with_sd
 
 if TYPE_CHECKING:
@@ -103,11 +104,8 @@ def _prepare(config: Config, session: Session, done: int) -> Config:
         t for t in document["thermometers"] if t["name"] in chosen["thermometers"]
     ]
     if session.programme:
-        heaters = [o for o in document["outputs"] if load_driver("output", o["driver"]).heats]
-        if not heaters:
-            raise ConfigurationError("--programme: no output of the configuration heats")
-        for heater in heaters:
-            heater["programme"] = session.steps(done * chosen["period_s"])
+        for i in heating_outputs(config, "--programme"):
+            document["outputs"][i]["programme"] = session.steps(done * chosen["period_s"])
     return parse_config(document, Path("config.yaml"))
 
 
@@ -124,7 +122,6 @@ def _stored(config: Config, session: Session) -> int:
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
     from thermocald.acquisition.pipeline import check_frame
-    from thermocald.daemon.plan import plan_cameras
 
     clock = SystemClock()
     for one in config.thermometers:
@@ -289,9 +286,7 @@ def plan_separation(
     if session.programme:
         raise UsageError("--until-separated plans the programme; omit --programme")
     names = read_alternatives(text)
-    heaters = [o for o in config.outputs if load_driver("output", o.driver).heats]
-    if not heaters:
-        raise ConfigurationError("--until-separated: no output of the configuration heats")
+    heaters = [config.outputs[i] for i in heating_outputs(config, "--until-separated")]
     highest = min(float(o.options["limit_c"]) - _BELOW_LIMIT_K for o in heaters)
     limits = Limits(highest if max_c is None else min(highest, max_c), max_rate, max_duty)
     body = Body()

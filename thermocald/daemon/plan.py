@@ -16,7 +16,7 @@ from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.thermometers import require_columns
 from thermocald.config import parse_config
 from thermocald.errors import ConfigurationError, RecordingError
-from thermocald.hal import open_device
+from thermocald.hal import load_driver, open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, GeometryBounds
 from thermocald.photogrammetry.field.testfield import TestField
@@ -234,6 +234,14 @@ def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]
             f"camera {plan.name!r}: series {plan.series!r} was begun with {what}, or choose "
             "another series"
         )
+
+
+def heating_outputs(config: Config, what: str) -> list[int]:
+    """Return the places of the outputs that heat; ConfigurationError about `what` if none does."""
+    found = [i for i, o in enumerate(config.outputs) if load_driver("output", o.driver).heats]
+    if not found:
+        raise ConfigurationError(f"{what}: no output of the configuration heats")
+    return found
 
 
 def mock_config() -> Config:

@@ -183,7 +183,7 @@ class Service:
         self._control = ControlSocket(self.live.folder, self._ask)
         try:
             self._station = Station(self.config, self._runtime)
-            self._sessions = Sessions(self._guard, self.clock, self._station)
+            self._sessions = Sessions(self._station)
             if not self._until_finished:
                 self._sessions.resume(self._station)
             self._station.start()

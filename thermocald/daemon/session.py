@@ -21,8 +21,6 @@ from thermocald.hal import HeatingStep  # noqa: TC001
 
 if TYPE_CHECKING:
     from thermocald.daemon.station import CameraLine, Station
-    from thermocald.daemon.store_guard import StoreGuard
-    from thermocald.hal import Clock
     from thermocald.store.series import Event
 
 
@@ -80,13 +78,12 @@ class _Progress:
 class Sessions:
     """The sessions of a daemon, at most one per camera; used by one thread at a time."""
 
-    def __init__(self, guard: StoreGuard, clock: Clock, station: Station) -> None:
+    def __init__(self, station: Station) -> None:
         self.station = station
-        self._guard = guard
-        self._clock = clock
+        self._guard = station.runtime.guard
         self._active: dict[str, _Progress] = {}
         self._ended: dict[str, _Progress] = {}
-        for event in guard.store.events():
+        for event in self._guard.store.events():
             self._remember(event)
 
     def _remember(self, event: Event) -> None:
@@ -256,7 +253,7 @@ class Sessions:
             "session": session.model_dump(mode="json"), "state": one.state, "taken": one.taken,
             "why": one.why,
         }  # fmt: skip
-        self._guard.event(self._clock.utc(), kind, about, data=data)
+        self._guard.event(self.station.runtime.clock.utc(), kind, about, data=data)
 
     def _line(self, camera: str) -> CameraLine:
         line = self.station.line(camera)

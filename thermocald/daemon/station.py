@@ -22,10 +22,9 @@ from thermocald.acquisition.device_loop import DeviceLoop, Link, OutputLoop
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.pipeline import check_frame
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.plan import heating_outputs, plan_cameras
 from thermocald.daemon.series_run import SeriesRun
-from thermocald.errors import ConfigurationError
-from thermocald.hal import load_driver, open_device
+from thermocald.hal import open_device
 from thermocald.store.series import LoggedReading
 
 if TYPE_CHECKING:
@@ -47,15 +46,12 @@ class CameraLine:
     """A camera and the series it takes; one thread at a time changes the series."""
 
     plan: CameraPlan
-    runtime: Runtime
-    thermometers: Thermometers
-    frames: FrameFolder
-    outputs: list[OutputLoop]
+    station: Station
     begin: float
-    preview: bool
 
     def __post_init__(self) -> None:
-        plan, runtime = self.plan, self.runtime
+        plan, runtime = self.plan, self.station.runtime
+        self.runtime = runtime
         self.checked: tuple[list[str], str] | None = None  # the result of `check_frame`
         self.run: SeriesRun | None = None
         self._checking = False
@@ -75,7 +71,8 @@ class CameraLine:
     def identity(self) -> dict[str, Any]:
         """Return the identities that the camera and its thermometers report."""
         names = self.plan.config.thermometers
-        thermometers = {name: self.thermometers.links[name].identity() for name in names}
+        links = self.station.thermometers.links
+        thermometers = {name: links[name].identity() for name in names}
         return {**self.link.identity(), **({"thermometers": thermometers} if thermometers else {})}
 
     @property
@@ -99,9 +96,10 @@ class CameraLine:
         run = None
         if series is not None:
             plan = replace(self.plan, series=series)
+            own = self.station
             run = SeriesRun(
-                plan, self.runtime, self.thermometers, self.frames, self.outputs, self.identity,
-                self.preview, start, limit,
+                plan, self.runtime, own.thermometers, own.frames, own.outputs, self.identity,
+                own.config.dashboard.enabled, start, limit,
             )  # fmt: skip
         self._replace(run, checking=False)
         if run is not None and self._started:
@@ -141,7 +139,8 @@ class CameraLine:
             text = f"camera {self.plan.name}: {self._frozen()[0]}"
             log.warning(text, extra={"event": "frozen"})
             self._event(frame.utc, "frozen", text)
-        self.thermometers.read_up_to(self.plan.config.thermometers, frame.monotonic)
+        names = self.plan.config.thermometers
+        self.station.thermometers.read_up_to(names, frame.monotonic)
         if self._checking:
             found = check_frame(self.plan.name, self.plan.calibrator_of_check(), frame)
             if self._checking:
@@ -167,11 +166,6 @@ class CameraLine:
         """Return the number of epochs in the pipeline."""
         run = self.run
         return 0 if run is None else run.pipeline.waiting()
-
-    def busy_s(self) -> float:
-        """Return how long the pipeline has been working on one step, s."""
-        run = self.run
-        return 0.0 if run is None else run.pipeline.busy_s()
 
     def _event(self, utc: float, kind: str, text: str) -> None:
         """Store an event of the device, with the series being taken."""
@@ -217,13 +211,7 @@ class Station:
         begin = clock.monotonic() + _LEAD_S
         self.thermometers = Thermometers(config, clock, runtime.guard.event, fast=runtime.fast)
         self.outputs = [self._output(one, one.options) for one in config.outputs]
-        self.cameras = [
-            CameraLine(
-                plan, runtime, self.thermometers, self.frames, self.outputs, begin,
-                config.dashboard.enabled,
-            )
-            for plan in plan_cameras(config, clock)
-        ]  # fmt: skip
+        self.cameras = [CameraLine(plan, self, begin) for plan in plan_cameras(config, clock)]
         self._readers = {
             name: DeviceLoop(link, partial(self._read, name), begin)
             for name, link in self.thermometers.links.items()
@@ -270,7 +258,8 @@ class Station:
     def stalled(self) -> list[str]:
         """Return a sentence for each device and pipeline that hangs."""
         busy = [(loop.link.called, loop.busy_s()) for loop in self._loops]
-        busy += [(f"pipeline of {camera.plan.name}", camera.busy_s()) for camera in self.cameras]
+        runs = [camera.run for camera in self.cameras if camera.run is not None]
+        busy += [(f"pipeline of {run.plan.name}", run.pipeline.busy_s()) for run in runs]
         return [f"{name} hangs" for name, busy_s in busy if busy_s > self.runtime.hang_after_s]
 
     @property
@@ -296,14 +285,11 @@ class Station:
 
         Raises ConfigurationError if no output heats or an output rejects the programme.
         """
-        found = {
-            i: self._output(one, {**one.options, "programme": list(programme)})
-            for i, one in enumerate(self.config.outputs)
-            if load_driver("output", one.driver).heats
+        outputs = self.config.outputs
+        return {
+            i: self._output(outputs[i], {**outputs[i].options, "programme": list(programme)})
+            for i in heating_outputs(self.config, "programme")
         }
-        if not found:
-            raise ConfigurationError("programme: no output of the configuration heats")
-        return found
 
     def heat(self, programme: Sequence[Mapping[str, Any]]) -> None:
         """Start another programme on the heating outputs; raises as `heaters` does.

@@ -307,6 +307,11 @@ def test_points_are_corrected_as_the_command_does(camera, world, tmp_path):
          tmp_path / "theirs.csv", folder=world)  # fmt: skip
 
     assert (tmp_path / "ours.csv").read_text() == (tmp_path / "theirs.csv").read_text()
+    head, first, *_ = (world / "points.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "one.csv").write_text(head + first)
+    one = tc.correct(tmp_path / "one.csv", camera, log=world / "M1")
+    one.write(tmp_path / "corrected.csv")
+    assert "1 point corrected" in str(one)
 
 
 def test_calibrations_at_two_temperatures_give_the_camera_back(camera, world):

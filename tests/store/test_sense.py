@@ -157,9 +157,6 @@ DOUBTS = {
     "a thermometer in another time zone": (
         lambda p: change(p, "epochs.csv", temperature_time=scaled(1, 3600)),
         "read 3600 s after their frames"),
-    "a thermometer whose clock is a day late": (
-        lambda p: change(p, "epochs.csv", temperature_time=scaled(1, -86400)),
-        "read 86400 s before their frames"),
     "°F from the beginning": (
         lambda p: change(p, "epochs.csv", temperature=scaled(1.8, 32)), "are they °F?"),
     "nothing but 85.00": (

@@ -87,12 +87,6 @@ VENDORS = {
     "months as words": (
         b'Timestamp,Temperature (C)\n"Jun 14, 2026 12:00 PM",21.5\n"Jun 14, 2026 12:01 PM",21.75\n'
     ),
-    # Campbell Scientific TOA5: four lines of header, all in quotes
-    "TOA5": (
-        b'"TOA5","box","CR300","1234","CR300.Std.10","CPU:box.CR3","55","Table1"\n'
-        b'"TIMESTAMP","RECORD","BattV","AirTC"\n"TS","RN","Volts","Deg C"\n"","","Min","Avg"\n'
-        b'"2026-06-14 12:00:00",1,12.9,21.5\n"2026-06-14 12:01:00",2,12.9,21.75\n'
-    ),
     # T&D Thermo Recorder: the time again as a spreadsheet's day number
     "T&D Ondotori": (
         b'"Date/Time","Date/Time","No.1"\n"","","Temp.(C)"\n'

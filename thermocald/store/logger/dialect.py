@@ -477,20 +477,16 @@ def find_date_order(
         return None, []
     places = [file.names.index(name) for name in names]
     first = last = ""
-    orders: set[str] = set()
-    same = True
+    pairs: set[tuple[int, int]] = set()
     for _, row in file.rows():
-        found = day_and_month(row[places[0]])
-        if found is None:
-            continue
-        last = " ".join(row[place] for place in places)
-        first = first or last
-        same &= found[0] == found[1]
-        if max(found) > 12:
-            orders.add("dmy" if found[0] > 12 else "mdy")
+        if found := day_and_month(row[places[0]]):
+            pairs.add(found)
+            last = " ".join(row[place] for place in places)
+            first = first or last
+    orders = {"dmy" if a > 12 else "mdy" for a, b in pairs if max(a, b) > 12}
     if len(orders) == 1:
         return orders.pop(), []
-    if same:
+    if all(a == b for a, b in pairs):
         return "dmy", []
     if not orders:
         spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in _WORDS}

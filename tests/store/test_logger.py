@@ -564,18 +564,18 @@ def test_a_column_of_another_quantity_is_no_temperature(tmp_path, head):
     assert list(found.channels) == ["Temp"]
 
 
-def test_rows_before_the_clock_was_set_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"line 4, column 'time': is 26 years after the row before"):
-        read(
-            tmp_path,
-            ["time,T °C"],
-            lambda m, t, i: f"{m.replace(year=2026 if i > 1 else 2000):%Y-%m-%d %H:%M},{t}",
-        )
-
-
-def test_a_time_of_unknown_form_is_shown(tmp_path):
-    with pytest.raises(DataError, match=r"as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"):
-        read(tmp_path, ["time,T °C"], lambda m, t, i: f"{m:%H:%M},{t}")
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (lambda m, t, i: f"{m.replace(year=2026 if i > 1 else 2000):%Y-%m-%d %H:%M},{t}",
+         r"line 4, column 'time': is 26 years after the row before"),
+        (lambda m, t, i: f"{m:%H:%M},{t}",
+         r"as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"),
+    ],
+)  # fmt: skip
+def test_what_is_no_time_is_refused(tmp_path, row, words):
+    with pytest.raises(DataError, match=words):
+        read(tmp_path, ["time,T °C"], row)
 
 
 def test_the_minus_of_scandinavian_spreadsheets_is_one(tmp_path):

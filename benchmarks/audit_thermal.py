@@ -247,8 +247,10 @@ def thermometer(draws: int, rng: np.random.Generator) -> list[Row]:
         steady = camera.model.interior.as_array()
         eop, points = s.truth.eop[0], s.field.points[:1]
         warm = np.concatenate([project(s.model.sensor, steady + d, eop, points) for d in drift])
-        found = correct_points(camera, log, times, warm, temperature_sd=camera.thermometer_sd)
-        off = (found.points - project(s.model.sensor, steady, eop, points)) / found.sds
+        at_T0, sds, *_ = correct_points(
+            camera, log, times, warm, temperature_sd=camera.thermometer_sd
+        )
+        off = (at_T0 - project(s.model.sensor, steady, eop, points)) / sds
         moved.append(off.ravel())
     return [
         ratio("`predict --log`", "sd of the change of c, x0, y0; thermometer ± 0.15 K",
@@ -269,10 +271,10 @@ def _corrected(s: Any, camera: ThermalCamera) -> list[float]:
     rows = np.flatnonzero(s.model.sensor.contains(project(truth.sensor, cool, eop, s.field.points)))
     points = s.field.points[rows[:: max(1, len(rows) // 3)][:3]]
     log = TemperatureLog(np.arange(3.0), {"temperature": np.full(3, 40.0)})
-    found = correct_points(
+    at_25, sds, *_ = correct_points(
         camera, log, np.ones(len(points)), project(truth.sensor, warm, eop, points), to=25.0
     )
-    off = (found.points - project(truth.sensor, cool, eop, points)) / found.sds
+    off = (at_25 - project(truth.sensor, cool, eop, points)) / sds
     return [float(v) for v in off.ravel()]
 
 

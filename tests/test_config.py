@@ -89,6 +89,7 @@ BAD = [
     ({"camera": []}, "camera: unknown; is 'cameras' meant?"),
     (document(dashbord={}), "dashbord: unknown; is 'dashboard' meant?"),
     (document(store={"pth": "x"}), "store.pth: unknown; is 'path' meant?"),
+    (document(store={"path": ""}), "store.path: is ''; must not be empty"),
     (document(store={"xyz": 1}), "store.xyz: unknown; known are: path, durable"),
     (camera(perod_s=3), "cameras[0].perod_s: unknown; is 'period_s' meant?"),
     (camera(period_s=0.01), "cameras[0].period_s: is 0.01; must be at least 0.05"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 import threading
-import time
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -57,9 +56,7 @@ def test_times_and_settings_of_a_driver_are_numbers(wrong):
 
 def test_virtual_clock_jumps_and_never_goes_back():
     clock = VirtualClock(utc=1000.0, monotonic=5.0)
-    begin = time.monotonic()
     assert clock.sleep_until(3605.0)
-    assert time.monotonic() - begin < 1.0
     assert (clock.monotonic(), clock.utc()) == (3605.0, 4600.0)
     clock.sleep_until(10.0)
     assert clock.monotonic() == 3605.0

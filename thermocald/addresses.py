@@ -63,6 +63,7 @@ _HOOK = re.compile(  # a webhook's address is its secret
     r"|webhook\.office\.com/\w+|maker\.ifttt\.com/\S+/key)/?)[^\s'\"<>?]+"
 )
 _PEM = re.compile(r"(?s)(-----BEGIN [\w ]*PRIVATE KEY-----).*?(?=-----END|\Z)")
+_HOST = re.compile(r"(\[[^]]*:[^]]*\]|[^][:]*)(?::([0-9]*))?")
 _SHORTEST = 4  # a shorter secret is part of too many words
 _known: set[str] = set()
 
@@ -180,19 +181,11 @@ class HostNames:
 
     def allow_host(self, header: str) -> bool:
         """Return whether a `Host` header names this page: `name`, `name:port`, `[address]:port`."""
-        text, port = header, ""
-        if header.startswith("["):
-            text, closed, rest = header[1:].partition("]")
-            if not closed or (rest and not rest.startswith(":")) or ":" not in text:
-                return False
-            port = rest[1:]
-        elif ":" in header:
-            text, _, port = header.rpartition(":")
-            if ":" in text:
-                return False
-        if port and not (port.isascii() and port.isdigit() and int(port) < 65536):
+        found = _HOST.fullmatch(header)
+        if found is None or int(found[2] or 0) > 65535:
             return False
-        return is_loopback(text) or (_address(_plain(text)) or _plain(text)) in self._known
+        name = _plain(found[1])
+        return is_loopback(found[1]) or (_address(name) or name) in self._known
 
     def allow_origin(self, header: str) -> bool:
         """Return whether an `Origin` header names this page."""

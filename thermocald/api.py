@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
+from thermocald.names import file_name
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import TestField
@@ -142,8 +143,9 @@ def calibrate(
         file = unknown_camera(paths, pixel_pitch)
     settings = AdjustmentSettings(free=free_names(free))
     field = read_testfield(testfield)
-    photographs = calibrate_photographs(paths, field, file, settings, progress)
-    return Calibration(photographs, file, camera is None and pixel_pitch is None)
+    photographs = vars(calibrate_photographs(paths, field, file, settings, progress))
+    assumed = camera is None and pixel_pitch is None
+    return Calibration(**photographs, file=file, pitch_assumed=assumed)
 
 
 def study(
@@ -413,6 +415,7 @@ def simulate(
     from thermocald.physics.testfields import load_field
 
     require_within(seed=(seed, 0), epochs=(epochs, 1))
+    file_name(series, "series", UsageError)
     if lamp is not None and (
         not len(lamp)
         or [t for t, _ in lamp] != sorted({t for t, _ in lamp})

@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -45,7 +46,17 @@ def _folder(info: ValidationInfo) -> Path:
     return folder
 
 
-FilePath = Annotated[Path, AfterValidator(lambda path, info: _folder(info) / path.expanduser())]
+def _not_empty(path: Any) -> Any:
+    if path == "":  # as a Path it would be the current folder
+        raise PydanticCustomError("string_too_short", "empty")
+    return path
+
+
+FilePath = Annotated[
+    Path,
+    BeforeValidator(_not_empty),
+    AfterValidator(lambda path, info: _folder(info) / path.expanduser()),
+]
 """A path relative to the file's folder."""
 
 

@@ -106,8 +106,7 @@ class Machine:
             "power": self._power, "board temperature": self._heat, "disk": self._disk,
             "service": self._service,
         }  # fmt: skip
-        results = {name: check() for name, check in checks.items()}
-        return [Finding(name, *result) for name, result in results.items() if result is not None]
+        return [Finding(name, *found) for name, check in checks.items() if (found := check())]
 
     def _read(self, path: str) -> str | None:
         """Return a file's text without NULs and outer white space, None if it cannot be read."""

@@ -141,13 +141,12 @@ def listed(names: Sequence[str], most: int) -> str:
 
 def duration(seconds: float) -> str:
     """Write a duration in words: `25 minutes`, `1 minute`, `3.5 hours`, `12 days`."""
-    for unit, length in (("day", 86_400.0), ("hour", 3600.0), ("minute", 60.0)):
-        if seconds >= 2 * length or (unit == "minute" and seconds >= 59.5):
-            count = seconds / length
-            shown = f"{count:.0f}" if count >= 10 or unit == "minute" else f"{count:.1f}"
-            return f"{shown} {unit}{'' if shown == '1' else 's'}"
-    shown = f"{seconds:.0f}"
-    return f"{shown} second{'' if shown == '1' else 's'}"
+    units = (("day", 86_400.0, 2.0), ("hour", 3600.0, 2.0), ("minute", 60.0, 59.5 / 60))
+    longer = (one for one in units if seconds >= one[1] * one[2])
+    unit, length, _ = next(longer, ("second", 1.0, 0.0))
+    count = seconds / length
+    shown = f"{count:.1f}" if count < 10 and length > 60 else f"{count:.0f}"
+    return f"{shown} {unit}{'' if shown == '1' else 's'}"
 
 
 def percent(share: float, decimals: int = 0) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,6 +12,7 @@ import numpy as np
 
 from thermocald.analysis import field as checks
 from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.camera.photographs import Photographs
 from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.analysis.study import study as studies
 from thermocald.discovery import result as discoveries
@@ -28,11 +29,9 @@ from thermocald.store.recording.sense import doubt_lines, interior_doubts
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from thermocald.analysis.camera.photographs import Photographs
     from thermocald.analysis.study.reference import Comparison
-    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
+    from thermocald.photogrammetry.camera.camera_model import CameraSpec, ExteriorOrientation
     from thermocald.physics.model import ThermalModel
-    from thermocald.store.recording.head import CameraSpec
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -129,19 +128,17 @@ class Discovery(discoveries.Discovery, Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(Result):
+class Calibration(Photographs, Result):
     """A camera calibrated from photographs of a test field, and the photographs' poses.
 
-    photographs: status and reason, the adjustment's sigma0 and covariance, and each photograph;
     file: the camera's data as given; pitch_assumed: whether the pixel pitch was assumed.
     """
 
-    JSON: ClassVar = {
-        "photographs": "*", "file": "", "pitch_assumed": "", "head": "camera", "doubts": "doubts",
+    JSON: ClassVar = Photographs.JSON | {
+        "file": "", "pitch_assumed": "", "head": "camera", "doubts": "doubts",
     }  # fmt: skip
 
-    photographs: Photographs
-    file: CameraSpec
+    file: CameraSpec = field(kw_only=True)
     pitch_assumed: bool = False
 
     @property
@@ -153,34 +150,23 @@ class Calibration(Result):
     @property
     def doubts(self) -> list[str]:
         """Probable mistakes in the estimated camera, one sentence each."""
-        result = self.photographs
-        if result.interior is None or not result.estimated:
+        if self.interior is None or not self.estimated:
             return []
         found = []
-        if result.disagreement > 1:
+        if self.disagreement > 1:
             found.append(
                 "the photographs disagree: what the image points of one photograph have in common "
-                f"is {result.disagreement:.1f} times as large as their noise explains (another "
+                f"is {self.disagreement:.1f} times as large as their noise explains (another "
                 "focus or zoom, a board that bends, a rolling shutter, blur by motion?); the "
                 "standard deviations, also of the poses, include this, but no error that all "
                 "photographs share"
             )
         if self.pitch_assumed:
             return found
-        first = known_photograph(Path(result.photographs[0].path), "file")
+        first = known_photograph(Path(self.photographs[0].path), "file")
         nominal = self.file.principal_distance or (first.focal_length if first else None)
-        c, x0, y0 = result.interior.as_array()[:3].tolist()
+        c, x0, y0 = self.interior.as_array()[:3].tolist()
         return found + interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
-
-    @property
-    def status(self) -> str:
-        """`ok` if the interior orientation was estimated."""
-        return self.photographs.status
-
-    @property
-    def sigma0(self) -> float:
-        """Standard deviation of unit weight, NaN if nothing was estimated."""
-        return self.photographs.sigma0
 
     @cached_property
     def camera(self) -> Camera:
@@ -188,22 +174,20 @@ class Calibration(Result):
 
         Raises DataError if the camera was not calibrated.
         """
-        if self.photographs.interior is None:
-            raise DataError(f"the camera was not calibrated: {self.photographs.reason}")
+        if self.interior is None:
+            raise DataError(f"the camera was not calibrated: {self.reason}")
         return Camera(
             self.file.sensor,
             float("nan"),
-            self.photographs.interior.as_array(),
-            np.array(self.photographs.covariance[:10, :10]),
+            self.interior.as_array(),
+            np.array(self.covariance[:10, :10]),
             name=self.file.name,
         )
 
     @property
     def poses(self) -> dict[str, ExteriorOrientation]:
         """{photograph: exterior orientation} of the photographs that have one."""
-        return {
-            str(p.path): p.exterior for p in self.photographs.photographs if p.exterior is not None
-        }
+        return {str(p.path): p.exterior for p in self.photographs if p.exterior is not None}
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald calibrate --json` writes."""
@@ -222,7 +206,7 @@ class Calibration(Result):
                 f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
                 + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
             )
-            table = interior_table(self.photographs, self.file.sensor, str)
+            table = interior_table(self, self.file.sensor, str)
             rows = [("", *table.headings[1:]), *table.rows]
             width = [max(len(row[k]) for row in rows) for k in range(3)]
             lines += [
@@ -254,14 +238,14 @@ class Calibration(Result):
         from thermocald.output.calibration import render_calibration
 
         name = title or self.file.name
-        return render_calibration(self.photographs, self.file.sensor, name, self.doubts)
+        return render_calibration(self, self.file.sensor, name, self.doubts)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""
         from thermocald.figures import draw_figure
         from thermocald.output.calibration import residual_figure
 
-        return draw_figure(residual_figure(self.photographs, self.file.sensor))
+        return draw_figure(residual_figure(self, self.file.sensor))
 
     def save(self, path: Path | str) -> Path:
         """Write the camera in this program's format: `.json` with covariance, `.yaml` without.
@@ -270,15 +254,15 @@ class Calibration(Result):
         """
         from thermocald.photogrammetry.camera_files import write_camera
 
-        if self.photographs.interior is None or not self.photographs.estimated:
-            why = self.photographs.reason
+        if self.interior is None or not self.estimated:
+            why = self.reason
             raise DataError(f"{path}: not written, the camera was not calibrated: {why}")
         comment = (
-            f"calibrated by thermocald from {len(self.photographs.photographs)} photographs, "
+            f"calibrated by thermocald from {len(self.photographs)} photographs, "
             f"sigma0 {self.sigma0:.2f}"
         )
-        known = replace(self.file, interior=self.photographs.interior)
-        write_camera(Path(path), known, self.photographs.covariance[:10, :10], comment)
+        known = replace(self.file, interior=self.interior)
+        write_camera(Path(path), known, self.covariance[:10, :10], comment)
         return Path(path)
 
 

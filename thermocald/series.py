@@ -18,9 +18,8 @@ import numpy as np
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import (
     misplaced_doubts,
-    recorded_table,
     replay_into,
-    table_of_stored,
+    series_epochs,
 )
 from thermocald.analysis.study.measured import measured_series
 from thermocald.arrays import spread_rows
@@ -190,7 +189,7 @@ class Series:
         settings = AdjustmentSettings(free=free_names(free))
         if store is None:
             with self._opened() as source:
-                return with_drifts(_adjust(source, settings, exterior, progress, jobs))
+                return with_drifts(series_epochs(source, settings, exterior, progress, jobs))
         path = source_of(store)
         if not isinstance(self._measured, Recording):
             raise UsageError(f"{path}: {self.source} is in a store already")
@@ -249,7 +248,7 @@ class Series:
         settings = AdjustmentSettings(free=tuple(free))
         with self._opened() as source:
             source.head.require_calibrated(source.title)
-            table = _adjust(source, settings, exterior, None, jobs)
+            table = series_epochs(source, settings, exterior, None, jobs)
             found = measured_series(source, table, label or usual, thermometer_sd)
         return replace(found, doubts=tuple(self.doubts(table, found.mean)))
 
@@ -270,19 +269,6 @@ class Series:
             assert self._store is not None
             with open_source(self._store) as store:
                 yield StoredRecording(store, self._measured)
-
-
-def _adjust(
-    source: Recording | StoredRecording,
-    settings: AdjustmentSettings,
-    exterior: str,
-    progress: Progress,
-    jobs: int,
-) -> Epochs:
-    """Return a source's adjusted epochs."""
-    if isinstance(source, Recording):
-        return recorded_table(source, settings, exterior, progress, jobs)
-    return table_of_stored(source, settings, exterior, jobs)
 
 
 def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
@@ -335,9 +321,11 @@ def require_series(series: Sequence[Series]) -> None:
     for i, one in enumerate(series):
         for other in series[:i]:
             if one is other or one.place == other.place:
+                same = f"is the same series as {other.source}"
+                fault = "is given twice" if one.source == other.source else same
                 raise UsageError(
-                    f"{one.source} is the same series as {other.source}; give each series once (a "
-                    "copy would count as a second measurement that agrees perfectly)"
+                    f"{one.source} {fault}; give each series once (a copy would count as a second "
+                    "measurement that agrees perfectly)"
                 )
 
 
@@ -366,6 +354,8 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
                 f"--free: {name!r} is no parameter of the interior orientation; give some of "
                 f"{choices}, or none"
             )
+        if names.count(name) > 1:
+            raise UsageError(f"--free: {name} is given twice")
     return tuple(name for name in IOP_NAMES if name in names)
 
 

@@ -278,6 +278,8 @@ class AlertOutput(Output):
         self._last[device] = moment
         failed = 0 if result.get("status") in WITH_VALUES else self._in_a_row.get(device, 0) + 1
         self._in_a_row[device] = failed
+        utc = _number(result.get("frame_time"))
+        epoch = moment[1] if isinstance(moment[1], int) else None
         before, self._lost = self._lost, int(result.get("lost", self._lost))
         self._unstored = self._unstored + 1 if result.get("stored") is False else 0
         lost = max(0, self._lost - before, self._unstored)
@@ -293,20 +295,11 @@ class AlertOutput(Output):
             limit = high if value > high or math.isinf(low) else low
             bound = f" (limit {limit + found.step:g}{found.unit})"
             text = found.words + (bound if out else ": within its limits again")
-            utc, epoch = _number(result.get("frame_time")), moment[1]
-            changes.append(
-                Alert(
-                    device,
-                    condition.name,
-                    "out" if out else "in",
-                    f"{device}: {text}",
-                    value,
-                    limit,
-                    str(result.get("series", "")),
-                    int(epoch) if isinstance(epoch, int) else None,
-                    None if math.isnan(utc) else utc,
-                )
-            )
+            one = Alert(
+                device, condition.name, "out" if out else "in", f"{device}: {text}", value, limit,
+                str(result.get("series", "")), epoch, None if math.isnan(utc) else utc,
+            )  # fmt: skip
+            changes.append(one)
         return changes
 
     def deliver(self, alert: Alert) -> None:

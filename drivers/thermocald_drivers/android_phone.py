@@ -293,6 +293,8 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         units: dict[str, Literal["degC", "tenths", "thousandths"]] = {}  # noqa: RUF012
         timeout_s: support.Seconds = 5.0
 
+    range_c = PHONE_RANGE_C
+
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.sensors: dict[str, str] = self.options.sensors
@@ -307,7 +309,6 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
                 raise ConfigurationError(
                     f"units.{channel}: sensors has no battery or zone of that name"
                 )
-        self.checked = support.Channels(self.clock, *PHONE_RANGE_C)
         self._scales = self._stated()
 
     @classmethod
@@ -335,7 +336,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
             channel: (source, partial(self._judge, channel, source, found.get(source)))
             for channel, source in self.sensors.items()
         }
-        return self.checked.reading(measures, start)
+        return self.reading(measures, start)
 
     def _judge(self, channel: str, source: str, value: float | str | None) -> float:
         where = f"{self.where}: {source}"
@@ -345,7 +346,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
             state = STATE_UNIT.format(channel=channel)
             raise BadReading(f"{where}: {value.format(state=state)}")
         idle = "what an absent sensor reports" if chips.is_idle("", value) else ""
-        return self.checked.judge(source, value, where, idle)
+        return self.judge(source, value, where, idle)
 
     def _stated(self) -> dict[str, float]:
         """Return {source: factor to °C} for the units in the stanza."""
@@ -356,7 +357,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
 
     def _in_unit(self, source: str, number: float, scale: float) -> float | str:
         """Return °C, or why the unit is doubtful, in words."""
-        if self.checked.switched(source, number, scale):
+        if self.switched(source, number, scale):
             return f"{number:g} agrees with the last reading only in another unit: it has switched"
         return round(number * scale, 6)
 

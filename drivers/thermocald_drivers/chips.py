@@ -3,7 +3,7 @@
 A chip that was just powered up, that lost its supply or its bus, or whose probe is open returns a
 fixed word, and firmware and kernel drivers convert it to a temperature like any other. The value is
 a property of the chip; only a reading shortly before can distinguish it from a real temperature
-(`support.Channels`). Words are given before offset, scale and unit.
+(`support.CheckedThermometer`). Words are given before offset, scale and unit.
 """
 
 from __future__ import annotations

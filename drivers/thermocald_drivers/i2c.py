@@ -40,7 +40,7 @@ from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from thermocald.hal import Reading
 
@@ -59,7 +59,6 @@ class I2cThermometer(support.CheckedThermometer):
 
     chip: ClassVar[str]
     addresses: ClassVar[range | tuple[int, ...]]
-    range_c: ClassVar[tuple[float, float]]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -71,7 +70,6 @@ class I2cThermometer(support.CheckedThermometer):
                 f"address: 0x{chosen:02x} is not an address of a {self.chip} ({known})"
             )
         self.where = f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.options.bus}"
-        self.checked = support.Channels(self.clock, *self.range_c)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
@@ -106,11 +104,11 @@ class I2cThermometer(support.CheckedThermometer):
 
     def read(self) -> Reading:
         self.opened()
-        return self.checked.reading({self.options.channel: (self.where, self._checked)})
+        return self.reading({self.options.channel: (self.where, self._judged)})
 
-    def _checked(self) -> float:
+    def _judged(self) -> float:
         value, idle = self._measure()
-        return self.checked.judge("", value, self.where, idle)
+        return self.judge("", value, self.where, idle)
 
     def _identify(self) -> None:
         """Check the chip's identity and make it convert; WrongDevice if it is another chip."""
@@ -120,21 +118,17 @@ class I2cThermometer(support.CheckedThermometer):
         """Return (a fresh value in °C, why it may not have been measured or "")."""
         raise NotImplementedError
 
-    def _byte(self, register: int) -> int:
-        return int(self.handle.read_byte_data(self.address, register))
+    def _read(self, register: int, mask: int = 0xFFFF) -> int:
+        """Read a register as wide as a mask, of 8 or 16 bits."""
+        if mask <= 0xFF:
+            return int(self.handle.read_byte_data(self.address, register))
+        return swapped(int(self.handle.read_word_data(self.address, register)))
 
-    def _word(self, register: int) -> int:
-        """Read a 16-bit register: high byte first on the wire, unlike an SMBus word."""
-        value = int(self.handle.read_word_data(self.address, register))
-        return (value & 0xFF) << 8 | value >> 8
-
-    def _reader(self, mask: int) -> Callable[[int], int]:
-        """Return the method that reads a register as wide as a mask."""
-        return self._word if mask > 0xFF else self._byte
-
-    def _write_word(self, register: int, value: int) -> None:
-        swapped = (value & 0xFF) << 8 | value >> 8
-        self.handle.write_word_data(self.address, register, swapped)
+    def _write(self, register: int, value: int, mask: int = 0xFFFF) -> None:
+        if mask <= 0xFF:
+            self.handle.write_byte_data(self.address, register, value)
+        else:
+            self.handle.write_word_data(self.address, register, swapped(value))
 
     def _driven(self, word: int) -> int:
         """Return a measured word; BadReading for 0xFFFF, of a bus that nothing drives."""
@@ -155,9 +149,8 @@ class I2cThermometer(support.CheckedThermometer):
 
     def _await(self, register: int, mask: int, wanted: int, poll_s: float) -> None:
         """Poll a status register for the wanted bits; DeviceTimeout after 20 attempts."""
-        read = self._reader(mask)
         for _ in range(20):
-            if read(register) & mask == wanted:
+            if self._read(register, mask) & mask == wanted:
                 return
             self._wait(poll_s)
         raise DeviceTimeout(f"{self.where}: the conversion did not end in {20 * poll_s:g} s")
@@ -173,14 +166,14 @@ class Tmp117Thermometer(I2cThermometer):
     ONE_SHOT_8_AVERAGES, DATA_READY = 0b11 << 10 | 0b01 << 5, 1 << 13
 
     def _identify(self) -> None:
-        self._expect("the device identity", self._word(self.DEVICE) & 0x0FFF, 0x0117)
+        self._expect("the device identity", self._read(self.DEVICE) & 0x0FFF, 0x0117)
 
     def _measure(self) -> tuple[float, str]:
-        self._word(self.CONFIGURATION)  # reading clears the Data_Ready of an earlier conversion
-        self._write_word(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
+        self._read(self.CONFIGURATION)  # reading clears the Data_Ready of an earlier conversion
+        self._write(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
         self._wait(0.1245)
         self._await(self.CONFIGURATION, self.DATA_READY, self.DATA_READY, 0.01)
-        raw = self._driven(self._word(self.TEMPERATURE))
+        raw = self._driven(self._read(self.TEMPERATURE))
         if raw == 0x8000:
             raise BadReading(f"{self.where}: 0x8000, the power-on value; no conversion took place")
         return signed(raw, 16) / 128.0, ""
@@ -195,28 +188,25 @@ class _ConvertingThermometer(I2cThermometer):
 
     def _wake(self) -> None:
         """Wake the chip from shut-down and wait for a conversion."""
-        read = self._reader(self.SHUTDOWN)
-        configuration = read(self.CONFIGURATION)
+        configuration = self._read(self.CONFIGURATION, self.SHUTDOWN)
         if not configuration & self.SHUTDOWN:
             return
-        if self.SHUTDOWN > 0xFF:
-            self._write_word(self.CONFIGURATION, configuration & ~self.SHUTDOWN)
-        else:
-            self.handle.write_byte_data(
-                self.address, self.CONFIGURATION, configuration & ~self.SHUTDOWN
-            )
-        if read(self.CONFIGURATION) & self.SHUTDOWN:
+        self._write(self.CONFIGURATION, configuration & ~self.SHUTDOWN, self.SHUTDOWN)
+        if self._read(self.CONFIGURATION, self.SHUTDOWN) & self.SHUTDOWN:
             raise BadReading(f"{self.where}: does not leave shut-down (locked registers?)")
         self._wait(self.conversion_s)
 
     def _measure(self) -> tuple[float, str]:
         self._wake()
-        value = self._decode(self._driven(self._word(self.TEMPERATURE)))
+        value = self._temperature()
         if value == 0.0:
             self._wait(self.conversion_s)
-            value = self._decode(self._driven(self._word(self.TEMPERATURE)))
+            value = self._temperature()
         idle = "its power-up value: it lost its supply or does not convert"
         return value, "" if value else idle
+
+    def _temperature(self) -> float:
+        return self._decode(self._driven(self._read(self.TEMPERATURE)))
 
     def _decode(self, word: int) -> float:
         """Convert a temperature word to °C."""
@@ -234,8 +224,8 @@ class Mcp9808Thermometer(_ConvertingThermometer):
     SHUTDOWN = 1 << 8
 
     def _identify(self) -> None:
-        self._expect("the manufacturer", self._word(self.MANUFACTURER), 0x0054)
-        self._expect("the device register", self._word(self.DEVICE) >> 8, 0x04)
+        self._expect("the manufacturer", self._read(self.MANUFACTURER), 0x0054)
+        self._expect("the device register", self._read(self.DEVICE) >> 8, 0x04)
         self._wake()
 
     def _decode(self, word: int) -> float:
@@ -269,9 +259,9 @@ class Lm75Thermometer(_ConvertingThermometer):
     def _identify(self) -> None:
         unused = (1 << (16 - self.limit_bits)) - 1
         # a TMP102 in extended mode has 13 bits, to 150 °C
-        extended = self.options.chip == "tmp102" and self._word(self.CONFIGURATION) & 1 << 4
+        extended = self.options.chip == "tmp102" and self._read(self.CONFIGURATION) & 1 << 4
         for register, what in self.LIMITS.items():
-            limit = self._word(register)
+            limit = self._read(register)
             if limit == 0xFFFF or (limit & unused and not extended):
                 raise WrongDevice(
                     f"{self.where}: {what} reads 0x{limit:04x}, which a {self.options.chip} "
@@ -337,7 +327,7 @@ class Bme280Thermometer(I2cThermometer):
     FORCED_X2_X1, MEASURING = 0b010 << 5 | 0b001 << 2 | 0b01, 1 << 3
 
     def _identify(self) -> None:
-        self._expect("the identity", self._byte(self.IDENTITY), 0x60)
+        self._expect("the identity", self._read(self.IDENTITY, 0xFF), 0x60)
         table = self._block(self.CALIBRATION, 26)
         if table in (bytes(26), b"\xff" * 26):
             raise BadReading(f"{self.where}: the calibration registers are empty")
@@ -347,8 +337,8 @@ class Bme280Thermometer(I2cThermometer):
         return bytes(self.handle.read_i2c_block_data(self.address, register, size))
 
     def _measure(self) -> tuple[float, str]:
-        self.handle.write_byte_data(self.address, self.CONTROL_HUMIDITY, 0b001)
-        self.handle.write_byte_data(self.address, self.CONTROL, self.FORCED_X2_X1)
+        self._write(self.CONTROL_HUMIDITY, 0b001, 0xFF)
+        self._write(self.CONTROL, self.FORCED_X2_X1, 0xFF)
         self._wait(0.012)
         self._await(self.STATUS, self.MEASURING, 0, 0.005)
         data = self._block(self.DATA, 8)
@@ -374,6 +364,11 @@ def crc8(data: bytes) -> int:
         for _ in range(8):
             crc = (crc << 1 ^ 0x31) & 0xFF if crc & 0x80 else crc << 1
     return crc
+
+
+def swapped(word: int) -> int:
+    """Return a word as on the wire, high byte first, unlike an SMBus word."""
+    return (word & 0xFF) << 8 | word >> 8
 
 
 def signed(value: int, bits: int) -> int:

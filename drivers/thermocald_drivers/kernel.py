@@ -107,7 +107,7 @@ class _KernelThermometer(support.CheckedThermometer):
             )
         self.chip = self.where = getattr(o, self.key)
         self.sysfs = Path(o.sysfs)
-        self.checked = support.Channels(self.clock, o.minimum_c, o.maximum_c)
+        self.range_c = o.minimum_c, o.maximum_c
         self._channels: dict[str, str] = {}
         self._name = ""
 
@@ -183,7 +183,7 @@ class _KernelThermometer(support.CheckedThermometer):
         for channel, key in self._channels.items():
             where = f"{folder.name} ({self.chip}) {key}"
             measures[channel] = where, partial(self._measure, folder, key, where)
-        reading = self.checked.reading(measures)
+        reading = self.reading(measures)
         try:
             name = support.read_line(folder / self.name_file)
         except OSError as error:
@@ -194,7 +194,7 @@ class _KernelThermometer(support.CheckedThermometer):
 
     def _measure(self, folder: Path, key: str, where: str) -> float:
         value, idle = self._convert(folder, key)
-        return self.checked.judge(key, value, where, idle)
+        return self.judge(key, value, where, idle)
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:
@@ -339,12 +339,12 @@ class ThermalZoneThermometer(_KernelThermometer):
             )
         if value == NOT_FITTED_C:
             raise BadReading(f"{folder.name}: {value:g} °C is what an absent sensor reports")
-        if self.checked.switched(key, number, scale):
+        if self.switched(key, number, scale):
             raise BadReading(
                 f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and agrees with the "
                 "last reading only in another unit; the kernel has switched the unit"
             )
-        if not stated and not larger and not self.checked.support(key, value):
+        if not stated and not larger and not self.supports(key, value):
             return value, f"{number:g} in a unit that is not certain (set unit: {self.unit})"
         if self.unit == "thousandths" and 0 < abs(number) <= LARGEST_OF_DEGREES:
             return value, f"{number:g} in thousandths, or in degrees"

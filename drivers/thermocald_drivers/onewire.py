@@ -116,13 +116,13 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         sysfs: support.Text = "/sys"
 
     where = "1-wire"
+    range_c = (-55.0, 125.0)
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.sensors: dict[str, str] = self.options.sensors
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._pending: dict[str, Future[float]] = {}
-        self.checked = support.Channels(self.clock, -55.0, 125.0)
 
     def named_channels(self) -> list[str]:
         return list(self.sensors)
@@ -165,7 +165,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
                 self._pending[channel] = support.in_thread(
                     partial(self._read_one, channel), f"w1-{channel}"
                 )
-        return self.checked.reading(
+        return self.reading(
             {
                 channel: (f"1-wire {rom}", partial(self._await, channel, deadline))
                 for channel, rom in self.sensors.items()
@@ -189,7 +189,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
                 )
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
                 idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
-                return self.checked.judge(channel, value, f"1-wire {rom}", idle)
+                return self.judge(channel, value, f"1-wire {rom}", idle)
             except BadReading as error:
                 problem = error
             except OSError as error:

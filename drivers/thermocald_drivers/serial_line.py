@@ -171,7 +171,7 @@ class SerialThermometer(support.CheckedThermometer):
             raise ConfigurationError("pattern: name the value, such as (?P<temperature>[-+0-9.]+)")
         if o.checksum != "none" and "checksum" not in self.pattern.groupindex:
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
-        self.checked = support.Channels(self.clock, o.minimum_c, o.maximum_c)
+        self.range_c = o.minimum_c, o.maximum_c
         self._decimals: dict[str, tuple[int, bool, int]] = {}
         self._line = b""
         self._synchronous = False
@@ -247,7 +247,7 @@ class SerialThermometer(support.CheckedThermometer):
             channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match[channel]))
             for channel in there
         }
-        reading = self.checked.reading(measures, start)
+        reading = self.reading(measures, start)
         if self.command:
             return reading
         monotonic, utc = support.on_clock(self.clock, ended)
@@ -351,7 +351,7 @@ class SerialThermometer(support.CheckedThermometer):
         celsius = factor * (number * self.options.scale + self.options.offset - zero)
         if self.options.unit == "mA" and not LOOP_MA[0] <= number <= LOOP_MA[1]:
             raise BadReading(f"{where} mA is a broken loop, not within 3.6 … 21 mA (NAMUR NE 43)")
-        self.checked.require_range(celsius, where)
+        self.require_range(celsius, where)
         if any(
             self._printed(number, decimals, refused) or abs(celsius - refused) < NO_SENSOR_STEP_K
             for refused in self.options.refuse_c
@@ -361,7 +361,7 @@ class SerialThermometer(support.CheckedThermometer):
                 "refuse_c: []"
             )
         idle = self._idle(number, decimals) if self.options.refuse_c else ""
-        return self.checked.judge(channel, celsius, where, idle)
+        return self.judge(channel, celsius, where, idle)
 
     def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
         """Raise BadReading for a number that lost digits, since firmware always prints as many.

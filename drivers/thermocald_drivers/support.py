@@ -208,36 +208,37 @@ def result_in_time(task: Future[Any], seconds: float, late: str) -> Any:
         raise DeviceTimeout(late) from error
 
 
-class Channels:
-    """The channels of one thermometer: checks their temperatures and makes its readings.
+class CheckedThermometer(Thermometer):
+    """A thermometer that checks the temperatures of its channels, and makes its readings of them.
 
-    low_c, high_c: the sensor's range. An idle value, which a chip reports without having measured
-    (see `chips`), is accepted only if a reading less than NEIGHBOUR_AGE_S old lies within
-    NEIGHBOUR_STEP_K of it. An idle value never supports another.
+    range_c: of the sensor. An idle value, which a chip reports without having measured (see
+    `chips`), is accepted only if a reading less than NEIGHBOUR_AGE_S old, since the opening, lies
+    within NEIGHBOUR_STEP_K of it. An idle value never supports another.
     """
 
-    def __init__(self, clock: Clock, low_c: float, high_c: float) -> None:
-        self._clock = clock
-        self._low_c, self._high_c = low_c, high_c
-        self._last: dict[str, tuple[float, float]] = {}
+    range_c: tuple[float, float]
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._checked: dict[str, tuple[float, float]] = {}
         self._numbers: dict[str, tuple[float, float]] = {}
 
-    def clear(self) -> None:
-        """Forget the last readings, when the device is closed."""
-        self._last.clear()
+    def close(self) -> None:
+        super().close()
+        self._checked.clear()
 
-    def support(self, channel: str, value_c: float) -> bool:
+    def supports(self, channel: str, value_c: float) -> bool:
         """Return whether a recent reading of the channel is close to a value."""
-        at, last_c = self._last.get(channel, (-math.inf, math.nan))
-        recent = self._clock.monotonic() - at <= NEIGHBOUR_AGE_S
+        at, last_c = self._checked.get(channel, (-math.inf, math.nan))
+        recent = self.clock.monotonic() - at <= NEIGHBOUR_AGE_S
         return recent and abs(last_c - value_c) <= NEIGHBOUR_STEP_K
 
     def require_range(self, value_c: float, where: str) -> None:
         """Raise BadReading for a value that is not finite or outside the sensor's range."""
-        if not math.isfinite(value_c) or not self._low_c <= value_c <= self._high_c:
+        low_c, high_c = self.range_c
+        if not low_c <= value_c <= high_c:
             raise BadReading(
-                f"{where}: {value_c:g} °C is outside the sensor's range {self._low_c:g} … "
-                f"{self._high_c:g} °C"
+                f"{where}: {value_c:g} °C is outside the sensor's range {low_c:g} … {high_c:g} °C"
             )
 
     def judge(self, channel: str, value_c: float, where: str, idle: str = "") -> float:
@@ -248,8 +249,8 @@ class Channels:
         """
         self.require_range(value_c, where)
         if not idle:
-            self._last[channel] = (self._clock.monotonic(), value_c)
-        elif not self.support(channel, value_c):
+            self._checked[channel] = (self.clock.monotonic(), value_c)
+        elif not self.supports(channel, value_c):
             raise BadReading(
                 f"{where}: {value_c:g} °C is {idle}, and no recent reading was near it"
             )
@@ -261,7 +262,7 @@ class Channels:
         Kernels report 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45. The
         last numbers are retained while the device is closed.
         """
-        value, now = number * scale, self._clock.monotonic()
+        value, now = number * scale, self.clock.monotonic()
         at, last = self._numbers.get(source, (now, value))
         other = None
         if now - at <= SWITCH_S and abs(value - last) > NEIGHBOUR_STEP_K:
@@ -278,7 +279,7 @@ class Channels:
         The reading's time is midway between `start` (s, by default the call) and the end. If no
         channel has a value, one error with the reasons of all is raised.
         """
-        start = self._clock.monotonic() if start is None else start
+        start = self.clock.monotonic() if start is None else start
         values: dict[str, float] = {}
         missing: dict[str, TransientDeviceError] = {}
         for channel, (where, measure) in measures.items():
@@ -294,17 +295,7 @@ class Channels:
         if not values:
             first = next(iter(missing.values()))
             raise type(first)("; ".join(map(str, missing.values()))) from first
-        return middle_reading(self._clock, values, start, {k: str(e) for k, e in missing.items()})
-
-
-class CheckedThermometer(Thermometer):
-    """A thermometer whose readings pass the checks of `Channels`, which are anew after a close."""
-
-    checked: Channels
-
-    def close(self) -> None:
-        super().close()
-        self.checked.clear()
+        return middle_reading(self.clock, values, start, {k: str(e) for k, e in missing.items()})
 
 
 BAYER_ORDERS = {

@@ -58,7 +58,6 @@ if TYPE_CHECKING:
 
     from thermocald_drivers.v4l2_stream import Control, Grab, Stream
 
-    Wanted = float | str | None
 
 FUTURE_S = 1.0
 """A time stamp may be this far ahead (vivid: up to a frame); a later one is of another clock."""
@@ -130,7 +129,10 @@ class V4l2Camera(Camera):
             )
         self.where = f"camera {o.device or o.serial}"
         self._wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
-        self._controls = CameraControls(self.where, self._wanted, o.controls)
+        self._held: dict[int, int] = {}  # also while it is closed and opened again
+        self._asked: dict[int, int] = {}
+        self._automatic: list[Lock] = []
+        self._available: dict[int, Control] = {}
 
     @classmethod
     def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
@@ -170,7 +172,7 @@ class V4l2Camera(Camera):
             stream.set_format(o.pixel_format.ljust(4), o.width, o.height)
             if o.card is not None and o.card not in stream.card:
                 raise WrongDevice(f"{path}: this is {stream.card!r}, not {o.card!r}")
-            self._controls.apply(stream, strict=o.strict)
+            self._apply()
             stream.start()
         except OSError as error:
             self.close()
@@ -196,14 +198,14 @@ class V4l2Camera(Camera):
         called = time.monotonic()
         deadline = called + self.options.timeout_s
         try:
-            settings = self._controls.settings(self._controls.values(stream))
+            settings = self._settings(self._values())
             # known only in manual exposure
             exposure = None if settings.get("exposure_auto") else settings.get("exposure_s")
             grab, stamp = self._fresh(stream, called, deadline, exposure or 0.0)
-            values = self._controls.values(stream)
+            values = self._values()
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
-        disobeyed = self._controls.deviations(values)
+        disobeyed = self._deviations(values)
         if disobeyed and self.options.strict:
             raise BadReading(f"{self.where}: {'; '.join(disobeyed)}")
         middle = stamp + (0.5 if grab.start_of_exposure else -0.5) * (exposure or 0.0)
@@ -215,7 +217,7 @@ class V4l2Camera(Camera):
             utc=utc,
             exposure=exposure,
             sequence=grab.sequence,
-            settings=self._controls.settings(values),
+            settings=self._settings(values),
         )
 
     def _fresh(
@@ -274,53 +276,39 @@ class V4l2Camera(Camera):
             )
         return str(links[0])
 
+    def _apply(self) -> None:
+        """Apply all settings, automatic modes first.
 
-class CameraControls:
-    """A camera's settings, retained while it is closed and opened again.
-
-    wanted: {option of LOCKS: value, AUTO, or None to lock the current one}; named: {control's name:
-    value}. Raises WrongDevice for a setting that the camera does not have or hold.
-    """
-
-    def __init__(self, where: str, wanted: Mapping[str, Wanted], named: Mapping[str, int]) -> None:
-        self._where = where
-        self._wanted = wanted
-        self._named = named
-        self._held: dict[int, int] = {}
-        self._asked: dict[int, int] = {}
-        self._automatic: list[Lock] = []
-        self._available: dict[int, Control] = {}
-
-    def apply(self, stream: Stream, *, strict: bool) -> None:
-        """Apply all settings, automatic modes first; strict: raise if one does not read back."""
-        self._available = stream.controls()
+        Raises WrongDevice for a setting that the camera does not have or hold.
+        """
+        self._available = self.handle.controls()
         self._asked, self._automatic = {}, []
-        locked = self._collect(stream)
+        locked = self._collect()
         for control, value in self._asked.items():
-            self._set(stream, control, value, locked)
+            self._set(control, value, locked)
         for control in locked & set(self._asked):
             if control not in MODES:
                 # the camera may round: its value is what is locked
-                self._asked[control] = self._held[control] = stream.get(control)
-        problems = self.deviations(self.values(stream))
-        if problems and strict:
-            raise WrongDevice(f"{self._where}: {'; '.join(problems)}")
+                self._asked[control] = self._held[control] = self.handle.get(control)
+        problems = self._deviations(self._values())
+        if problems and self.options.strict:
+            raise WrongDevice(f"{self.where}: {'; '.join(problems)}")
 
-    def _collect(self, stream: Stream) -> set[int]:
+    def _collect(self) -> set[int]:
         """Fill `_asked` and `_automatic`; return the controls that the stanza does not set."""
         locked = set()
         for lock in LOCKS:
-            wanted = self._wanted.get(lock.option)
+            wanted = self._wanted[lock.option]
             if wanted == AUTO:
-                self._ask_automatic(stream, lock)
+                self._ask_automatic(lock)
                 continue
             if wanted is not None and lock.control not in self._available:
                 raise WrongDevice(
-                    f"{self._where}: {lock.option}: it has no control 0x{lock.control:08x}"
+                    f"{self.where}: {lock.option}: it has no control 0x{lock.control:08x}"
                 )
             if wanted is None:
                 locked |= {lock.automatic, lock.control}
-                value = self._value_to_hold(stream, lock.control)
+                value = self._value_to_hold(lock.control)
             else:
                 value = round(float(wanted) / lock.unit)
             if lock.automatic in self._available:
@@ -328,40 +316,40 @@ class CameraControls:
             if value is not None:
                 self._asked[lock.control] = value
         for control in HELD:
-            if (value := self._value_to_hold(stream, control)) is not None:
+            if (value := self._value_to_hold(control)) is not None:
                 self._asked[control] = value
                 locked.add(control)
         self._asked |= {control: 0 for control in OFF if control in self._available}
         by_name = {control.name: number for number, control in self._available.items()}
-        for name, number in self._named.items():
+        for name, number in self.options.controls.items():
             if name not in by_name:
                 known = ", ".join(sorted(by_name)) or "none"
-                raise WrongDevice(f"{self._where}: there is no control {name!r}; it has {known}")
+                raise WrongDevice(f"{self.where}: there is no control {name!r}; it has {known}")
             self._asked[by_name[name]] = number
             locked.discard(by_name[name])
         return locked
 
-    def _ask_automatic(self, stream: Stream, lock: Lock) -> None:
+    def _ask_automatic(self, lock: Lock) -> None:
         if lock.automatic not in self._available:
-            raise WrongDevice(f"{self._where}: {lock.option}: auto, but it has no automatic mode")
+            raise WrongDevice(f"{self.where}: {lock.option}: auto, but it has no automatic mode")
         self._automatic.append(lock)
-        if stream.get(lock.automatic) != lock.manual:
+        if self.handle.get(lock.automatic) != lock.manual:
             return
         for value in lock.automatic_values:
             try:
-                stream.set(lock.automatic, value)
+                self.handle.set(lock.automatic, value)
             except OSError:
                 continue
             return
-        raise WrongDevice(f"{self._where}: {lock.option}: auto is not accepted")
+        raise WrongDevice(f"{self.where}: {lock.option}: auto is not accepted")
 
-    def _value_to_hold(self, stream: Stream, control: int) -> int | None:
+    def _value_to_hold(self, control: int) -> int | None:
         """Return the value held before a re-plug, else the current one; None without either."""
         if control not in self._available:
             return None
         if control not in self._held:
             try:
-                value = stream.get(control)
+                value = self.handle.get(control)
             except OSError as error:
                 if error.errno not in _UNREADABLE:
                     raise
@@ -369,26 +357,26 @@ class CameraControls:
             self._held[control] = _bounded(value, self._available[control])
         return self._held[control]
 
-    def _set(self, stream: Stream, control: int, value: int, locked: set[int]) -> None:
+    def _set(self, control: int, value: int, locked: set[int]) -> None:
         try:
-            if control in locked and stream.get(control) == value:
+            if control in locked and self.handle.get(control) == value:
                 return  # some cameras reject a value that they already have
-            stream.set(control, value)
+            self.handle.set(control, value)
         except OSError as error:
             if control in locked and control not in MODES:
                 return  # it cannot be set, so it may stay; every frame is checked
             name, remedy = self._available[control].name, self._remedy(control, "it takes ")
             raise WrongDevice(
-                f"{self._where}: does not take {name} = {value} ({error.strerror}); {remedy}"
+                f"{self.where}: does not take {name} = {value} ({error.strerror}); {remedy}"
             ) from error
 
-    def values(self, stream: Stream) -> dict[int, int]:
+    def _values(self) -> dict[int, int]:
         """Return the current values of all locked and automatic settings."""
         automatic = [c for lock in self._automatic for c in (lock.automatic, lock.control)]
         watched = [*self._asked, *(c for c in automatic if c in self._available)]
-        return {control: stream.get(control) for control in dict.fromkeys(watched)}
+        return {control: self.handle.get(control) for control in dict.fromkeys(watched)}
 
-    def deviations(self, values: Mapping[int, int]) -> list[str]:
+    def _deviations(self, values: Mapping[int, int]) -> list[str]:
         """Return a sentence for each control that does not read back as it was set."""
         return [
             f"{self._available[control].name} was set to {asked} and is {values[control]} "
@@ -397,7 +385,7 @@ class CameraControls:
             if values[control] != asked
         ]
 
-    def settings(self, values: Mapping[int, int]) -> dict[str, float]:
+    def _settings(self, values: Mapping[int, int]) -> dict[str, float]:
         """Return the values under the options' names and units; automatic modes as 1.0 and 0.0."""
         found: dict[str, float] = {}
         named = set()

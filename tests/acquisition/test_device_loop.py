@@ -24,9 +24,7 @@ def test_a_day_of_ticks_has_no_drift():
         starts.append(clock.monotonic())
         clock.advance(work_s)
     assert starts == [1234.567 + 10.0 * k for k in range(8640)]
-    assert schedule.stats() == {
-        "ticks": 8640, "skipped": 0, "late_p99_s": 0.0, "late_max_s": 0.0
-    }  # fmt: skip
+    assert schedule.stats() == {"ticks": 8640, "skipped": 0, "late_p99_s": 0.0}
 
 
 def test_a_late_tick_is_skipped_and_counted_and_the_rhythm_stays():
@@ -42,14 +40,8 @@ def test_a_late_tick_is_skipped_and_counted_and_the_rhythm_stays():
     assert skipped == [0, 0, 2, 2, 2, 2]
     assert schedule.wait() == 9
     assert schedule.stats()["skipped"] == 3
-
-
-def test_a_device_that_joins_late_has_missed_nothing():
-    clock = VirtualClock(monotonic=105.0)
-    schedule = Schedule(clock, 10.0, begin=0.0)
-    assert schedule.wait() == 11
-    assert schedule.due(11) == 110.0
-    assert schedule.stats()["skipped"] == 0
+    late = Schedule(clock, 10.0, begin=0.0)  # a device that joins late has missed nothing
+    assert (late.wait(), late.stats()["skipped"]) == (9, 0)
 
 
 @pytest.fixture
@@ -199,6 +191,6 @@ def test_the_last_400_results_wait_for_an_output_that_is_away(back):
         while 999 not in got and time.monotonic() < end:
             time.sleep(0.02)
     assert loop.stop(5.0)
-    assert got[-400:] == (list(range(600, 1000)) if back else [])
-    assert len(got) == loop.emitted <= 401  # one is being sent
+    assert got == (list(range(600, 1000)) if back else [])  # none of those before, out of order
+    assert len(got) == loop.emitted
     assert loop.emitted + loop.lost == 1000

@@ -15,7 +15,7 @@ import pytest
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.gauge import GaugeCalibrator, GaugeObserver
+from thermocald.analysis.thermal.gauge import GaugeCalibrator
 from thermocald.analysis.thermal.predictor import Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
@@ -80,11 +80,11 @@ class World:
 def followed(gauge: GaugeCalibrator, epochs):
     """Return the results of epochs, their statuses, and the reported events (kind, text)."""
     events = []
-    observer = GaugeObserver(gauge, lambda kind, text, *_: events.append((kind, text)))
+    gauge.tell = lambda kind, text, *_: events.append((kind, text))
     results = []
     for epoch in epochs:
         done = gauge.calibrate(epoch)
-        observer.observe(done)
+        gauge.observe(done)
         results.append(done)
     return results, [r.adjustment.status for r in results], events
 

@@ -344,7 +344,7 @@ OUT_OF_BOUNDS = {
     "grid is 0; it must be from 2 to 9": lambda M1, field: tc.study(M1, grid=0),
     "distance_mm is 0": lambda M1, field: tc.reference_study(distance_mm=0.0),
     "2 labels for 1 series": lambda M1, field: tc.study(M1, labels=["a", "b"]),
-    "is the same series as": lambda M1, field: tc.fit(M1, M1),
+    "M1 is given twice; give each": lambda M1, field: tc.fit(M1, M1),
     "T0 is nan": lambda M1, field: tc.fit(M1, T0=np.nan),
     "jobs is 999; it must be from 1 to 256": lambda M1, field: M1.calibrate(jobs=999),
     "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
@@ -358,6 +358,7 @@ OUT_OF_BOUNDS = {
         lambda M1, field: tc.fit(M1, model=3)
     ),
     "free is 3; it must be text or a list .each text.": lambda M1, field: M1.calibrate(free=3),
+    "c is given twice": lambda M1, field: M1.calibrate(free="c,x0,c"),
     "free is \\['c', 0\\]": lambda M1, field: M1.calibrate(free=["c", 0]),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
@@ -486,7 +487,7 @@ def test_a_copy_is_no_second_measurement(M1, M2, inside, tmp_path):
     with pytest.raises(DataError, match=r"M3 holds the same observations as .*M1"):
         tc.discover(M1, verify=[M2, renamed])
     for others in ([M2, M1], [M2, renamed, tc.open(M2.source)]):
-        with pytest.raises(UsageError, match="is the same series as"):
+        with pytest.raises(UsageError, match="give each series once"):
             tc.discover(M1, verify=others)
     with pytest.raises(DataError, match="has the same epochs as"):
         tc.study(M1, tc.open("thermocald.db"))

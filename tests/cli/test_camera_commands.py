@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from tests.commands import call, finish
-from thermocald.analysis.camera.camera import CameraDifference
+from thermocald.analysis.camera.camera import Camera, CameraDifference
 from thermocald.analysis.thermal.calibrations import Calibration, fit_calibrations
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import (
@@ -105,6 +105,8 @@ def test_the_camera_at_35_degrees_as_a_ros_file(model, tmp_path):
     read = camera_files.read(tmp_path / "own.json")
     assert np.sqrt(read.covariance[0, 0]) == pytest.approx(document["sd_c"], rel=1e-9)
     assert "at 35 °C" in own.stdout
+    refused = call("camera", "diff", tmp_path / "own.json", model)
+    assert (refused.returncode, "`thermocald camera at` writes" in refused.stderr) == (2, True)
     # far outside its range it is refused
     assert call("camera", "at", model, "--temperature", 90, "-o", tmp_path / "x").returncode == 2
     assert not (tmp_path / "x").exists()
@@ -265,8 +267,8 @@ def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen(coarse):
         given = []
         for T in (20.0, 32.0, 50.0):
             found, C = drawn(T, rng, extra)
-            given.append(Calibration(None, "rpi", CameraModel(SENSOR, found), C, 8, (),
-                                     T + rng.normal(0, 0.1)))  # fmt: skip
+            shown = T + rng.normal(0, 0.1)
+            given.append(Calibration(None, Camera(SENSOR, shown, found.as_array(), C)))
         return fit_calibrations(given)
 
     for _ in range(400):

@@ -91,7 +91,7 @@ def test_export_of_several_series_names_the_option(recording, tmp_path):
     done = run("export", tmp_path / "t.db")
     assert done.returncode == 1
     assert "several series fit" in done.stderr
-    assert "--series CAMERA/SERIES" in done.stderr
+    assert "export selects one with --series CAMERA/SERIES" in done.stderr
     finish("export", tmp_path / "t.db", "--series", "M2")
 
 

@@ -20,6 +20,7 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.correction import RowBlock
 from thermocald.analysis.thermal.places import measure_places
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.measuring import Plane, Profile, place_on
 from thermocald.photogrammetry.field.testfield import Observations
@@ -178,6 +179,12 @@ def test_the_level_is_printed_and_heights_that_contradict_each_other_are_said(tm
     moved = ",".join([*begin, f"{float(y) + 30:.1f}", sx, sy])
     (tmp_path / "points.csv").write_text("\n".join([head, moved, *rest]) + "\n")
     assert "the places contradict each other" in measured(tmp_path).stdout
+    aside = ",".join([*begin[:-1], f"{float(begin[-1]) + 1100:.1f}", y, sx, sy])  # 5 m at 13 m
+    (tmp_path / "points.csv").write_text("\n".join([head, aside, *rest]) + "\n")
+    row = [[float(v) for v in point] for point in SECTION[:2] / 1000 + ORIGIN_M]
+    line = {"point": row[0], "direction": [0, 0, 1]}
+    (tmp_path / "water.yaml").write_text(yaml.safe_dump({"line": line}))
+    assert re.search("stone . is .* m beside the line", measured(tmp_path).stderr)
 
 
 def test_what_is_printed(gauge):
@@ -331,14 +338,35 @@ def test_five_points_of_which_one_has_moved_are_refused():
         posed(world, world.seen(20.0), thermal_camera().at(20.0))
 
 
-def places(world: World, seen: Observations, image: np.ndarray, sd_mm: float = 0.0):
-    """Measure image points (n, 2) px on the water at 20 °C."""
-    log = TemperatureLog(MORNING + np.array([0.0, 60.0]), {"temperature": np.full(2, 20.0)})
+def places(
+    world: World, seen: Observations, image: np.ndarray, sd_mm: float = 0.0,
+    shown=(20.0, 20.0), times=MORNING, noise_K: float = NOISE_K,
+):  # fmt: skip
+    """Measure image points (n, 2) px on the water; shown °C: by the thermometer every 6 hours."""
+    readings = MORNING + 6 * 3600.0 * np.arange(len(shown))
+    log = TemperatureLog(readings, {"temperature": np.array(shown)})
     observed, n = np.column_stack([image, np.full(image.shape, NOISE_PX)]), len(image)
-    row = RowBlock([], list(range(n)), [{}] * n, np.full(n, MORNING), observed, [])
+    row = RowBlock([], list(range(n)), [{}] * n, np.broadcast_to(times, n), observed, [])
     control = ControlPoints(world.field, seen, np.zeros(3), "mm")
     water = Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]), sd_mm)
-    return measure_places(thermal_camera(), log, control, MORNING, water, [row])
+    model = replace(thermal_camera().model, fitted_on=({"thermometer_sd_K": noise_K},))
+    return measure_places(ThermalCamera(model), log, control, MORNING, water, [row])
+
+
+def test_a_poor_thermometer_has_its_share_at_every_time():
+    """Of ±3 K: error over sd was 0.65 at the control points' time, where it does not matter."""
+    ratio, warmth = [], (20.0, 36.0)
+    for seed in range(40):
+        world = World(seed)
+        seen, image = world.seen(20.0), []
+        for T in warmth:
+            image.append(project(PLACES, POSE, **world.interior(T)))
+            image[-1] += world.rng.normal(0, NOISE_PX, image[-1].shape)
+        found = places(world, seen, np.concatenate(image), shown=world.rng.normal(warmth, 3.0),
+                       times=MORNING + np.repeat([0.0, 6 * 3600.0], 3), noise_K=3.0)  # fmt: skip
+        ratio.append(((found.points - np.tile(PLACES, (2, 1))) / np.maximum(found.sd, 1e-9))[:, :2])
+    at_each = np.sqrt(np.mean(np.square(ratio).reshape(-1, 2, 6), axis=(0, 2)))
+    assert at_each == pytest.approx(1.0, abs=0.2)
 
 
 def test_places_that_a_moved_control_point_falsifies_are_doubted():

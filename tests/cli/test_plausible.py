@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,13 +56,13 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
         names, from_five_places(field, model), {}, field,
         CameraSpec("", model.sensor, model.interior.c), AdjustmentSettings(),
     )  # fmt: skip
-    calibration = Calibration(found, CameraSpec("camera", model.sensor))
+    calibration = Calibration(**vars(found), file=CameraSpec("camera", model.sensor))
     assert len(calibration.as_dict()["doubts"]) == doubts
     said = str(calibration)
     assert ("doubtful: the principal distance is" in said) == bool(doubts)
     # the camera file has priority over EXIF
     stated = CameraSpec("camera", model.sensor, found.interior.c)
-    assert Calibration(found, stated).as_dict()["doubts"] == []
+    assert replace(calibration, file=stated).as_dict()["doubts"] == []
 
 
 def test_binned_photographs_are_flagged_at_import_where_exif_knows_the_focal_length_alone(tmp_path):

@@ -88,7 +88,8 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
     [
         ([], UsageError, "give recordings or stores"),
         (["nowhere"], DataError, "nowhere: does not exist"),
-        (["RECORDING", "RECORDING"], UsageError, "is the same series as"),
+        (["RECORDING", "RECORDING"], UsageError, "is given twice"),
+        (["=RECORDING"], UsageError, "the label before = is empty"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no parameter"),

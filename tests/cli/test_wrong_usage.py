@@ -54,6 +54,10 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("study", "M1", "--seed", "x"), "error: .*--seed"),
         (("predict", "--temperature", "20"), "error: missing option '--model'"),
         (("export", "M1", "--format", "xlsx"), "one of csv, json, parquet"),
+        (
+            ("simulate", "--preset", "rpi-v2.1-heating", "--out", "o", "--series", "a/b"),
+            "series: 'a/b' cannot be part of a file's name",
+        ),
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),
@@ -158,6 +162,7 @@ def test_what_may_not_be_replaced_is_refused_before_the_work(
 
 def test_every_option_that_says_that_it_writes_is_looked_at():
     for name, parameters in COMMANDS.items():
+        assert not [p for p in parameters if set(p.metavar or "") & set("[]…")]  # typer adds these
         for one in parameters:
             told = getattr(one, "help", None) or ""
             if re.match(r"(Also )?[Ww]rite|The .* to write", told):

@@ -76,8 +76,9 @@ def test_a_temperature_that_a_series_began_without_is_reported_once(run, caplog)
     assert thermometers.columns(["air"]) == ["temperature"]  # what it has once it is there
     for number, channel in enumerate(("temperature", "lens", "lens"), 1):
         keep(run, number, **{channel: 20.0})
-    kinds = [event.kind for event in run.runtime.guard.store.events()]
-    assert kinds == ["series_begun", "channel_unknown"]
+    events = run.runtime.guard.store.events()
+    assert [event.kind for event in events] == ["series_begun", "channel_unknown"]
+    assert all(event.text.startswith("camera river: series M1 beg") for event in events)
     assert caplog.text.count("series M1 began without lens: no analysis") == 1
 
 

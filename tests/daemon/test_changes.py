@@ -10,7 +10,7 @@ import pytest
 
 from tests.daemon.conftest import fast_run, make_recording, replayed_camera
 from tests.store.small import write_recording
-from thermocald.analysis.series.recorded import table_of_stored
+from thermocald.analysis.series.recorded import series_epochs
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -77,7 +77,7 @@ def told(store, name: str) -> list[tuple[str, int]]:
 def test_what_was_stored_is_what_replay_makes_of_it(store):
     """For the late epochs; at an early epoch the daemon does not have the later ones."""
     series = store.find_series("nothing")
-    replayed = table_of_stored(StoredRecording(store, series), AdjustmentSettings(), "series")
+    replayed = series_epochs(StoredRecording(store, series), AdjustmentSettings(), "series")
     names = [
         f"{kind}_{n}" for kind in ("series", "sd_series", "level_sd") for n in ("c", "x0", "y0")
     ]
@@ -108,11 +108,3 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
     assert (columns["status"] == "ok").all()
     moved = columns["X0"][-1] - columns["X0"][WHEN - 2]
     assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))
-
-
-@pytest.mark.slow  # on a virtual clock in test_virtual_clock
-def test_the_mock_at_half_a_second_tells_nothing(daemon, devices):
-    daemon.run("--epochs", "300", **devices(period_s=0.5))
-    assert daemon.wait(400.0) == 0
-    assert daemon.events() == ["started", "series_begun", "stopped"]
-    assert len(daemon.stored()[0]) == 300

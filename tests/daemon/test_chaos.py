@@ -32,18 +32,11 @@ class Chaos:
         self.results = daemon.folder / "results.jsonl"
         self.results.touch()
         self.offset = offset
-        self.count: dict[str, int] = {}
-
-    def start(self) -> None:
-        self.daemon.start(CLOCK_OFFSET_FILE=str(self.offset))
 
     def progress(self) -> None:
         """Wait for a new result."""
-        size, deadline = self.results.stat().st_size, time.monotonic() + 60
-        while self.results.stat().st_size == size:
-            assert time.monotonic() < deadline, (self.folder / "log.txt").read_text()[-3000:]
-            assert self.daemon.process.poll() is None, (self.folder / "log.txt").read_text()[-3000:]
-            time.sleep(0.01)
+        size = self.results.stat().st_size
+        self.daemon.until(lambda: self.results.stat().st_size > size)
 
     def told(self) -> dict[int, tuple[float, float]]:
         """Return {epoch: (c, frame_time)} of the epochs reported as stored."""
@@ -81,7 +74,7 @@ class Chaos:
             if not name.name.endswith("-shm"):
                 shutil.copy(name, scratch / name.name)
         before = self.compare(scratch / "thermocald.db")
-        assert not before[0], f"{before} before any bit was flipped: {self.count}"
+        assert not before[0], f"{before} before any bit was flipped"
         (scratch / "thermocald.db-shm").unlink(missing_ok=True)
         victims = [p for p in scratch.iterdir() if p.stat().st_size]
         victim = victims[int(rng.integers(len(victims)))]
@@ -90,13 +83,7 @@ class Chaos:
             data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
         victim.write_bytes(data)
         wrong, named = self.compare(scratch / "thermocald.db")
-        self.note("flips")
-        self.note("flips that showed", bool(wrong))
-        said = f"{wrong} epochs are not right, and nothing says so: {victim} {self.count}"
-        assert not wrong or named, said
-
-    def note(self, what: str, happened: bool = True) -> None:
-        self.count[what] = self.count.get(what, 0) + happened
+        assert not wrong or named, f"{wrong} epochs are not right, and nothing says so: {victim}"
 
 
 @pytest.fixture
@@ -112,14 +99,13 @@ def chaos(daemon, recording, replayed, preloaded, tmp_path):
 def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path):
     rng = np.random.default_rng(SEED)
     for number in range(ROUNDS):
-        chaos.start()
+        chaos.daemon.start(CLOCK_OFFSET_FILE=str(chaos.offset))
         chaos.progress()
         if rng.random() < 0.3:
             leap = int(rng.choice([120 * 86400, -3600, 7200, -86400]))
             chaos.offset.write_text(str(leap).ljust(12))
             time.sleep(rng.uniform(0.1, 0.6))
             chaos.offset.write_text("0".ljust(12))
-            chaos.note("clock leaps")
         if rng.random() < 0.3:
             files = sorted(p for p in chaos.folder.glob("thermocald.db*") if p.is_file())
             chosen = files if rng.random() < 0.5 else [files[int(rng.integers(len(files)))]]
@@ -127,15 +113,11 @@ def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path
                 path.unlink(missing_ok=True)
             chaos.progress()  # writes what the process holds
             chaos.progress()
-            chaos.note("deletions")
         time.sleep(rng.uniform(0.0, 0.25))
         chaos.daemon.kill()
-        chaos.note("kills")
         if rng.random() < 0.5:
             chaos.flip(rng, tmp_path / "scratch")
         if number % 10 == 9 or number == ROUNDS - 1:
             wrong, _ = chaos.compare(chaos.daemon.store)
             assert wrong == 0
-    log = (chaos.folder / "log.txt").read_text()
-    assert "Traceback" not in log, log[log.index("Traceback") - 500 :][:3000]
-    print(f"{ROUNDS} rounds, {len(chaos.told())} epochs reported as stored, 0 lost: {chaos.count}")
+    assert "Traceback" not in chaos.daemon.log()

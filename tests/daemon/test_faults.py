@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 import signal
 import subprocess
@@ -22,7 +21,7 @@ from thermocald.store.database.store import Store
 
 
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("kills", [4, pytest.param(80, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, pytest.param(80, marks=pytest.mark.slow)])
 def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed, kills):
     """40 more kills in test_chaos, and 300 of the store's writer in store/test_kills."""
     daemon.configure(**replayed(recording))
@@ -82,28 +81,6 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     assert "hung" in daemon.events()
 
 
-def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
-    """As with a card that fails, every write beyond a file size fails."""
-    daemon.run(**devices())
-    daemon.more(4)
-    before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (16384, before[1]))
-    daemon.until(lambda: "results wait in memory" in daemon.log())
-    daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
-    resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
-    daemon.until(lambda: "can be written again" in daemon.log())
-    # the output's file failed as well, and receives the waiting results when it is opened again
-    daemon.until(lambda: sum(not r["stored"] for r in daemon.results()) >= 5)
-    daemon.until(lambda: daemon.results()[-1]["stored"])
-    assert daemon.stop() == 0
-    results = daemon.results()
-    assert sum(not r["stored"] for r in results) >= 5
-    numbers, _ = daemon.stored()
-    assert numbers == [r["epoch"] for r in results] == list(range(1, len(numbers) + 1))
-    assert daemon.log().count("results wait in memory") == 1
-    assert daemon.log().count("can be written again") == 1
-
-
 def test_a_hang_up_while_it_starts_does_not_end_it(recording, tmp_path):
     """systemd does not restart a service that a SIGHUP ended; it came in the first second, too."""
     script = f"""
@@ -159,42 +136,6 @@ def test_on_a_read_only_file_system_it_says_so_and_leaves_the_rest_to_the_restar
     daemon.start()
     daemon.more(3)
     assert daemon.stop() == 0
-
-
-@pytest.mark.slow
-def test_a_full_disk_loses_frames_then_observations_but_no_result(daemon, devices, small_disk):
-    disk = small_disk(60)
-    daemon.store = disk / "thermocald.db"
-    frames = {"keep": "all", "folder": str(disk / "frames"), "min_free_gb": 0.04}
-    daemon.configure(**devices(period_s=1.0), frames=frames)  # a busy machine keeps up with this
-    daemon.start()
-    daemon.until(lambda: list(disk.rglob("*.png")))
-    daemon.until(lambda: any(r["status"] == "ok" for r in daemon.results()))
-    (disk / "filler").write_bytes(b"\0" * 25_000_000)
-    daemon.until(lambda: "no frames are kept" in daemon.log())
-    free = shutil.disk_usage(disk).free
-    (disk / "more").write_bytes(b"\0" * (free - 14_000_000))  # 16 MB are reserved for results
-    daemon.until(lambda: "observations no longer" in daemon.log())
-    free = shutil.disk_usage(disk).free
-    (disk / "rest").write_bytes(b"\0" * (free - 200_000))
-    daemon.more(4)
-    for name in ("rest", "more", "filler"):
-        (disk / name).unlink()
-    daemon.until(lambda: "observations are stored again" in daemon.log())
-    again = len(daemon.results())
-    daemon.until(lambda: any(r["stored"] and r["status"] == "ok" for r in daemon.results()[again:]))
-    assert daemon.stop() == 0
-    numbers, statuses = daemon.stored()
-    assert numbers == [r["epoch"] for r in daemon.results()]
-    # on a busy machine, a calibration may have been deferred
-    assert set(statuses) <= {"ok", "not_calibrated", "frame_not_kept"}
-    with Store.open(daemon.store) as store:
-        epochs = list(store.epochs(store.find_series()))
-    calibrated = [e for e in epochs if e.result.status == "ok"]
-    kept = [e.epoch.observations is not None for e in calibrated]
-    assert kept[0]
-    assert kept[-1]
-    assert not all(kept)
 
 
 def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon, measured):

@@ -58,7 +58,7 @@ def reading(row, server, folder):
 
 
 DRIVERS = sorted({row["driver"] for row in ROWS})
-PARTS = {"serial": 8, "hwmon": 3, "iio": 3}
+PARTS = {"serial": 12, "hwmon": 3, "iio": 3}
 
 
 @pytest.mark.parametrize(

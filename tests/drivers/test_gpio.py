@@ -9,9 +9,8 @@ import gpiozero
 import pytest
 from gpiozero.pins.mock import MockFactory
 
-from thermocald.acquisition.device_loop import OutputLoop
 from thermocald.errors import DeviceDenied, DeviceTimeout, PermanentDeviceError
-from thermocald.hal import SystemClock, VirtualClock, open_device
+from thermocald.hal import VirtualClock, open_device
 
 PROGRAMME = [
     {"seconds": 100, "hold_c": None},
@@ -100,27 +99,6 @@ def test_no_result_for_long_stops_the_lamp(pins, clock):
         assert not pins.pin(27).state
         lamp.emit({"temperature": 20.0})  # and heats again with the next result
         assert pins.pin(27).state
-
-
-def test_the_daemon_does_not_reopen_a_relay_at_its_limit(pins):
-    """Opening it again would reset the limit and start the programme from its beginning."""
-    programme = [{"seconds": 1000, "hold_c": 45.0}]
-    pin, events = pins.pin(27), []
-    loop = OutputLoop("lamp", relay(SystemClock(), programme=programme), SystemClock(),
-                      lambda utc, kind, text: events.append(kind))  # fmt: skip
-    loop.start()
-    for temperature, condition in ((20.0, lambda: pin.state), (60.0, lambda: events)):
-        loop.put({"temperature": temperature})
-        deadline = time.monotonic() + 5.0
-        while not condition() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert condition()
-    for _ in range(3):
-        loop.put({"temperature": 20.0})
-    assert loop.stop(5.0)
-    assert not pin.state
-    assert (events, loop.link.state) == (["device_failed"], "failed")
-    assert "reached the limit" in loop.link.why
 
 
 def test_opening_again_neither_restarts_the_programme_nor_resets_the_limit(pins, clock):

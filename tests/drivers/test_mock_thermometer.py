@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from thermocald.hal import VirtualClock, open_device
 
@@ -22,31 +21,18 @@ def read(options, times):
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def test_lag_against_the_differential_equation():
-    times, values, lag = np.array([0.0, 100.0, 250.0]), np.array([20.0, 50.0, 30.0]), 40.0
-    instants = np.linspace(0, 600, 61)
-    solved = solve_ivp(
-        lambda t, y: (np.interp(t, times, values) - y) / lag,
-        (0, 600),
-        [20.0],
-        t_eval=instants,
-        rtol=1e-10,
-        atol=1e-10,
-        max_step=5.0,
-    )
-    programme = np.stack([times, values], 1).tolist()
-    options = {"programme": programme, "channels": {"t": {**QUIET, "lag_s": lag}}}
-    assert read(options, instants)["t"] == pytest.approx(solved.y[0], abs=1e-6)
-
-
-def test_offset_gain_and_quantisation():
+def test_lag_offset_gain_and_quantisation():
     channels = {
         "plain": QUIET,
         "off": {**QUIET, "offset_k": 1.5},
         "board": {**QUIET, "gain": 2.0},
         "coarse": {"noise_k": 0.0, "resolution_k": 0.5},
+        "slow": {**QUIET, "lag_s": 40.0},
     }
-    found = read({"programme": [[0, 20], [100, 30]], "channels": channels}, np.arange(0, 100, 7.0))
+    times = np.arange(0, 100, 7.0)
+    found = read({"programme": [[0, 20], [100, 30]], "channels": channels}, times)
+    behind = 4.0 * (1 - np.exp(-times / 40.0))  # of a ramp of 0.1 K/s
+    assert found["slow"] == pytest.approx(found["plain"] - behind, abs=1e-6)
     assert found["off"] == pytest.approx(found["plain"] + 1.5)
     assert found["board"] == pytest.approx(20 + 2 * (found["plain"] - 20))
     assert np.array_equal(found["coarse"], np.round(found["plain"] * 2) / 2)

@@ -20,7 +20,6 @@ from thermocald.photogrammetry.field.testfield import (
     observations_from_lists,
 )
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.writer import RecordingWriter
 
 BEGIN = 1.6e9
@@ -127,14 +126,3 @@ def test_what_is_broken_comes_as_recorded_and_what_is_missing_is_a_bad_reading(w
         for message in ("000003.png: cannot be read: No such file", "epoch 4 has no frame"):
             with pytest.raises(BadReading, match=message):
                 camera.capture()
-
-
-def test_a_real_recording(shared):
-    path = shared / "data" / "aviary-cam1"
-    recording = read_recording(path)
-    with open_device("camera", "replay", {"recording": str(path)}, VirtualClock()) as camera:
-        for expected in recording.epochs:
-            frame = camera.capture()
-            found = observations_from_lists(frame.observations, recording.testfield)
-            assert frame.utc == expected.frame_time
-            assert np.array_equal(found.points, expected.observations.points)

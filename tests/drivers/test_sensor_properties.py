@@ -21,12 +21,12 @@ from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.errors import BadReading, ConfigurationError
 from thermocald.hal import SystemClock, VirtualClock, driver_names, open_device
 
-FEW = {"max_examples": 60, "deadline": None, "derandomize": True,
+FEW = {"max_examples": 40, "deadline": None, "derandomize": True,
        "suppress_health_check": [HealthCheck.function_scoped_fixture]}  # fmt: skip
 MANY = {**FEW, "max_examples": 3000}
 
 
-FEWER, MORE = {**FEW, "max_examples": 12}, {**FEW, "max_examples": 200}  # for each driver
+FEWER, MORE = {**FEW, "max_examples": 8}, {**FEW, "max_examples": 200}  # for each driver
 AMOUNTS = pytest.mark.parametrize(
     "amount", [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)]
 )

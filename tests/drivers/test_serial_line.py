@@ -126,18 +126,18 @@ def test_echo_and_garbage_before_the_answer_are_skipped(instrument, before):
         *((rubbish, errors.BadReading, "check 9600 Bd 8N1")
           for rubbish in (b"\xf8\x80\x00\xfe" * 20, b"\xf8\x80\r\n" * 20, b"T=\r\n")),
         (b"T=20.", errors.BadReading, r"'T=20\.'"),
-        (b"", errors.DeviceTimeout, r"silent for 0\.4 s"),
+        (b"", errors.DeviceTimeout, r"silent for 0\.2 s"),
     ],
 )  # fmt: skip
 def test_rubbish_half_a_line_and_silence_say_what_they_are(instrument, answer, error, said):
     far = instrument({b"T?\r\n": answer} if answer else {})
-    with asked(far) as device, pytest.raises(error, match=said):
+    with asked(far, timeout_s=0.2) as device, pytest.raises(error, match=said):
         device.read()
 
 
 def test_an_endless_line_does_not_grow(instrument):
     far = instrument({b"T?\r\n": b"U" * 3000})
-    with asked(far) as device:
+    with asked(far, timeout_s=0.2) as device:
         with pytest.raises(errors.BadReading):
             device.read()
         assert len(device._line) <= 1
@@ -156,7 +156,7 @@ def test_checksums(instrument, kind):
         expected["nmea"] ^= byte
     answers = [b"T=20.50*%02X\r\n" % expected[kind], b"T=20.51*%02X\r\n" % expected[kind]]
     far = instrument({b"T?\r\n": answers})
-    with asked(far, pattern=CHECKED, checksum=kind) as device:
+    with asked(far, pattern=CHECKED, checksum=kind, timeout_s=0.2) as device:
         assert device.read().values == {"temperature": 20.5}
         with pytest.raises(errors.BadReading, match="checksum"):
             device.read()

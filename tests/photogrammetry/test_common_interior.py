@@ -96,7 +96,7 @@ def test_the_camera_is_as_accurate_as_stated_if_the_focus_moves_between_photogra
     Without it, the projection centres would be off by 4 standard deviations.
     """
     z, off = [], []
-    for r, stations, ratio in errors(20, 9, focus=5e-4):
+    for r, stations, ratio in errors(10, 9, focus=5e-4):
         found, true = (np.array([e.centre for e in eops]) for eops in (r.exteriors, stations))
         variances = np.diagonal(r.exterior_covariances, axis1=1, axis2=2)[:, 3:]
         z.append(ratio)

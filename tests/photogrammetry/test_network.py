@@ -113,10 +113,10 @@ _BENT = cases.bent_sheet(8, 6)
 _SPOT = _BENT.mean(axis=0)
 
 
-def _adjust(photos):
+def _adjust(photos, **options):
     """Adjust photographs of the bent sheet, scaled by one distance."""
     scale = Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)
-    return adjust_network(cases.SENSOR, photos, [f"t{i}" for i in range(48)], [scale])
+    return adjust_network(cases.SENSOR, photos, [f"t{i}" for i in range(48)], [scale], **options)
 
 
 @pytest.mark.parametrize(
@@ -234,10 +234,9 @@ def test_bad_photographs_in_a_small_network_are_refused():
 def test_photographs_of_a_moving_field_are_refused():
     """Each photograph shows another random field; chance agreement is refused."""
     rng = np.random.default_rng(8)
-    stations = cases.convergent_stations(_BENT)
     photos = {}
-    for i, station in enumerate(stations):
+    for i, station in enumerate(cases.convergent_stations(_BENT, 4)):
         moved = _BENT + rng.normal(0, 30, _BENT.shape)
         photos[f"photo{i}"] = cases.photographs(moved, [station], 0.05, rng)[0]["photo0"]
     with pytest.raises(GeometryError):
-        _adjust(photos)
+        _adjust(photos, interior=cases.INTERIOR)

@@ -214,6 +214,14 @@ def test_noise_that_grows_towards_the_edge_is_estimated_with_its_sd(factor):
         assert value - 1.0 > 5.0 * sd
 
 
+@pytest.mark.parametrize(("epochs", "shown"), [(1, False), (2, True), (6, True)])
+def test_one_epoch_does_not_show_the_noise_beside_the_fields_errors(epochs, shown):
+    field, _, observations = series(np.random.default_rng(39), epochs=6, coordinate_error=2.0)
+    adjusted = scene.adjusted_series(field, observations[:epochs])
+    assert adjusted.noise_shown is shown
+    assert np.isfinite(adjusted.outer_noise).all() == (epochs == 6)
+
+
 def test_repeated_epochs_count_once():
     """Each three times, they would be 90 independent epochs."""
     field, _, observations = series(np.random.default_rng(38), epochs=30)

@@ -26,13 +26,6 @@ def test_the_limit_is_the_quantile_of_f(alpha):
     np.testing.assert_allclose(exceeded, alpha, rtol=1e-9)
 
 
-def test_targets_of_equal_noise_have_equal_estimates():
-    rng = np.random.default_rng(5)
-    ratio, freedom = noise_ratios(*drawn(rng, 10, 0.0)[:3], 1.0)
-    assert np.std(np.log(ratio)) < 0.1  # from single targets 0.45
-    assert freedom.min() > 100
-
-
 def failing(epochs, spread, lost):
     """Return the share of good points in further epochs that fail the test, and sd of ln noise.
 
@@ -61,7 +54,7 @@ def test_as_many_good_points_fail_as_stated(epochs, spread, lost):
     share, scatter = failing(epochs, spread, lost)
     assert share < 1.35 * ALPHA
     assert share > 0.5 * ALPHA or epochs < 100
-    assert spread > 0 or scatter < 0.15
+    assert spread > 0 or scatter < 0.1  # from single targets 0.45
 
 
 def test_a_target_seen_once_has_the_noise_of_the_others():

@@ -37,6 +37,7 @@ READ = textwrap.dedent(
     before = peak_mb()
     if sys.argv[2] == "stream":
         observation_file.LONG_FROM_BYTES = 0
+        observation_file._parse_once = lambda table: table
         epochs = module.open_recording(Path(sys.argv[1])).iter_epochs()
     else:
         epochs = module.read_recording(Path(sys.argv[1])).epochs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,6 +60,7 @@ def test_head_keeps_interior_and_unknown_keys(tmp_path, field, head, make_epoch)
 def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
     whole = read_recording(recording_path).epochs
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    monkeypatch.setattr(observation_file, "_parse_once", lambda table: table)
     monkeypatch.setattr(table, "_ROWS", 7)  # epochs span chunks
     streamed = list(open_recording(recording_path).iter_epochs())
     assert [e.number for e in streamed] == [e.number for e in whole]
@@ -225,25 +227,31 @@ def test_files_as_windows_writes_them(recording_path):
 
 @pytest.fixture
 def long_from_nothing(tmp_path, monkeypatch):
-    """Treat every recording as long; return the test's folder for the user's copies."""
+    """Treat every recording as long; return the test's folder for the user's cache."""
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "thermocald"
 
 
-def test_long_text_is_parsed_twice_only(recording_path, long_from_nothing, monkeypatch):
-    """The third reading does not read the text; every number equals the text's to the bit."""
-    with monkeypatch.context() as short:
-        short.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
-        from_text = list(open_recording(recording_path).iter_epochs())
-    recording = open_recording(recording_path)
-    list(recording.iter_epochs())
-    first = list(recording.iter_epochs())
-    (recording_path / "observations.csv").unlink()
-    for a, b, c in zip(from_text, first, recording.iter_epochs(), strict=True):
+def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch):
+    """The second reading does not read the text; every number equals the text's to the bit."""
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
+    from_text = list(open_recording(recording_path).iter_epochs())
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    first = list(open_recording(recording_path).iter_epochs())
+    assert len(list(long_from_nothing.glob("*.parquet"))) == 1
+    monkeypatch.setattr(observation_file, "_typed", None)
+    second = list(open_recording(recording_path).iter_epochs())
+    for a, b, c in zip(from_text, first, second, strict=True):
         assert same(a.observations, b.observations)
         assert same(a.observations, c.observations)
-    assert list(long_from_nothing.iterdir()) == []  # the copy has no name that could stay
+
+
+def test_text_that_was_changed_is_parsed_again(recording_path, long_from_nothing):
+    before = next(open_recording(recording_path).iter_epochs()).observations.points[0, 0]
+    set_field(recording_path / "observations.csv", 2, "x", str(before + 1))
+    after = next(open_recording(recording_path).iter_epochs()).observations.points[0, 0]
+    assert after == pytest.approx(before + 1, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -253,25 +261,24 @@ def test_long_text_is_parsed_twice_only(recording_path, long_from_nothing, monke
      ("epoch", "99", "is not in epochs.csv"), ("epoch", "1.5", "not an integer")],
 )  # fmt: skip
 def test_a_copy_says_where_the_text_is_wrong(
-    recording_path, long_from_nothing, column, value, words, monkeypatch
+    recording_path, long_from_nothing, column, value, words
 ):
     """An error found in the binary copy names the line of the text."""
     set_field(recording_path / "observations.csv", 40, column, value)
-    monkeypatch.setattr(table, "_ROWS", 7)
-    recording = open_recording(recording_path)
-    assert len(recording.observations(0)) == 12  # read from the text, up to it
     with pytest.raises(RecordingError, match=r"observations\.csv, line 40") as error:
-        list(recording.iter_epochs())
+        list(open_recording(recording_path).iter_epochs())
     assert words in str(error.value)
 
 
 def test_without_a_place_for_the_copy_the_text_is_read(
     recording_path, long_from_nothing, monkeypatch
 ):
+    expected = list(open_recording(recording_path).iter_epochs())
+    (copy,) = long_from_nothing.glob("*.parquet")
+    copy.unlink()
+    monkeypatch.setattr(observation_file, "_cache", lambda: Path("/proc/nowhere"))
     monkeypatch.setattr(observation_file.shutil, "disk_usage", raise_full)
-    recording = open_recording(recording_path)
-    expected = list(recording.iter_epochs())
-    for a, b in zip(expected, recording.iter_epochs(), strict=True):
+    for a, b in zip(expected, open_recording(recording_path).iter_epochs(), strict=True):
         assert same(a.observations, b.observations)
 
 

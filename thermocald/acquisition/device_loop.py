@@ -19,10 +19,8 @@ import logging
 import math
 import threading
 from collections import deque
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Literal
 
 from thermocald.addresses import without_secrets
@@ -89,7 +87,6 @@ class Schedule:
             "ticks": self._ticks,
             "skipped": self._skipped,
             "late_p99_s": late[math.ceil(0.99 * len(late)) - 1],
-            "late_max_s": late[-1],
         }
 
 
@@ -254,14 +251,13 @@ class DeviceLoop:
 
     link: Link
     action: Callable[[], object]
-    clock: Clock
-    period_s: float
     begin: float
     free_running: bool = False
     idle: Callable[[], bool] = lambda: False
 
     def __post_init__(self) -> None:
-        self.schedule = Schedule(self.clock, self.period_s, self.begin)
+        self.clock = self.link.clock
+        self.schedule = Schedule(self.clock, self.link.period_s, self.begin)
         self.lost = 0
         self._stop = threading.Event()
         self._busy_since: float | None = None
@@ -310,7 +306,8 @@ class OutputLoop:
         self.link = Link("output", name, output, clock, on_event=on_event)
         self.emitted = 0
         self.lost = 0
-        self._queue: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
+        self._queue: deque[Mapping[str, Any]] = deque()
+        self._changed = threading.Condition()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=self.link.called, daemon=True)
 
@@ -320,27 +317,37 @@ class OutputLoop:
 
     def put(self, result: Mapping[str, Any]) -> None:
         """Queue a result; returns at once."""
-        if self._queue.qsize() >= _QUEUE:
-            with suppress(Empty):
-                self._queue.get_nowait()
+        with self._changed:
+            if len(self._queue) >= _QUEUE:
+                self._queue.popleft()
                 self.lost += 1
-        self._queue.put(result)
+            self._queue.append(result)
+            self._changed.notify()
 
     def stop(self, grace_s: float) -> bool:
         """Emit the waiting results within the grace and close; False if that took too long."""
-        self._stopping.set()
-        self._queue.put(None)
+        with self._changed:
+            self._stopping.set()
+            self._changed.notify()
         self._thread.join(grace_s)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         self.link.do(lambda: None)
-        while (result := self._queue.get()) is not None:
-            while not self.link.do(partial(self.link.device.emit, result)):
-                # it is kept until the output is back
-                if self.link.ended or self._stopping.wait(_RETRY_S):
-                    self.lost += 1
-                    break
-            else:
-                self.emitted += 1
+        while (result := self._oldest()) is not None:
+            done = self.link.do(partial(self.link.device.emit, result))
+            if not (done or self.link.ended or self._stopping.wait(_RETRY_S)):
+                continue  # it waits until the output is back, unless newer ones displace it
+            with self._changed:
+                waited = bool(self._queue) and self._queue[0] is result
+                if waited:
+                    self._queue.popleft()
+                self.emitted += done
+                self.lost += waited - done  # a displaced one was counted as lost
         self.link.close()
+
+    def _oldest(self) -> Mapping[str, Any] | None:
+        """Wait for a result; return it without removing it, None when the loop is stopped."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._stopping.is_set())
+            return self._queue[0] if self._queue else None

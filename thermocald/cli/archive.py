@@ -151,7 +151,7 @@ def archive(
 def backup(
     store: str | None = typer.Argument(None, help="The store; a daemon may be using it."),
     to: str | None = typer.Argument(
-        None, metavar="[TO]", help="A file that does not exist yet, or a folder: FOLDER/ is made."
+        None, metavar="TO", help="A file that does not exist yet, or a folder: FOLDER/ is made."
     ),
     config: StoreConfigOption = None,
     keep: int = typer.Option(0, min=0, help="In a folder, keep only the newest N; 0 keeps all."),

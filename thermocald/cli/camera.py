@@ -22,9 +22,9 @@ from thermocald.cli.common import (
     TimezoneOption,
     progress,
     say,
+    say_warning,
     show,
     takes_log_options,
-    warned,
     warnings_said,
     write_json,
     write_parts,
@@ -72,7 +72,7 @@ def calibrate(
         written.append(f"written: {result.report(report)}")
     show(result, json, result, *written)
     if not (result.status == "ok" or result.poses):
-        raise DataError(f"no photograph has a result: {result.photographs.reason}")
+        raise DataError(f"no photograph has a result: {result.reason}")
 
 
 _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
@@ -125,9 +125,9 @@ def at(
     thermal = tc.load_camera(model)
     if renew is not None:
         thermal = thermal.for_images(*series_export.image_size(renew))
-    warned(thermal)
     with warnings_said():
         found = tc.predict(thermal, temperature, extrapolate=extrapolate)
+    say_warning(thermal)
     document, lines = found.as_dict(), found.lines()
     if out is not None:
         assert found.state is not None
@@ -189,7 +189,7 @@ def predict(
 
     Example: thermocald predict --model camera.thermal.yaml --temperature 35
     """
-    thermal = warned(tc.load_camera(model))
+    thermal = tc.load_camera(model)
     with warnings_said(), progress(None, "reading and measuring") as advance:
         found = tc.predict(
             thermal, temperature, channels=_channels(channel or []) or None, log=log,
@@ -197,6 +197,7 @@ def predict(
             programme=programme, camera=camera, distance_m=distance, wanted_mm=wanted,
             extrapolate=extrapolate, progress=advance,
         )  # fmt: skip
+    say_warning(thermal)
     show(found, json)
 
 
@@ -245,7 +246,7 @@ def correct(
 
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
-    thermal = warned(tc.load_camera(model))
+    thermal = tc.load_camera(model)
     with warnings_said():
         done = tc.correct(
             points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
@@ -254,6 +255,7 @@ def correct(
         )  # fmt: skip
         if done.of_images and out is None:
             raise UsageError("--out is missing: the folder for the corrected images")
+        say_warning(thermal)
         if out is not None:
             with progress(None, "correcting images") as advance:
                 done.write(out, advance)
@@ -303,13 +305,14 @@ def measure(
     Example: thermocald measure points.csv --model camera.thermal.yaml --log weather.csv
     --control gcp.csv --seen 2026-05-04T09:00:00Z --plane water.yaml --length-unit m
     """
-    thermal = warned(tc.load_camera(model))
+    thermal = tc.load_camera(model)
     with warnings_said():
         found = tc.measure(
             points, thermal, log=log, control=control, seen=seen, surface=plane, unit=length_unit,
             log_options=log_options, timezone=timezone, ambiguous=ambiguous,
             extrapolate=extrapolate, say=say,
         )  # fmt: skip
+    say_warning(thermal)
     show(found, json)
     if found.refused:
         raise DataError(f"{points}: {counted(len(found.refused), 'row')} left out")

@@ -39,7 +39,7 @@ StoreConfigOption = Annotated[
 ]
 StoreArgument = Annotated[Path | None, typer.Argument(help="The store; a daemon may be using it.")]
 PhotosArgument = Annotated[
-    list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of photographs.")
+    list[Path], typer.Argument(metavar="PHOTO", help="Photographs, or folders of photographs.")
 ]
 PixelPitchOption = Annotated[
     float | None,
@@ -249,11 +249,10 @@ def session_line(one: Mapping[str, Any]) -> str:
     return f"{one['camera']}/{one['series']}{start}: {taken}, {one['state']}{why}"
 
 
-def warned(camera: ThermalCamera) -> ThermalCamera:
-    """Print a thermal camera's warning, if it has one, and return the camera."""
+def say_warning(camera: ThermalCamera) -> None:
+    """Print a thermal camera's warning, after errors of options, which would hide in it."""
     if camera.warning:
         say(f"warning: {camera.warning}")
-    return camera
 
 
 def write_parts(parts: Iterable[str], destination: str | Path) -> None:

@@ -141,7 +141,7 @@ def forward(
 
 def fleet(
     servers: list[str] = typer.Argument(
-        ..., metavar="ADDRESS…", help="postgresql://USER@HOST/DATABASE?station=…"
+        ..., metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?station=…"
     ),
     report: Path | None = typer.Option(None, help="Write a page to an HTML file."),
     json: JsonOption = None,
@@ -190,7 +190,7 @@ def analyse(analysis: str, sets: int, task: tuple[Path, Path]) -> Outcome:
 
 def reprocess(
     archives: list[str] = typer.Argument(
-        ..., metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"
+        ..., metavar="ARCHIVE", help="Folders that hold recordings, or postgresql://…"
     ),
     out: Path = typer.Option(..., "--out", "-o", help="Folder for the results."),
     do: str = typer.Option("calibrate", help="calibrate epochs, or discover or study series."),

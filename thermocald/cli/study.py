@@ -66,9 +66,9 @@ def replay(
     """
     from thermocald.store.recording.sense import doubt_lines
 
-    if model is not None and log is None:
-        raise UsageError("--model and --log go together")
-    if model is not None and log is not None:
+    if model is not None:
+        if log is None:
+            raise UsageError("--model and --log go together")
         from thermocald.store.logger.photographs import find_photographs
 
         camera, pictures = tc.load_camera(model), find_photographs([recording])
@@ -161,9 +161,9 @@ def export(
 def study(
     inputs: list[str] | None = typer.Argument(
         None,
-        metavar="[LABEL=]RECORDING_OR_STORE…",
-        help="Recordings (folders) and stores (files). Series with the same label belong to one "
-        "camera; default label: the camera's name.",
+        metavar="RECORDING_OR_STORE",
+        help="Recordings (folders) and stores (files), also as LABEL=RECORDING_OR_STORE: series "
+        "with the same label belong to one camera; default label: the camera's name.",
     ),
     json: JsonOption = None,
     report: Path | None = typer.Option(None, help="Write the report to an HTML file."),
@@ -226,6 +226,8 @@ def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str
         # A path may contain "=": a text that exists as a path is one.
         if not equals or Path(text).exists() or is_server(text):
             label, rest = "", text
+        elif not label:
+            raise UsageError(f"{text}: the label before = is empty")
         found = tc.open_all(rest)
         labels += [label or None] * len(found)
         series += found
@@ -289,7 +291,7 @@ def discover(
 def fit(
     inputs: list[str] = typer.Argument(
         ...,
-        metavar="RECORDING_OR_STORE…",
+        metavar="RECORDING_OR_STORE",
         help="Recordings and stores; or JSON files of `calibrate`, each with its temperature, °C: "
         "21.5=cold.json.",
     ),

@@ -105,11 +105,10 @@ def print_(
     Example: thermocald testfield print --aprilgrid 6x6 --paper A2 --out board
     """
     from thermocald.output.testfield import print as sheets
-    from thermocald.output.testfield.layout import PAPERS, paper_size
+    from thermocald.output.testfield.layout import paper_size
 
     if board is not None:  # by default the page has the orientation of the board
-        wide = board.columns > board.rows and paper.strip().upper() in PAPERS
-        page = paper_size(paper, landscape=wide if landscape is None else landscape)
+        page = paper_size(paper, landscape, usual=board.columns > board.rows)
         printed = sheets.print_board(board.filled(page), page, out, replace_printed=force)
     else:
         design = replace(
@@ -127,7 +126,7 @@ def print_(
 def import_(
     source: Path | None = typer.Argument(
         None,
-        metavar="[FILE]",
+        metavar="FILE",
         help="Kalibr's target.yaml, OpenCV's board parameters, a calib.io file, or a target list.",
     ),
     out: Path = typer.Option(
@@ -226,7 +225,7 @@ def survey(
 
 def check(
     field: Path | None = typer.Argument(
-        None, metavar="[FIELD]", help="A testfield.csv; default: the field that `print` would draw."
+        None, metavar="FIELD", help="A testfield.csv; default: the field that `print` would draw."
     ),
     paper: Paper = "A3",
     flat: Flat = False,
@@ -280,9 +279,7 @@ def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | No
     from thermocald.output.testfield.layout import Design, paper_size
     from thermocald.output.testfield.print import default_diameter
 
-    page = paper_size(paper, landscape=not flat if landscape is None else landscape)
-    if landscape is None and "x" in paper.lower().replace("×", "x"):
-        page = paper_size(paper)  # a size in mm includes the orientation
+    page = paper_size(paper, landscape, usual=not flat)
     return Design(
         page, diameter if diameter is not None else default_diameter(page), sheets=1 if flat else 3
     )

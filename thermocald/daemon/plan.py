@@ -42,16 +42,15 @@ _UNKNOWN_PITCH_MM = 0.001
 class CameraPlan:
     """A camera of the configuration, ready to be started.
 
-    series: its current series, empty for none; sensor, testfield, calibrator: None if its epochs
-    are acquired without calibration; a gauge's test field holds its control points, if any; extra:
-    further entries for the head of a series; corrector: None if no corrected frames are stored.
+    series: its current series, empty for none; sensor, calibrator: None if its epochs are acquired
+    without calibration; extra: further entries for the head of a series; corrector: None if no
+    corrected frames are stored.
     """
 
     config: CameraConfig
     calibration: CalibrationConfig
     camera: Camera
     sensor: Sensor | None
-    testfield: TestField | None
     calibrator: Calibrator | GaugeCalibrator | None
     series: str
     extra: Mapping[str, Any] = field(default_factory=dict)
@@ -60,6 +59,11 @@ class CameraPlan:
     @property
     def name(self) -> str:
         return self.config.name
+
+    @property
+    def testfield(self) -> TestField | None:
+        """The targets, or the control points of a gauge; None without calibration."""
+        return None if self.calibrator is None else self.calibrator.testfield
 
     def calibrator_of_check(self) -> Calibrator:
         """Return the calibrator that checks a frame; ConfigurationError without a test field."""
@@ -96,12 +100,12 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
         calibrator = Calibrator(
             sensor,
             targets,
-            adjustment_settings(calibration),
+            _adjustment_settings(calibration),
             nominal_c=one.principal_distance_mm,
             interior=_held(one, calibration),
             sigma_floor_px=calibration.sigma_floor_px,
         )
-    return CameraPlan(one, calibration, camera, sensor, targets, calibrator, one.series or "")
+    return CameraPlan(one, calibration, camera, sensor, calibrator, one.series or "")
 
 
 def _plan_gauge(
@@ -125,7 +129,7 @@ def _plan_gauge(
     if len(gauge.testfield):
         extra["control_origin_mm"] = origin
     return CameraPlan(
-        one, calibration, camera, gauge.sensor, gauge.testfield, gauge, one.series or "", extra,
+        one, calibration, camera, gauge.sensor, gauge, one.series or "", extra,
         FrameCorrector(thermal, one.name, origin) if corrected else None,
     )  # fmt: skip
 
@@ -146,8 +150,7 @@ def _sensor(one: CameraConfig) -> Sensor | None:
     return Sensor(one.sensor.width_px, one.sensor.height_px, one.sensor.pixel_pitch_mm)
 
 
-def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
-    """Return the settings of an epoch's adjustment."""
+def _adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
     return AdjustmentSettings(
         free=tuple(calibration.free),
         priors={name: (prior.value, prior.sd) for name, prior in calibration.priors.items()},
@@ -158,16 +161,15 @@ def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
 
 def running_series(plan: CameraPlan) -> RunningSeries | None:
     """Return the running adjustment of the camera's series; None if no parameter is shared."""
-    if not isinstance(plan.calibrator, Calibrator):
+    calibrator = plan.calibrator
+    if not isinstance(calibrator, Calibrator):
         return None
-    assert plan.sensor is not None
-    assert plan.testfield is not None
     from thermocald.analysis.online.running_series import RunningSeries
 
     running = RunningSeries(
-        plan.sensor,
-        plan.testfield,
-        adjustment_settings(plan.calibration),
+        calibrator.sensor,
+        calibrator.testfield,
+        calibrator.settings,
         exterior=plan.calibration.exterior,
         offsets=plan.calibration.target_offsets,
     )

@@ -115,7 +115,7 @@ class SeriesRun:
     def __post_init__(self) -> None:
         plan, names = self.plan, self.plan.config.thermometers
         self.last: dict[str, Any] = {}
-        self.stored = self.kept_frames = 0
+        self.stored = 0
         self._guard = self.runtime.guard
         self._series = self._guard.find(plan.name, plan.series)
         self._backlog: list[Epoch] = []
@@ -159,23 +159,23 @@ class SeriesRun:
 
     def _make_observer(self) -> Any:
         """Return the camera's online estimate; None if the camera is not calibrated."""
-        plan = self.plan
-        if plan.sensor is None or plan.testfield is None or plan.calibrator is None:
+        calibrator = self.plan.calibrator
+        if calibrator is None:
             return None
-        if isinstance(plan.calibrator, Calibrator):
+        if isinstance(calibrator, Calibrator):
             from thermocald.analysis.online.observer import OnlineObserver
 
-            return OnlineObserver(plan.sensor, plan.testfield, self._report)
-        from thermocald.analysis.thermal.gauge import GaugeObserver
-
+            return OnlineObserver(calibrator.sensor, calibrator.testfield, self._report)
         # the readings of many, since effects have a memory; the details of the most recent
         detailed = max(0, self.first - 1 - _DETAILED)
         earlier = self.read(detailed - _LATEST, detailed, details=False)
-        plan.calibrator.remember([*earlier, *self.read(detailed + 1)])
-        return GaugeObserver(plan.calibrator, self._report)
+        calibrator.remember([*earlier, *self.read(detailed + 1)])
+        calibrator.tell = self._report
+        return calibrator
 
     def _report(self, kind: str, text: str, utc: float, epoch: int) -> None:
-        log.warning("camera %s: %s", self.plan.name, text, extra={"event": kind})
+        text = f"camera {self.plan.name}: {text}"
+        log.warning(text, extra={"event": kind})
         self.record(utc, kind, text, epoch)
 
     def record(self, utc: float, kind: str, text: str, epoch: int | None = None) -> None:
@@ -270,7 +270,6 @@ class SeriesRun:
         path = None
         if self.frames.wanted(epoch.number, eventful) or deferred:
             path = self.frames.keep(plan.name, plan.series, epoch.number, acquired.frame)
-            self.kept_frames += path is not None
         if calibrated is not None:
             result = EpochResult.from_adjustment(calibrated.adjustment)
             extra |= calibrated.extra
@@ -329,10 +328,11 @@ class SeriesRun:
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
         """Store a deferred calibration; delete a frame that was stored only for it."""
-        assert self._series is not None
         epoch = calibrated.epoch
         result = EpochResult.from_adjustment(calibrated.adjustment)
         try:
+            if self._series is None:
+                raise StoreError(f"series {self.plan.series} has not begun")
             self._guard.amend(self._series, calibrated, result)
         except StoreError as error:
             # that the store is away was logged once
@@ -344,7 +344,6 @@ class SeriesRun:
         frame = next((s.epoch.frame for s in self.read(epoch.number, epoch.number)), None)
         if frame is not None and not self.frames.wanted(epoch.number, failed):
             self.frames.delete(frame)
-            self.kept_frames -= 1
         else:
             self._correct(frame, calibrated)
 

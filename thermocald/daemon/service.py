@@ -13,13 +13,11 @@ from __future__ import annotations
 import gc
 import logging
 import os
-import queue
 import signal
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -164,7 +162,8 @@ class Service:
         self._reload = False
         self._stalled: list[str] = []
         self._dashboard = DashboardProcess(config.store.path, self.live.folder)
-        self._inbox: queue.SimpleQueue[tuple[Request, Future[dict[str, Any]]]] = queue.SimpleQueue()
+        self._turn = threading.Lock()  # free only while the service waits: for requests
+        self._turn.acquire()
 
     def run(self) -> bool:
         """Work until stopped; return True, or False if a device hangs.
@@ -223,13 +222,10 @@ class Service:
         turn_s = _TURN_S if interval is None else min(_TURN_S, interval)
         fed = written = float("-inf")
         while not self._end:
-            if self._wake.wait(turn_s):
-                self._wake.clear()
             now = time.monotonic()
             if self._reload:
                 self._reload = False
                 self._reload_configuration()
-            self._answer_requests()
             self._sessions.turn()
             if (step := self.clock.check()) is not None:
                 seconds, adopted, text = step
@@ -254,6 +250,10 @@ class Service:
                 break
             if self._until_finished and self._station.finished:
                 break
+            self._turn.release()
+            if self._wake.wait(turn_s):
+                self._wake.clear()
+            self._turn.acquire()
 
     def status(self) -> dict[str, Any]:
         """Return the document that `thermocald status` prints."""
@@ -273,26 +273,19 @@ class Service:
         return {**document, "warnings": status_warnings(document)}
 
     def _ask(self, request: Request) -> dict[str, Any]:
-        """Pass a request from the control socket's thread to the service's; return the answer."""
-        future: Future[dict[str, Any]] = Future()
-        self._inbox.put((request, future))
-        self._wake.set()
+        """Answer a request in the control socket's thread, between two turns of the service."""
+        if not self._turn.acquire(timeout=_ANSWER_S):
+            raise DataError("the daemon is busy; look at its status and try again")
         try:
-            return future.result(_ANSWER_S)
-        except TimeoutError:
-            raise DataError("the daemon is busy; look at its status and try again") from None
-
-    def _answer_requests(self) -> None:
-        while not self._inbox.empty():
-            request, future = self._inbox.get()
-            try:
-                future.set_result(self._answer(request))
-            except ThermocaldError as error:
-                future.set_exception(error)
-            except Exception as error:
-                # no request may stop the daemon
-                log.exception("a request could not be answered")
-                future.set_exception(DataError(f"the daemon could not answer: {error}"))
+            return self._answer(request)
+        except ThermocaldError:
+            raise
+        except Exception as error:
+            # no request may stop the daemon
+            log.exception("a request could not be answered")
+            raise DataError(f"the daemon could not answer: {error}") from error
+        finally:
+            self._turn.release()
 
     def _answer(self, request: Request) -> dict[str, Any]:
         if request.session is not None:

@@ -78,7 +78,7 @@ class _Progress:
 
 
 class Sessions:
-    """The sessions of a daemon, at most one per camera; used only by the service's thread."""
+    """The sessions of a daemon, at most one per camera; used by one thread at a time."""
 
     def __init__(self, guard: StoreGuard, clock: Clock, station: Station) -> None:
         self.station = station

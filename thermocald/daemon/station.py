@@ -44,7 +44,7 @@ _FROZEN = 2  # repeats from which a camera counts as frozen
 
 @dataclass(eq=False)
 class CameraLine:
-    """A camera and the series it takes; only the service's thread changes the series."""
+    """A camera and the series it takes; one thread at a time changes the series."""
 
     plan: CameraPlan
     runtime: Runtime
@@ -68,9 +68,8 @@ class CameraLine:
             runtime.free_running,
         )  # fmt: skip
         self.loop = DeviceLoop(
-            self.link, self._capture, runtime.clock, plan.config.period_s, self.begin,
-            runtime.free_running, lambda: not self.taking,
-        )  # fmt: skip
+            self.link, self._capture, self.begin, runtime.free_running, lambda: not self.taking
+        )
         self.take(plan.config.series, runtime.start_condition)
 
     def identity(self) -> dict[str, Any]:
@@ -197,7 +196,6 @@ class CameraLine:
             "deferred": 0 if pipeline is None else pipeline.dropped,
             "caught_up": 0 if pipeline is None else pipeline.caught_up,
             "stored": 0 if run is None else run.stored,
-            "frames_kept": 0 if run is None else run.kept_frames,
             "last": {} if run is None else run.last,
         }
 
@@ -214,7 +212,6 @@ class Station:
         self.config, self.runtime = config, runtime
         clock = runtime.clock
         self.frames = FrameFolder(config.frames)
-        self.logged = 0  # readings stored apart from epochs
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
@@ -228,13 +225,10 @@ class Station:
             for plan in plan_cameras(config, clock)
         ]  # fmt: skip
         self._readers = {
-            one.name: DeviceLoop(
-                self.thermometers.links[one.name], partial(self._read, one.name), clock,
-                one.period_s, begin,
-            )
-            for one in config.thermometers
-            if one.name not in self.thermometers.with_frames
-        }  # fmt: skip
+            name: DeviceLoop(link, partial(self._read, name), begin)
+            for name, link in self.thermometers.links.items()
+            if name not in self.thermometers.with_frames
+        }
         self._loops = [*self._readers.values(), *(camera.loop for camera in self.cameras)]
         self._retention = threading.Thread(target=self._retain, name="retention", daemon=True)
 
@@ -344,7 +338,6 @@ class Station:
                 }
                 for output in self.outputs
             },
-            "readings_logged": self.logged,
             "frames": {
                 "keep": self.config.frames.keep,
                 "paused": self.frames.paused,
@@ -370,7 +363,6 @@ class Station:
         if not in_epochs:
             trusted = self.runtime.clock.trusted()
             self.runtime.guard.reading(LoggedReading(name, reading.utc, reading.values, trusted))
-            self.logged += 1
 
     def retain(self) -> list[str]:
         """Delete expired frames; return sentences on what was deleted."""

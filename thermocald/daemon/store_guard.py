@@ -45,8 +45,8 @@ log = logging.getLogger(__name__)
 class FollowedStore:
     """An open store that is followed when its file goes away; used under one lock.
 
-    events: receives the events of the file; notice: what last happened to the file, or "". Raises
-    StoreError.
+    events: receives the events of the file; notice: what last happened to the file, or ""; series:
+    those that were looked up in the open store. Raises StoreError.
     """
 
     def __init__(self, path: Path, events: deque[Event], *, durable: bool = True) -> None:
@@ -75,6 +75,7 @@ class FollowedStore:
             self._file.discard_empty()
             self._file.release()
             raise
+        self.series: dict[tuple[str, str], StoredSeries] = {}
         self._file.remember_helpers()
         if self._file.names > 1:
             text = f"the file has {self._file.names} names (hard links); write it only under this"
@@ -257,8 +258,6 @@ class StoreGuard:
         self._retry_at = -math.inf
         self._locked = False  # whether it is away because another program locks it
         self._lock = threading.RLock()
-        self._series: dict[tuple[str, str], StoredSeries] = {}
-        self._series_store: Store | None = None  # the store of `_series`
         self._file = FollowedStore(path, self._events, durable=durable)
 
     @property
@@ -288,12 +287,9 @@ class StoreGuard:
         """Return the series of this camera and name in the open store; create it if missing."""
         key = (wanted.camera, wanted.name)
         with self._lock:
-            if self._series_store is not self.store:
-                self._series_store = self.store
-                self._series.clear()
-            if key not in self._series:
-                stored = self.store.series_of(*key)
-                self._series[key] = stored or self.store.create_series(
+            known = self._file.series
+            if key not in known:
+                known[key] = self.store.series_of(*key) or self.store.create_series(
                     wanted.head,
                     wanted.testfield,
                     start=wanted.start,
@@ -301,7 +297,7 @@ class StoreGuard:
                     settings=wanted.settings,
                     created_utc=wanted.created_utc,
                 )
-            return self._series[key]
+            return known[key]
 
     def epochs(
         self, series: StoredSeries, first: int, last: int | None = None, *, details: bool = True
@@ -517,7 +513,6 @@ class StoreGuard:
     def status(self) -> dict[str, Any]:
         """Return the store's part of the status document."""
         return {
-            "path": str(self.path),
             "state": "out" if self.away else "results_only" if self.thin else "ok",
             "why": self.away,
             "waiting": self.waiting,

@@ -16,7 +16,7 @@ from thermocald.discovery import criteria
 from thermocald.discovery.search import Search, Solution, by_score
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
-from thermocald.physics.effect import Proportional
+from thermocald.physics.formula import Proportional
 from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.movement import (
     Mount,
@@ -209,7 +209,7 @@ def is_convincing(base: Solution, best: Solution) -> bool:
 
 def make_own_rates(series: int, count: int) -> Term:
     """Make the term of rates that one of `count` series has for itself."""
-    along_T = catalogue.find(lambda k: isinstance(k, Proportional) and k.power == 1).name
+    along_T = catalogue.find(lambda k: getattr(k, "formula", "") == Proportional.formula).name
     fresh = tuple(() if k == series else None for k in range(count))
     return Term(along_T, BASE, fresh=fresh, through_drive=True)
 

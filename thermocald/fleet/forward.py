@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from thermocald.store.server.connection import ServerAddress
 
 _COUNTED = (*KEPT, "frame")
+_OF = {"server", "station", "identity", "inode"}
 _NO_FRAMES = ForwardConfig()
 
 
@@ -79,8 +80,7 @@ class Cursor(BaseModel):
         except (OSError, ValueError):
             return fresh
         old.sent = {**fresh.sent, **old.sent}
-        names = ("server", "station", "identity", "inode")
-        same = all(getattr(old, name) == getattr(fresh, name) for name in names)
+        same = old.model_dump(include=_OF) == fresh.model_dump(include=_OF)
         return old if same and {*old.sent} == {*_COUNTED} else fresh
 
     @property

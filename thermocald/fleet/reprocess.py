@@ -135,6 +135,7 @@ def _cluster(do: Callable[[Any], Outcome], tasks: Sequence[Any], address: str) -
                 return
 
 
+_OF_RESULT = ("sigma0", "redundancy", "n_observations")
 BLOCK = 360
 """Epochs per block: an hour at 10 s, of whose work the search at its start is a hundredth."""
 
@@ -225,15 +226,13 @@ def calibrate_block(block: Block) -> Outcome:
     columns: dict[str, Any] = {
         "camera": [camera.name] * len(epochs),
         "series": [recording.series] * len(epochs),
-        "epoch": np.array([d.epoch.number for d in epochs], dtype=np.int64),
+        "epoch": np.array([d.epoch.number for d in epochs]),
         "frame_time": np.array([d.epoch.frame_time for d in epochs]),
         **{n if n != "camera" else "temperature camera": t for n, t in temperatures.items()},
         **{name: values[:, i] for i, name in enumerate(PARAMETER_NAMES)},
         **{f"sd_{name}": sds[:, i] for i, name in enumerate(PARAMETER_NAMES)},
-        "sigma0": np.array([r.sigma0 for r in results]),
-        "redundancy": np.array([r.redundancy for r in results], dtype=np.int64),
-        "n_observations": np.array([r.n_observations for r in results], dtype=np.int64),
-        "n_rejected": np.array([len(r.rejected) for r in results], dtype=np.int64),
+        **{n: np.array([getattr(r, n) for r in results]) for n in _OF_RESULT},
+        "n_rejected": np.array([len(r.rejected) for r in results]),
         "status": [r.status for r in results],
         "reason": [r.reason for r in results],
     }

@@ -180,7 +180,7 @@ class Correction(Result):
         if not len(block.times):
             return ""
         try:
-            found = correct_points(
+            points, sds, temperatures, beyond = correct_points(
                 self.thermal, self.log, block.times, block.values, self.to, self.temperature_sd,
                 self.extrapolate,
             )  # fmt: skip
@@ -199,15 +199,15 @@ class Correction(Result):
         writer = csv.writer(text, lineterminator="\n")
         if not self.points:
             writer.writerow([*block.header, *_ADDED])
-        moved = found.points - block.values
+        moved = points - block.values
         for i, row in enumerate(block.rows):
-            row = {**row, "x": f"{found.points[i, 0]:.5f}", "y": f"{found.points[i, 1]:.5f}"}
-            tail = [*moved[i], *found.sds[i], found.temperature[i], found.extrapolated[i]]
+            row = {**row, "x": f"{points[i, 0]:.5f}", "y": f"{points[i, 1]:.5f}"}
+            tail = [*moved[i], *sds[i], temperatures[i], beyond[i]]
             writer.writerow([*(row[n] for n in block.header), *(f"{v:.6g}" for v in tail)])
         self.points += len(block.rows)
         self._moved += float(np.sum(moved**2))
-        self._left_over += float(np.sum(found.sds**2))
-        self.extrapolated_rows += int((found.extrapolated > 0).sum())
+        self._left_over += float(np.sum(sds**2))
+        self.extrapolated_rows += int((beyond > 0).sum())
         return text.getvalue()
 
     def _refuse(self, line: int, reason: str) -> None:

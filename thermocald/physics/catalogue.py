@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import ConfigurationError
 from thermocald.physics.effect import Effect
-from thermocald.physics.formula import OfFormula, is_formula
+from thermocald.physics.formula import GivenFormula, is_formula
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -56,7 +56,7 @@ def get(name: str) -> Effect:
     Raises ConfigurationError if there is none, or if the entry point is not an effect.
     """
     if is_formula(name):
-        return OfFormula(name)
+        return GivenFormula(name)
     if name not in names():
         near = get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"known are: {', '.join(names())}"

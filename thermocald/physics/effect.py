@@ -26,7 +26,6 @@ import numpy as np
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
-from thermocald.physics.operators import OPERATORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -401,37 +400,6 @@ class Effect:
         return f"record longer, with another temperature programme ({self.noun}, {other.noun})"
 
 
-class Operated(Effect):
-    """An effect that passes the reference temperature through an operator.
-
-    operator: its key in `operators.OPERATORS`; its constants are the effect's parameters.
-    """
-
-    operator: str
-
-    def _arguments(self, history: History, values: Values) -> tuple[Any, ...]:
-        """Return the operator's arguments: values, or a polygon and times; and its constants."""
-        constants = [values.get(name, c.default) for name, c in self.nonlinear.items()]
-        if not OPERATORS[self.operator].remembers:
-            return history.temperature(), *constants
-        p = history.polygon()
-        return p.times, p.values, *constants, history.times
-
-    def drive(self, history: History, **nonlinear: Any) -> Array:
-        return OPERATORS[self.operator].value(*self._arguments(history, nonlinear))
-
-    def signal(self, history: History, **nonlinear: Any) -> Array:
-        return self.drive(history, **nonlinear)[:, None]
-
-    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        kind = OPERATORS[self.operator]
-        found = kind.derivatives(*self._arguments(history, nonlinear))
-        if not kind.remembers:
-            return history.temperature_matrix().multiply(found[0][:, None]).tocsr()
-        matrix: csr_array = found @ history.polygon().matrix
-        return matrix
-
-
 class OfTime(Effect):
     """An effect that depends on time alone: the thermometer's error does not reach it."""
 
@@ -443,28 +411,3 @@ class OfTime(Effect):
         from scipy.sparse import csr_array
 
         return csr_array((len(history.times), len(history.reading_times)))
-
-
-class Proportional(Effect):
-    """An effect whose signal is a power of T - T₀, without delay; T is that of its `channel`."""
-
-    power: int = 1
-    usual: tuple[str, ...] = IOP_NAMES[:3]
-    of_now = True
-    steady_signal = Steady((0.0, 1.0, 0.0))
-    behaviour: Mapping[str, str] = {
-        "hold": "does not move while the temperature is constant",
-        "cycle": "runs along the same line up and down",
-    }
-
-    def signal(self, history: History, **nonlinear: Any) -> Array:
-        T = history.temperature(self.channel(history, **nonlinear))
-        return ((T - history.T0) ** self.power)[:, None]
-
-    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        channel = self.channel(history, **nonlinear)
-        matrix = history.temperature_matrix(channel)
-        if self.power == 1:
-            return matrix
-        slope = self.power * (history.temperature(channel) - history.T0) ** (self.power - 1)
-        return matrix.multiply(slope[:, None]).tocsr()

@@ -19,16 +19,19 @@ from __future__ import annotations
 import ast
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.numbers import parameter_label, with_sd
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.effect import (
     PARAMETER_UNITS,
     Effect,
     Parameter,
+    Steady,
     coefficient_units,
     say_estimate,
 )
@@ -105,10 +108,11 @@ class Node:
                 if isinstance(value, str):
                     yield value, constant, node
 
-    def bound(self, values: Mapping[str, float]) -> Node:
-        """Replace all names by numbers; KeyError if one is missing."""
+    def bound(self, values: Values) -> Node:
+        """Replace names by numbers, and channels by others; KeyError if a number is missing."""
         if self.is_leaf:
-            return self
+            name = values.get(self.name) if not self.operator else None
+            return replace(self, name=name) if isinstance(name, str) else self
         return replace(
             self,
             inputs=tuple(n.bound(values) for n in self.inputs),
@@ -338,6 +342,8 @@ class Evaluator:
             if node.operator or node.name != channel:
                 return csr_array((len(at), len(self.history.reading_times)))
             p = self.history.polygon(channel)
+            if at is p.times:
+                return p.matrix
             return interpolation_matrix(p.times, at) @ p.matrix
         total = csr_array((len(at), len(self.history.reading_times)))
         carried = [
@@ -362,15 +368,69 @@ class Evaluator:
 
 
 class OfFormula(Effect):
-    """A signal a × formula, a tree of known operators over recorded quantities.
+    """A drive or a signal that is a formula.
 
-    Raises ConfigurationError if the formula's text cannot be read.
+    formula: its text, in which T is the temperature of the effect's `channel`, T0 the model's
+    reference temperature, and other names are the effect's parameters.
+    """
+
+    formula: str
+
+    @cached_property
+    def node(self) -> Node:
+        """The parsed formula."""
+        return parse(self.formula)
+
+    def bound(self, history: History, **nonlinear: Any) -> Node:
+        """Return the formula with all values."""
+        usual = {name: p.default for name, p in self.nonlinear.items()}
+        T = self.channel(history, **nonlinear)
+        return self.node.bound({**usual, "T": T, "T0": history.T0, **nonlinear})
+
+    def drive(self, history: History, **nonlinear: Any) -> Array:
+        return Evaluator(history).values(self.bound(history, **nonlinear))
+
+    def signal(self, history: History, **nonlinear: Any) -> Array:
+        return self.drive(history, **nonlinear)[:, None]
+
+    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
+        channel = self.channel(history, **nonlinear)
+        return Evaluator(history).sensitivity(self.bound(history, **nonlinear), channel)
+
+    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:
+        evaluator, node = Evaluator(history), self.bound(history, **nonlinear)
+        first = self.channel(history, **nonlinear)
+        found = {n: evaluator.sensitivity(node, n) for n in node.channels() if n != first}
+        return {name: matrix for name, matrix in found.items() if matrix.nnz}
+
+    def unresolved(self, history: History, rate_jump: Array, **nonlinear: Any) -> Array:
+        evaluator, node = Evaluator(history), self.bound(history, **nonlinear)
+        return np.abs(evaluator.shifted(node, rate_jump) - evaluator.values(node))
+
+
+class Proportional(OfFormula):
+    """An effect whose signal is T - T₀, without delay; T is that of its `channel`."""
+
+    formula = "offset(T, T0)"
+    usual: tuple[str, ...] = IOP_NAMES[:3]
+    of_now = True
+    steady_signal = Steady((0.0, 1.0, 0.0))
+    behaviour: Mapping[str, str] = {
+        "hold": "does not move while the temperature is constant",
+        "cycle": "runs along the same line up and down",
+    }
+
+
+class GivenFormula(OfFormula):
+    """A signal a × formula that has no name but its text.
+
+    Raises ConfigurationError if the text cannot be read.
     """
 
     usual = ("c", "x0", "y0")
 
     def __init__(self, text: str) -> None:
-        self.name, self.node = text, parse(text)
+        self.name = self.formula = text
         self.noun = f"an influence that follows {self.node.words({})}"
         self.nonlinear = {}
         for name, constant, owner in self.node.free():
@@ -382,26 +442,12 @@ class OfFormula(Effect):
         per = unit_text(self.node.unit())
         self.linear = coefficient_units(per if per.isalnum() else f"({per})")
 
+    def bound(self, history: History, **nonlinear: Any) -> Node:  # noqa: ARG002
+        return self.node.bound(nonlinear)  # a channel may be named T
+
     def channel(self, history: History, **_: Any) -> str:
         channels = self.node.channels()
         return history.reference if history.reference in channels or not channels else channels[0]
-
-    def signal(self, history: History, **nonlinear: Any) -> Array:
-        return Evaluator(history).values(self.node.bound(nonlinear))[:, None]
-
-    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        channel = self.channel(history)
-        return Evaluator(history).sensitivity(self.node.bound(nonlinear), channel)
-
-    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:
-        evaluator, node = Evaluator(history), self.node.bound(nonlinear)
-        first = self.channel(history)
-        found = {n: evaluator.sensitivity(node, n) for n in self.node.channels() if n != first}
-        return {name: matrix for name, matrix in found.items() if matrix.nnz}
-
-    def unresolved(self, history: History, rate_jump: Array, **given: Any) -> Array:
-        evaluator, node = Evaluator(history), self.node.bound(given)
-        return np.abs(evaluator.shifted(node, rate_jump) - evaluator.values(node))
 
     def sentence(self, estimates: Estimates) -> str:
         constants = {
@@ -454,7 +500,7 @@ def known_together(
     low, mean, high = temperatures
     T = np.linspace(low, high, _ON_THE_CURVE)
     parabola = np.linalg.pinv(np.vander(T - mean, 3, increasing=True))[1:] * [[1.0], [2.0]]
-    effect = OfFormula(text)
+    effect = GivenFormula(text)
 
     def course(x: Array) -> Array | None:  # slope and curvature (2, P)
         f = effect.node.bound(dict(zip(names, x.tolist(), strict=True))).steady(T)

@@ -5,9 +5,10 @@ pixels, blurred by a Gaussian, averaged over pixels, darkened towards the corner
 rounded to 8 bit. If the blur worked on the pixel grid itself, edges along rows or columns would be
 up to 0.02 px off, depending on their place in a pixel, which no lens does.
 
-A frame is the same on every machine, bit for bit: positions, coverage and blur consist of IEEE
-operations alone (`shapes`); the noise comes from PCG64's raw bits through integer tables; the rest
-is fixed-point with 6 fractional bits, always odd, so that no value is half-way when rounded.
+A frame is the same on every machine, but for single pixels by 1 DN in one of some hundred frames:
+positions are rounded, since mathematical libraries differ in their last bits; the noise comes from
+PCG64's raw bits through integer tables; the rest is fixed-point with 6 fractional bits, always odd,
+so that no value is half-way when rounded.
 
 Source: blur, vignetting and noise as in Luhmann, T. et al. (2014): Close-Range Photogrammetry and
 3D Imaging, 2nd ed., chapter 3; vignetting is the first term of the cos⁴ law.
@@ -29,7 +30,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from thermocald.physics.shapes import Shape, gaussian_kernel, outlines, project, surface_normals
+from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.physics.shapes import Shape, outlines, surface_normals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,6 +120,14 @@ def average(cells: NDArray[np.float32], kernel: Array, axis: int) -> NDArray[np.
         inner *= k[n + d]
         out[reach:end] += inner
     return np.moveaxis(out, 0, axis)
+
+
+def _gaussian(sigma: float) -> Array:
+    """Return a normalised Gaussian (2n+1,) on the pixel grid, n = ⌈4 σ⌉; [1] if σ is 0."""
+    x = np.arange(-np.ceil(4.0 * sigma), np.ceil(4.0 * sigma) + 1.0)
+    kernel: Array = np.exp(-0.5 * (x / max(sigma, 1e-9)) ** 2)
+    kernel /= kernel.sum()
+    return kernel
 
 
 _FRACTION = 64  # fixed-point steps per DN
@@ -227,10 +237,10 @@ class Scene:
         if not shapes:
             return
         vertices = [shape.vertices(points) for shape in shapes]
-        projected = project(self.sensor, iop, eop, np.concatenate(vertices))
+        projected = np.round(project(self.sensor, iop, eop, np.concatenate(vertices)), 9)
         images = np.split(projected, np.cumsum([len(v) for v in vertices])[:-1])
         zero, edge = np.zeros(1), np.array([self.sensor.width, self.sensor.height])
-        kernel = gaussian_kernel(_FINER * self.look.blur_px * blur_factor)
+        kernel = _gaussian(_FINER * self.look.blur_px * blur_factor)
         kernel = (np.concatenate([kernel, zero]) + np.concatenate([zero, kernel])) / _FINER
         margin = len(kernel) // (2 * _FINER) + 1
         depth = np.float32((self.look.paper_dn - self.look.ink_dn) * _FRACTION / 2)

@@ -1,12 +1,6 @@
-"""The outlines of discs, coded rings and markers in object space; arithmetic equal on all machines.
+"""The outlines of discs, coded rings and markers in object space.
 
-Outlines are polygons in the target's plane that move with the target. The plane of a circle is not
-in the test field's file: it is the plane through the target that contains most other targets.
-
-Mathematical libraries, fused multiply-add and vectorised sums differ in their last bits between
-machines, and a pixel value on the verge of rounding would flip. IEEE 754 defines only addition,
-multiplication, division and square root exactly, and NumPy's element-wise operations on arrays
-round each of them separately. Rendered frames depend on these operations alone.
+Outlines are polygons in the target's plane that move with the target.
 """
 
 from __future__ import annotations
@@ -17,14 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import Sensor, distort, image_to_px
+from thermocald.photogrammetry.field.testfield import plane_fit, target_normals
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
@@ -32,81 +26,8 @@ if TYPE_CHECKING:
     Integers = NDArray[np.int64]
     _Polygon = tuple[float, Array, Array]  # sign, weights (k, 4), offset (k, 3)
 
-# π/2 in two parts: multiples of the first are exact for the angles that occur
-_HALF_PI_HIGH = 1.5707963267341256
-_HALF_PI_LOW = 6.077100506506192e-11
-
-
-def sin_cos(angles: ArrayLike) -> tuple[Array, Array]:
-    """Return sine and cosine (...,) of angles in rad, to 1e-15, by their series on ±π/4."""
-    a = np.asarray(angles, dtype=float)
-    quarter = np.rint(a / 1.5707963267948966)
-    x = (a - quarter * _HALF_PI_HIGH) - quarter * _HALF_PI_LOW
-    x2 = x * x
-    s, c = np.zeros_like(x), np.zeros_like(x)
-    for n in range(9, 0, -1):
-        s = (1.0 + s) * (x2 / (-(2.0 * n) * (2.0 * n + 1.0)))
-        c = (1.0 + c) * (x2 / (-(2.0 * n) * (2.0 * n - 1.0)))
-    s, c = x * (1.0 + s), 1.0 + c
-    turn = quarter.astype(np.int64) % 4
-    swapped = turn % 2 == 1
-    sine, cosine = np.where(swapped, c, s), np.where(swapped, s, c)
-    return np.where(turn >= 2, -sine, sine), np.where((turn == 1) | (turn == 2), -cosine, cosine)
-
-
-def rotation(angles: ArrayLike) -> Array:
-    """Return R (3, 3) of omega, phi, kappa (CONVENTIONS §1), camera to object."""
-    sine, cosine = sin_cos(angles)
-    so, sp, sk = (float(v) for v in sine)
-    co, cp, ck = (float(v) for v in cosine)
-    return np.array(
-        [
-            [cp * ck, -cp * sk, sp],
-            [co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp],
-            [so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp],
-        ]
-    )
-
-
-def project(sensor: Sensor, iop: Array, eop: Array, points: Array) -> Array:
-    """Project object points (n, 3) mm to image points (n, 2) px as `camera_model.project` does.
-
-    Without matrix products. NaN for points not in front of the camera.
-    """
-    r = rotation(eop[:3])
-    dx, dy, dz = (points[:, k] - eop[3 + k] for k in range(3))
-    xc, yc, zc = (dx * r[0, k] + dy * r[1, k] + dz * r[2, k] for k in range(3))
-    scale = iop[0] / np.where(zc < 0, -zc, np.nan)
-    return image_to_px(sensor, np.stack(distort(iop, scale * xc, scale * yc), axis=1))
-
-
-def gaussian_kernel(sigma: float) -> Array:
-    """Return a normalised Gaussian (2n+1,) on the pixel grid, n = ⌈4 σ⌉; [1] if σ is 0."""
-    if sigma <= 0:
-        return np.ones(1)
-    n = int(np.ceil(4.0 * sigma))
-    # exp(-k²/2σ²) from exp(-1/2σ²), which is summed as a series after halving 10 times
-    x = -0.5 / (sigma * sigma) / 1024.0
-    e = 1.0
-    for k in range(14, 0, -1):
-        e = 1.0 + e * x / k
-    for _ in range(10):
-        e = e * e
-    half = [1.0]
-    power, odd = 1.0, e
-    for _ in range(n):
-        power = power * odd
-        odd = odd * e * e
-        half.append(power)
-    total = half[0]
-    for value in half[1:]:
-        total = total + 2.0 * value
-    return np.array([*half[:0:-1], *half]) / total
-
-
 _CIRCLE_EDGES = 96
 _EDGES_PER_MODULE = 3  # as the distortion bends a straight edge
-_NEIGHBOURS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,45 +68,21 @@ class Shape:
 
 
 def surface_normals(field: TestField) -> Array:
-    """Find the unit normals (n, 3) of the targets' planes; their sign is arbitrary.
+    """Return the unit normals (n, 3) of the targets' planes; their sign is arbitrary.
 
-    Candidates are the planes through a target and two of its neighbours. The one that contains most
-    targets is chosen; of several, the one whose targets are nearest.
+    A target on no board has the normal of the plane through all targets.
     """
-    p = field.points
-    n = len(p)
-    if n < 3:
-        return np.tile([0.0, 0.0, 1.0], (n, 1))
-    spread = float(np.linalg.norm(np.ptp(p, axis=0)))
-    tolerance = 0.002 * spread + 3.0 * float(np.nanmax(field.sigmas, initial=0.0))
-    normals = np.zeros((n, 3))
-    for i in range(n):
-        distance = np.linalg.norm(p - p[i], axis=1)
-        near = np.argsort(distance, kind="stable")[1 : _NEIGHBOURS + 1]
-        first, second = np.triu_indices(len(near), 1)
-        u, v = p[near[first]] - p[i], p[near[second]] - p[i]
-        cross = np.cross(u, v)
-        size = np.linalg.norm(cross, axis=1)
-        good = size > 0.2 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
-        if not good.any():
-            normals[i] = (0.0, 0.0, 1.0)
-            continue
-        candidates = cross[good] / size[good, None]
-        inside = np.abs((p - p[i]) @ candidates.T) < tolerance
-        score = inside.sum(axis=0) - 1e-3 * (inside * (distance / spread)[:, None]).mean(axis=0)
-        best = candidates[int(np.argmax(score))]
-        members = p[inside[:, int(np.argmax(score))]]
-        # fitted to all targets of the plane: grid planes are exact to the coordinates' last digits
-        _, _, axes = np.linalg.svd(members - members.mean(axis=0))
-        refined = axes[2] * np.sign(axes[2] @ best)
-        # rounded, as the last bits of the decomposition differ between machines
-        normals[i] = np.round(refined, 9)
-    return normals
+    normals = target_normals(field.points)
+    if len(field) < 3:
+        normals[:] = (0.0, 0.0, 1.0)
+    normals[np.isnan(normals[:, 0])] = plane_fit(field.points)[1][2]
+    # rounded, as the last bits of the decomposition differ between machines
+    return np.round(normals, 9)
 
 
 def _lay_arc(turns: Array) -> Array:
-    sine, cosine = sin_cos(2.0 * np.pi * turns)
-    return np.stack([cosine, sine], axis=1)
+    angles = 2.0 * np.pi * turns
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _disc_polygons(diameter: float, code: str) -> list[Array]:

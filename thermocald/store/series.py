@@ -152,7 +152,10 @@ class SeriesReader(ABC):
     """Whether times are corrected, see `series_times`."""
     _times: dict[int, SeriesTimes | None] | None = None
     # ends the message of a selection that fits no series or several
-    _remedy = "; select one with --series CAMERA/SERIES, or archive all with thermocald archive"
+    _remedy = (
+        "; export selects one with --series CAMERA/SERIES; for another command write it as a "
+        "recording with thermocald archive --series"
+    )
 
     @abstractmethod
     def all_series(self) -> list[StoredSeries]:

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.numbers import with_sd
+from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES
+from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.result import with_sds
 
 if TYPE_CHECKING:
@@ -60,20 +62,11 @@ class Equilibrium:
         if self.state == "unknown":
             return "not known yet whether it drifts"
         if self.state == "ready":
-            return f"ready: {_two_digits(self.drift, self.sd_drift)} px/min"
-        text = f"drifting {_two_digits(self.drift, self.sd_drift)} px/min"
+            return f"ready: {with_sd(self.drift, self.sd_drift, 'px/min')}"
+        text = f"drifting {with_sd(self.drift, self.sd_drift, 'px/min')}"
         if np.isfinite(self.ready_in):
-            minutes = _two_digits(self.ready_in / 60, self.sd_ready_in / 60)
-            text += f", ready in about {minutes} min"
+            text += f", ready in about {with_sd(self.ready_in / 60, self.sd_ready_in / 60, 'min')}"
         return text
-
-
-def _two_digits(value: float, sd: float) -> str:
-    """Format a value to the second digit of its standard deviation, as `1.1085 ± 0.0015`."""
-    if not (np.isfinite(sd) and sd > 0):
-        return f"{value:.3g}"
-    decimals = int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))
-    return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
 
 
 def fit_approach(
@@ -180,25 +173,22 @@ class EquilibriumWatch:
         # over the longest past that one exponential describes as well as the last minutes: heating
         # may have begun just now
         fits: list[tuple[float, ...]] = []
-        sizes: list[int] = []
         for windows in (1.0, 2.0, 4.0):
             past = times >= times[-1] - windows * _WINDOW_S
             past[-_FEWEST:] = True
-            sizes.append(int(past.sum()))
-            fits.append(fit_approach(times[past], values[past], sds[past], _STEADY / 60.0))
-            worse = 1.0 + _WORSE * np.sqrt(1.0 / sizes[0] + 1.0 / sizes[-1])
-            if fits[-1][-1] > worse * fits[0][-1]:
-                fits.pop()
+            fit = *fit_approach(times[past], values[past], sds[past], _STEADY / 60.0), past.sum()
+            if fits and fit[-2] > fits[0][-2] * (
+                1.0 + _WORSE * np.sqrt(1.0 / fits[0][-1] + 1.0 / fit[-1])
+            ):
                 break
-        speed, sd_speed, *ready_in, misfit = fits[-1]
+            fits.append(fit)
+        speed, sd_speed, *ready_in, misfit, _ = fits[-1]
         speed, sd_speed = 60.0 * speed, 60.0 * sd_speed
         if speed + _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("ready", speed, sd_speed)
-        if speed - _SETTLED_SD * sd_speed < _STEADY:
-            return Equilibrium("unknown", speed, sd_speed)
-        if misfit < _WORST_MISFIT:
-            return Equilibrium("drifting", speed, sd_speed, *ready_in)
-        return Equilibrium("drifting", speed, sd_speed)
+        drifting = speed - _SETTLED_SD * sd_speed >= _STEADY
+        known = ready_in if drifting and misfit < _WORST_MISFIT else ()
+        return Equilibrium("drifting" if drifting else "unknown", speed, sd_speed, *known)
 
 
 _IOP = slice(0, 3)
@@ -220,16 +210,12 @@ def condition_on_exterior(
     pitch. Returns values (3,), gain (3, 6) and sds (3,) as `EquilibriumWatch.add` takes them.
     Errors of the test field are the same in both orientations and cancel.
     """
-    block = covariance[10:, 10:]
-    cross = covariance[_IOP, 10:]
-    if not np.diag(block).all():
-        gain = np.zeros((3, 6))
-    else:
-        s = np.sqrt(np.diag(block))
-        gain = np.linalg.solve(block / np.outer(s, s), (cross / s).T).T / s
+    block, cross = covariance[EOP, EOP], covariance[_IOP, EOP]
+    held = not np.diag(block).all()
+    gain = np.zeros((3, 6)) if held else cross @ scaled_inverse(block)
     variance = np.diag(covariance[_IOP, _IOP] - gain @ cross.T)
     sds = np.sqrt(np.where(variance > 0, variance, np.nan))
-    return (values[_IOP] - gain @ values[10:]) / unit, gain / unit, sds / unit
+    return (values[_IOP] - gain @ values[EOP]) / unit, gain / unit, sds / unit
 
 
 class OnlineObserver:
@@ -278,20 +264,16 @@ class OnlineObserver:
         if innovation.change != "outlier":
             given = condition_on_exterior(adjustment.values, errors[0], self._pitch)
             self.watch.add(epoch.frame_time, *given)
-        self._equilibrium = self.watch.assess(self.filter.values()[10:])
+        self._equilibrium = self.watch.assess(self.filter.values()[EOP])
         columns = {
             "innovation_chi2": innovation.chi2,
             "innovation_bound": innovation.bound,
             "drift_px_per_min": self._equilibrium.drift,
             "sd_drift_px_per_min": self._equilibrium.sd_drift,
         }
-        sd = np.sqrt(np.diag(self.filter.covariance()))
-        for k, name in enumerate(PARAMETER_NAMES[_IOP]):
-            columns[f"online_{name}"] = float(self.filter.values()[k])
-            columns[f"sd_online_{name}"] = float(sd[k])
-        if event:
-            columns["event"] = 1.0
-        return columns
+        values, sd = self.filter.values()[_IOP], np.sqrt(np.diag(self.filter.covariance()))[_IOP]
+        columns |= with_sds([f"online_{name}" for name in PARAMETER_NAMES[_IOP]], values, sd)
+        return columns | ({"event": 1.0} if event else {})
 
     def report(self) -> dict[str, Any]:
         """Return state, drift, time to steady and the estimates with sds, for status and page."""

@@ -114,17 +114,6 @@ def table_of_series(
     if not np.isfinite(own).any():  # epochs of a long series are not calibrated one by one
         own = np.tile(start, (len(own), 1))
     far = misplaced_targets(head.camera.sensor, testfield, gathered(source, few), own)
-    wrong = np.flatnonzero(far)
-
-    def left_out() -> Epochs:
-        """Return the epochs without the misplaced targets, which count as rejected."""
-        fewer = WithoutTargets(source, wrong)
-        table = table_of_series(head, testfield, apart, fewer, settings, start, jobs, advance)
-        counts = [grid.observed[:, wrong].sum(axis=1) for _, grid in source.blocks()]
-        return replace(table, n_rejected=table.n_rejected + np.concatenate(counts))
-
-    if len(wrong):
-        return left_out()
     apart = replace(apart, head=head)
     in_blocks = len(source) > together_at_most(len(testfield))
     settings = replace(
@@ -132,23 +121,28 @@ def table_of_series(
         drift_period=drift_period(apart.frame_time, apart.temperature),
         gaps=() if in_blocks else drift_gaps(apart.frame_time),
     )
-    if not in_blocks:
-        source = grid = gathered(source, [slice(0, len(source))])
-    found = _adjust(testfield, apart, start, source, settings, in_blocks, jobs, advance)
-    assert found.adjustment is not None
     c_px = start[0] / head.camera.sensor.pixel_pitch
-    wrong = np.flatnonzero(find_misplaced(found.adjustment.offsets, c_px))
-    if len(wrong):  # the initial values had been biased towards them
-        return left_out()
-    if in_blocks:
-        return found
-    moved, still = correct_field(
-        head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
-        apart.frame_time,
-    )  # fmt: skip
-    if not moved:
-        return found
-    return replace(_adjust(testfield, apart, start, still, settings), field_movements=moved)
+    while True:  # a single pass, unless misplaced targets biased the initial values
+        used = WithoutTargets(source, np.flatnonzero(far)) if far.any() else source
+        grid = used if in_blocks else gathered(used, [slice(0, len(source))])
+        found = _adjust(testfield, apart, start, grid, settings, in_blocks, jobs, advance)
+        assert found.adjustment is not None
+        drawn = find_misplaced(found.adjustment.offsets, c_px)
+        if not drawn.any():
+            break
+        far = far | drawn
+    if not in_blocks:
+        moved, still = correct_field(
+            head.camera.sensor, testfield, gathered(grid, [slice(0, len(source))]),
+            found.adjustment, start, apart.number, apart.frame_time,
+        )  # fmt: skip
+        if moved:
+            found = _adjust(testfield, apart, start, still, settings)
+            found = replace(found, field_movements=moved)
+    if far.any():  # the misplaced targets count as rejected
+        counts = [part.observed[:, far].sum(axis=1) for _, part in source.blocks()]
+        found = replace(found, n_rejected=found.n_rejected + np.concatenate(counts))
+    return found
 
 
 def _adjust(

@@ -26,22 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.analysis.series.epochs import Epochs
-    from thermocald.arrays import Array
 
 _FEWEST = 10
 _LEAST_WARMING_K = 0.5  # a smaller change may be the thermometer's noise
-_MOST_VALUES = 100_000  # for a line: of more, neighbours are averaged
 _SUSPECTS = 5  # groups that are left out in turn
 _SHRUNK = 0.5  # fraction of a change that must vanish without the group that a drift rests on
-
-
-def _thin(*columns: Array) -> list[Array]:
-    """Average neighbours if there are more values than a line needs; drop an incomplete mean."""
-    n = len(columns[0])
-    size = -(-n // _MOST_VALUES)
-    if size == 1:
-        return list(columns)
-    return [c[: n // size * size].reshape(-1, size).mean(axis=1) for c in columns]
 
 
 def _p_value(change: float, sd: float) -> float:
@@ -66,16 +55,15 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         values, sds = table.values[ok, column], table.sd[ok, column]
         if len(values) < _FEWEST or not np.isfinite(sds).all() or np.ptp(time) == 0:
             continue
-        # the sds of means are smaller by one factor, which does not change p
-        t, y, sd = _thin(time, values, sds)
-        x = t - t.mean()
-        slope = float(x @ y / (x @ x))
-        noise = slope_noise(y, x, slope, times=t)
-        test = drift_test(y, sd, np.ones(len(y)), times=t)
+        x = time - time.mean()
+        slope = float(x @ values / (x @ x))
+        noise = slope_noise(values, x, slope, times=time)
+        test = drift_test(values, sds, np.ones(len(values)), times=time)
         p = 1.0 if test is None else test.p_value
         span, tilt_sd = float(np.ptp(time)), float(table.trend_sd[column])
         if tilt_sd > 0:
-            p = max(p, _p_value(float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t))), tilt_sd))
+            cubic = np.polynomial.Polynomial.fit(time, values, 3)(time)
+            p = max(p, _p_value(float(np.ptp(cubic)), tilt_sd))
         line = Course(
             name, float(values.mean()), float(values.std(ddof=1)),
             float(np.sqrt(np.mean(sds**2))), slope * span,
@@ -100,11 +88,11 @@ def courses(table: Epochs) -> list[Course]:
         course, variances = table.slow_errors
         per_kelvin = course[:, have] @ warming / (warming @ warming)
         slow = np.sqrt(per_kelvin**2 @ variances)
+        reading_sd = estimate_reading_noise(time, temperature, None)
         for name, line in lines.items():
             column = IOP_NAMES.index(name)
             values, sds = table.values[have, column], table.sd[have, column]
-            t, y, sd, times = _thin(temperature, values, sds, time)
-            on = dependence(y, sd, t, estimate_reading_noise(times, t, None), times)
+            on = dependence(values, sds, temperature, reading_sd, time)
             p = max(on.p_value, _p_value(on.slope, slow[column]))
             sd_slope = float(np.hypot(on.sd_slope, slow[column]))
             lines[name] = replace(

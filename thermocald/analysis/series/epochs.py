@@ -276,6 +276,11 @@ class Epochs(Result):
                     f"; the targets moved against one another before epoch {moved}: it cannot be "
                     "decided which of them, and the standard deviations allow for all"
                 )
+            elif self.adjustment is not None and not self.adjustment.noise_shown:
+                cause = (
+                    "; so few observations show the errors of the test field rather than theirs, "
+                    "so that the stated standard deviations are kept, untested"
+                )
             elif sigma0 > 1.0 + MATERIAL:
                 cause = f"; {CAUSES_OF_SIGMA0}"
                 if self.adjustment is not None and np.isfinite(self.adjustment.offsets).any():
@@ -526,16 +531,15 @@ def calibrate_epochs(
 
     temperature (E,): °C at the frames' times; jobs: processes.
     """
-    rows, found, observations = [], [], []
+    rows = []
     for done in calibrated_epochs(calibrator, epochs, jobs):
-        rows.append((done.epoch.number, done.epoch.frame_time))
-        found.append(done.adjustment)
-        observations.append(done.epoch.observations)
+        rows.append(done)
         if advance is not None:
             advance(1)
-    nothing = np.full(16, np.nan)
+    nothing, found = np.full(16, np.nan), [done.adjustment for done in rows]
     table = Epochs(
-        np.array([n for n, _ in rows], dtype=np.int64), np.array([t for _, t in rows]),
+        np.array([done.epoch.number for done in rows], dtype=np.int64),
+        np.array([done.epoch.frame_time for done in rows]),
         temperature,
         np.array([a.values if a.ok else nothing for a in found]).reshape(-1, 16),
         np.array([a.sd if a.ok else nothing for a in found]).reshape(-1, 16),
@@ -544,4 +548,4 @@ def calibrate_epochs(
         np.array([len(a.rejected) for a in found], dtype=np.int64),
         tuple(a.status for a in found), tuple(a.reason for a in found), "per_epoch",
     )  # fmt: skip
-    return table, observations
+    return table, [done.epoch.observations for done in rows]

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations
+    from thermocald.photogrammetry.series.normals import ObservationBlocks
     from thermocald.store.recording.reader import Recording
     from thermocald.store.series import StoredSeries
 
@@ -46,38 +47,46 @@ if TYPE_CHECKING:
 _STARTS = 25  # epochs of a long series that are calibrated one by one for initial values
 
 
-def recorded_table(
-    recording: Recording,
+def series_epochs(
+    source: Recording | StoredRecording,
     settings: AdjustmentSettings,
     exterior: str,
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
 ) -> Epochs:
-    """Adjust a recording as one series.
+    """Adjust a recording, or the series of an open store, as one series.
 
-    Frames without observations are measured. If a series with observations is too long to be
-    adjusted at once, only some epochs are calibrated one by one. advance: receives the number of
-    epochs done; jobs: processes, without effect on any bit. Raises DataError without a result.
+    Frames without observations are measured. If a recording with observations is too long to be
+    adjusted at once, only some epochs are calibrated one by one. exterior: `stored` returns the
+    epochs of a store as they are; advance: receives the number of a recording's epochs done; jobs:
+    processes, without effect on any bit. Raises DataError without a result.
     """
-    recording.head.require_calibrated(str(recording.path))
-    adjusted = SeriesSettings.of(settings, exterior)
-    calibrator = Calibrator.of_recording(recording, settings)
-    head, targets = recording.head, recording.testfield
-    if recording.has_observations and len(recording) > together_at_most(len(targets)):
-        start = _start(recording, recording.observations, calibrator)
-        columns, E = recording.columns, len(recording)
+    if exterior != "stored":
+        source.head.require_calibrated(source.title)
+    calibrator, field = Calibrator.of_recording(source, settings), source.testfield
+    blocks: ObservationBlocks = source
+    observations: Callable[[int], Observations | None] = source.observations
+    further = None
+    if isinstance(source, StoredRecording):
+        apart = _stored_epochs(source, exterior)
+        if exterior == "stored" or not {"ok", "weak_geometry"} & set(apart.status):
+            return apart
+    elif source.has_observations and len(source) > together_at_most(len(field)):
+        E, further = len(source), advance
         nothing, none = np.broadcast_to(np.nan, (E, 16)), np.broadcast_to(np.int64(0), (E,))
         apart = Epochs(  # these epochs are not calibrated one by one
-            columns.numbers, columns.frame_time, _temperature(recording), nothing, nothing,
-            nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
+            source.columns.numbers, source.columns.frame_time, _temperature(source), nothing,
+            nothing, nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
         )  # fmt: skip
-        return table_of_series(head, targets, apart, recording, adjusted, start, jobs, advance)
-    apart, observations = calibrate_epochs(
-        recording.iter_epochs(), calibrator, _temperature(recording), advance, jobs
-    )
-    begin = None if apart.ok.any() else _start(recording, observations.__getitem__, calibrator)
-    grid = ObservationGrid.from_observations(targets, observations)
-    return table_of_series(head, targets, apart, grid, adjusted, begin, jobs=jobs)
+    else:
+        apart, seen = calibrate_epochs(
+            source.iter_epochs(), calibrator, _temperature(source), advance, jobs
+        )
+        blocks, observations = ObservationGrid.from_observations(field, seen), seen.__getitem__
+    known = np.isfinite(apart.values[:, 0]).any()
+    start = None if known else _start(source, observations, calibrator)
+    together = SeriesSettings.of(settings, exterior)
+    return table_of_series(source.head, field, apart, blocks, together, start, jobs, further)
 
 
 def _start(
@@ -169,7 +178,7 @@ def replay_into(
             advance(1)
         # inside `with`: to leave targets out of a long series, the store is read again
         source = StoredRecording(store, series)
-        return with_drifts(table_of_stored(source, settings, exterior, jobs))
+        return with_drifts(series_epochs(source, settings, exterior, jobs=jobs))
 
 
 def _open_series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
@@ -193,18 +202,14 @@ def _open_series(store: Store, recording: Recording, settings: AdjustmentSetting
     return series
 
 
-def table_of_stored(
-    source: StoredRecording, settings: AdjustmentSettings, exterior: str, jobs: int = 1
-) -> Epochs:
-    """Return the epochs of a series in an open store. Raises DataError if it has none."""
+def _stored_epochs(source: StoredRecording, exterior: str) -> Epochs:
+    """Return a series' epochs as they are stored. Raises DataError if it has none."""
     store, series, size = source.store, source.series, len(source)
     if size == 0:
         raise DataError(f"{store.path}: series {series.name!r} has no epochs")
     names = ["sigma0", "n_observations", "n_rejected", "status"]
     columns = {n: c[:size] for n, c in store.series_columns(series, names).items()}
     ok = columns["status"] == "ok"
-    if exterior != "stored":
-        series.head.require_calibrated(str(store.path))
     known = ok | series.head.predicted
     reasons = [""] * size
     if not ok.all():
@@ -212,7 +217,7 @@ def table_of_stored(
         for stored in store.epochs(series, details=False):
             if stored.epoch.number in rows:
                 reasons[rows[stored.epoch.number]] = stored.result.reason
-    apart = Epochs(
+    return Epochs(
         source.columns.numbers,
         source.columns.frame_time,
         _temperature(source),
@@ -229,17 +234,6 @@ def table_of_stored(
         "per_epoch",
         head=series.head,
     )
-    weak = columns["status"] == "weak_geometry"
-    if exterior == "stored" or not (ok.any() or weak.any()):
-        return apart
-    start = None
-    if not ok.any():
-        calibrator = Calibrator.of_recording(source, settings)
-        start = _start(source, source.observations, calibrator)
-    return table_of_series(
-        series.head, series.testfield, apart, source, SeriesSettings.of(settings, exterior), start,
-        jobs,
-    )  # fmt: skip
 
 
 def _parameters(source: StoredRecording, prefix: str, ok: NDArray[np.bool_]) -> Array:

@@ -113,8 +113,7 @@ class Frequencies:
     def of(cls, n: int, times: Array | None = None) -> Frequencies:
         """Return the frequencies of n values at times (n,), evenly spaced by default."""
         pieces, pauses = _pieces(n, times)
-        lengths = [p.stop - p.start for p in pieces]
-        each = [np.arange(1, size) / size for size in lengths]
+        each = [np.arange(1, p.stop - p.start) / (p.stop - p.start) for p in pieces]
         K = len(pieces)
         own = np.concatenate([np.zeros(K - 1), *each])
         order = slice(None) if K == 1 else np.argsort(own, kind="stable")
@@ -128,14 +127,19 @@ class Frequencies:
         mean = np.pi * np.add.reduceat(own[order], starts) / count
         found = cls(pieces, np.zeros((0, K)), pauses, order, starts, count, mean)
         # orthonormal, orthogonal to a constant, and independent for noise with a long memory
-        root = np.sqrt(np.array(lengths) / sum(lengths))
+        root = np.sqrt(found.lengths / found.lengths.sum())
         flat = np.linalg.svd(root[None])[2][1:]
         slow = found.means_covariance(_TYPICAL_PHI)
         return replace(found, contrasts=np.linalg.eigh(flat @ slow @ flat.T)[1].T @ flat)
 
+    @property
+    def lengths(self) -> Array:
+        """The numbers of values (K,) of the stretches."""
+        return np.array([p.stop - p.start for p in self.pieces], dtype=float)
+
     def means_covariance(self, phi: float) -> Array:
         """Return the covariance (K, K) of the stretches' means times √length, for unit variance."""
-        size = np.array([p.stop - p.start for p in self.pieces], dtype=float)
+        size = self.lengths
         geometric = (1.0 - phi**size) / (1.0 - phi)
         own = (size * (1 + phi) - 2 * phi * geometric) / (1.0 - phi) / size
         scaled = geometric / np.sqrt(size)
@@ -145,9 +149,8 @@ class Frequencies:
 
     def coefficients(self, y: Array) -> Array:
         """Return the orthonormal coefficients of a series about its mean, without the constant."""
-        sizes = np.array([p.stop - p.start for p in self.pieces])
         means = np.array([y[p].mean() for p in self.pieces])
-        slow = self.contrasts @ (means * np.sqrt(sizes))
+        slow = self.contrasts @ (means * np.sqrt(self.lengths))
         every = np.concatenate([slow, *(cosines(y[p]) for p in self.pieces)])
         return np.asarray(every[self.order])
 
@@ -167,18 +170,14 @@ class Frequencies:
 
 def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:
     """Return the stretches between gaps, and the pauses (K, K) between them in intervals."""
-    whole = (slice(0, _with_small_factors(n)),)
-    if times is None or n < 3:
-        return whole, np.zeros((1, 1))
-    t = times
+    t = np.arange(float(n)) if times is None else times
     steps = np.diff(t)
-    usual = float(np.median(steps))
-    at = np.flatnonzero(steps > _GAP * usual) + 1
-    if not len(at) or not usual > 0:
-        return whole, np.zeros((1, 1))
-    inside = np.ones(n - 1, dtype=bool)
-    inside[at - 1] = False
-    interval = float(steps[inside].mean()) if inside.any() else usual
+    usual = float(np.median(steps)) if n > 1 else 0.0
+    gap = (steps > _GAP * usual) & (usual > 0)
+    if not gap.any():
+        return (slice(0, _with_small_factors(n)),), np.zeros((1, 1))
+    interval = float(steps[~gap].mean())  # the median is no gap
+    at = np.flatnonzero(gap) + 1
     first, last = np.append(0, at), np.append(at, n)
     pauses = np.maximum(t[first][None] - t[last - 1][:, None], 0.0) / interval
     pauses = np.maximum(pauses, pauses.T)

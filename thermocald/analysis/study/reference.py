@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.analysis.series.recorded import recorded_table
+from thermocald.analysis.series.recorded import series_epochs
 from thermocald.analysis.study.measured import measured_series
 from thermocald.analysis.study.study import study_camera
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -129,9 +129,7 @@ def reference_studies(
                 path = Path(folder) / name
                 preset_simulation(preset, seed, name).write(path)
                 recording = open_recording(path)
-                table = recorded_table(
-                    recording, AdjustmentSettings(), "series", jobs=settings.jobs
-                )
+                table = series_epochs(recording, AdjustmentSettings(), "series", jobs=settings.jobs)
                 one = measured_series(recording, table, preset)
                 # the folder no longer exists when the study is read
                 source = f"preset {preset}, series {name}, seed {seed}"

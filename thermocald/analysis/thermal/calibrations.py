@@ -9,6 +9,7 @@ affinity) are constant, or the distortion follows the angle; the sum of squares 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
@@ -17,18 +18,13 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtri
 
-from thermocald.analysis.camera.camera import CameraDifference
+from thermocald.analysis.camera.camera import Camera, CameraDifference
 from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
 from thermocald.analysis.thermal.result import with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry import camera_files
-from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics.model import BASES, RATED, ThermalModel, choose_basis, distortion_along
 from thermocald.store.logger.dialect import to_celsius
 from thermocald.store.recording.reader import interpolate_readings
@@ -51,18 +47,15 @@ _WARM_C = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration: a camera with the covariance (10, 10) of its interior orientation.
+    """A calibrated camera and its file.
 
-    moments: of its photographs, as the camera wrote them; temperature: °C, None if unknown.
+    photographs: how many there are; moments: of them, as the camera wrote them.
     """
 
     path: Path
-    name: str
-    camera: CameraModel
-    covariance: Array
-    photographs: int
-    moments: tuple[datetime, ...]
-    temperature: float | None
+    camera: Camera
+    photographs: int = 0
+    moments: tuple[datetime, ...] = ()
 
     def span(self, clock: DeviceClock) -> Array:
         """Return when the photographs were taken, s UTC. Raises DataError if that is not stored."""
@@ -85,6 +78,7 @@ def is_calibration(path: Path) -> bool:
 
 def read_calibration(path: Path, temperature: float | None = None) -> Calibration:
     """Read what `calibrate` wrote (`--json`, `--camera-out`). ConfigurationError names the file."""
+    T = math.nan if temperature is None else temperature
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
@@ -93,7 +87,8 @@ def read_calibration(path: Path, temperature: float | None = None) -> Calibratio
         found = camera_files.read(path)
         if found.covariance is None:
             raise ConfigurationError(f"{path}: the camera has no covariance: it cannot be weighted")
-        return Calibration(path, found.name, found.model, found.covariance, 0, (), temperature)
+        sensor, values = found.model.sensor, found.model.interior.as_array()
+        return Calibration(path, Camera(sensor, T, values, found.covariance, name=found.name))
     try:
         head, interior = document["camera"], document["interior"]
         names, r = document["correlations"]["names"], np.array(document["correlations"]["matrix"])
@@ -102,15 +97,14 @@ def read_calibration(path: Path, temperature: float | None = None) -> Calibratio
         covariance = np.zeros((10, 10))
         covariance[np.ix_(rows, rows)] = r * np.outer(sd, sd)
         sensor = Sensor(head["width"], head["height"], head["pixel_pitch"])
-        model = CameraModel(sensor, InteriorOrientation(**{n: interior[n] for n in IOP_NAMES}))
+        values = np.array([interior[n] for n in IOP_NAMES], dtype=float)
+        camera = Camera(sensor, T, values, covariance, name=head["name"])
         good = [p for p in document["photographs"] if p["status"] == "ok"]
         moments = tuple(datetime.fromisoformat(p["time"]) for p in good if p.get("time"))
     except (KeyError, TypeError, ValueError) as cause:
         reason = document.get("reason") or f"{cause} is missing"
         raise ConfigurationError(f"{path}: holds no calibrated camera: {reason}") from cause
-    return Calibration(
-        path, head["name"], model, covariance, len(good), moments, temperature
-    )  # fmt: skip
+    return Calibration(path, camera, len(good), moments)
 
 
 def with_log(calibration: Calibration, log: TemperatureLog, clock: DeviceClock) -> Calibration:
@@ -119,7 +113,7 @@ def with_log(calibration: Calibration, log: TemperatureLog, clock: DeviceClock) 
     readings = interpolate_readings(times, log.times, next(iter(log.channels.values())))
     if not np.isfinite(readings).all():
         raise DataError(f"{calibration.path}: the log has no temperature for its photographs")
-    return replace(calibration, temperature=float(readings.mean()))
+    return replace(calibration, camera=replace(calibration.camera, temperature=readings.mean()))
 
 
 def fit_calibrations(
@@ -134,11 +128,11 @@ def fit_calibrations(
     larger than the stated covariances allow. Raises DataError for temperatures too few or too close
     together, UsageError for cameras that differ or a calibration without a temperature.
     """
-    T = np.array([_known(c) for c in calibrations])
-    first = calibrations[0]
-    free = np.flatnonzero(np.diag(first.covariance) > 0)
-    for other in calibrations[1:]:
-        _require_alike(first, other, free)
+    first, cameras = calibrations[0], [c.camera for c in calibrations]
+    free = np.flatnonzero(np.diag(first.camera.covariance) > 0)
+    for one in calibrations:
+        _require_alike(first, one, free)
+    T = np.array([camera.temperature for camera in cameras])
     if np.ptp(T) < _LEAST_SPAN_K:
         raise DataError(
             f"the calibrations are all between {T.min():.1f} and {T.max():.1f} °C: a thermal model "
@@ -146,8 +140,8 @@ def fit_calibrations(
         )
     at = round(float(T.mean()), 1) if T0 is None else T0
     rated = [i for i, k in enumerate(free) if IOP_NAMES[k] in RATED]
-    y = np.concatenate([c.camera.interior.as_array()[free] for c in calibrations])
-    blocks = [c.covariance[np.ix_(free, free)] for c in calibrations]
+    y = np.concatenate([camera.values[free] for camera in cameras])
+    blocks = [camera.covariance[np.ix_(free, free)] for camera in cameras]
     mean = np.zeros(10)
     mean[free] = y.reshape(len(T), -1).mean(axis=0)
     found_in: dict[Distortion, tuple[Array, Array, float]] = {}
@@ -166,18 +160,18 @@ def fit_calibrations(
         covariance *= sigma0**2
     names = [f"interior.{IOP_NAMES[k]}" for k in free]
     names += [f"rates.{IOP_NAMES[free[i]]}" for i in rated]
+    name, sensor, interior = cameras[0].name, cameras[0].sensor, cameras[0].interior
+    span = float(T.min()), float(T.max())
     start = ThermalModel(
-        first.name,
-        first.camera.sensor,
-        at,
-        first.camera.interior,
-        dict.fromkeys(RATED, 0.0),
-        distortion=distortion,
-        validity={channel: (float(T.min()), float(T.max()))},
-        name=first.name,
-    )
+        name, sensor, at, interior, dict.fromkeys(RATED, 0.0), distortion=distortion,
+        validity={channel: span}, name=name,
+    )  # fmt: skip
     model = with_covariance(start, tuple(names), x, covariance)
-    rms = [_rms(model, c, t) for c, t in zip(calibrations, T.tolist(), strict=True)]
+    thermal = ThermalCamera(model)
+    rms = [
+        CameraDifference(("model", one.name), thermal.at(one.temperature).model, one.model).rms_px
+        for one in cameras
+    ]
     fitted_on: list[dict[str, Any]] = [
         {"calibration": str(c.path), "temperature": round(t, 3), "photographs": c.photographs,
          "rms_px": round(r, 5)}
@@ -199,22 +193,18 @@ def fit_calibrations(
     return ThermalCamera(replace(model, fitted_on=fitted_on, evidence=evidence), fitted)
 
 
-def _known(calibration: Calibration) -> float:
-    if calibration.temperature is None:
+def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
+    """Raise UsageError for an unknown temperature, another sensor or other free parameters."""
+    if math.isnan(other.camera.temperature):
         raise UsageError(
-            f"{calibration.path}: at which temperature? Write 21.5={calibration.path}, or give the "
+            f"{other.path}: at which temperature? Write 21.5={other.path}, or give the "
             "thermometer's --log"
         )
-    return calibration.temperature
-
-
-def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
-    """Raise UsageError if the sensor, the estimated parameters or the held values differ."""
     if other.camera.sensor != first.camera.sensor:
         raise UsageError(f"{other.path}: is of another sensor than {first.path}")
-    own = np.flatnonzero(np.diag(other.covariance) > 0)
+    own = np.flatnonzero(np.diag(other.camera.covariance) > 0)
     held = np.setdiff1d(np.arange(10), free)
-    same = other.camera.interior.as_array()[held] == first.camera.interior.as_array()[held]
+    same = other.camera.values[held] == first.camera.values[held]
     if not np.array_equal(own, free) or not same.all():
         raise UsageError(
             f"{other.path}: other parameters were estimated than in {first.path}; calibrate both "
@@ -236,12 +226,3 @@ def _adjust(
         slope = by_rate @ x[len(by_rate) :]
     left = y - A @ x
     return x, covariance, float(left @ weight @ left)
-
-
-def _rms(model: ThermalModel, calibration: Calibration, temperature: float) -> float:
-    """Return the RMS difference between the images of a calibration and of the model, px."""
-    values = model.interior.as_array() + (temperature - model.T0) * model.rate_vector
-    values = model.carried(values)
-    camera = CameraModel(model.sensor, InteriorOrientation.from_array(values))
-    difference = CameraDifference(("model", calibration.name), camera, calibration.camera)
-    return difference.rms_px

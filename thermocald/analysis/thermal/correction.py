@@ -19,7 +19,7 @@ import json
 import math
 import sys
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, cast
 import cv2
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import Maps, ideal_points
+from thermocald.analysis.camera.undistortion import Maps
 from thermocald.arrays import eight_bit
 from thermocald.errors import DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
+    from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.thermal.modelled_camera import Along
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
@@ -61,16 +62,6 @@ if TYPE_CHECKING:
 
 
 _SAMPLE = 997  # points of an image at which the size of the correction is computed
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Corrected:
-    """Corrected image points (n, 2) px with sds (n, 2) px; extrapolated (n,) K beyond the fit."""
-
-    points: Array
-    sds: Array
-    temperature: Array
-    extrapolated: Array
 
 
 def correct_points(
@@ -81,20 +72,22 @@ def correct_points(
     to: float | None = None,
     temperature_sd: float = 0.0,
     extrapolate: bool = False,
-) -> Corrected:
+) -> tuple[Array, Array, Array, Array]:
     """Correct image points (n, 2) px measured at times (n,) s to a temperature `to` (default T₀).
 
-    temperature_sd K: of a reading of the log. Raises DataError for times outside the log.
+    temperature_sd K: of a reading of the log. Returns the points, their sds (n, 2) px, temperatures
+    (n,) °C and by how many kelvin these are beyond the fit. Raises DataError for times outside the
+    log.
     """
     unique, place = np.unique(times, return_inverse=True)
     steady, along = _predict(camera, log, unique, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
     r = rays(sensor, along.values[place], points[:, None, :])
     direction = (r / -r[..., 2:])[:, 0]
-    corrected = project(sensor, steady, np.zeros(6), direction)
-    J = partials(sensor, steady, np.zeros(6), direction)[1][..., IOP]
+    corrected = project(sensor, steady.values, np.zeros(6), direction)
+    J = partials(sensor, steady.values, np.zeros(6), direction)[1][..., IOP]
     sds = np.sqrt(np.einsum("ncp,npq,ncq->nc", J, along.covariance[place], J, optimize=True))
-    return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
+    return corrected, sds, along.temperatures[place], along.extrapolated[place]
 
 
 def image_corrections(
@@ -114,36 +107,32 @@ def image_corrections(
     sensor = camera.model.sensor
     pixels = np.linspace(0, sensor.width * sensor.height - 1, _SAMPLE).astype(int)
     points = np.stack([pixels % sensor.width, pixels // sensor.width], axis=1).astype(float)
-    ideal = ideal_points(sensor, steady, points)
-    direction = np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)
-    J = partials(sensor, steady, np.zeros(6), direction)[1][..., IOP]
     found = []
     for i in range(len(along)):
         now = along[i]
-        seen = project(sensor, now.values, np.zeros(6), direction)
-        shift = np.linalg.norm(seen - points, axis=1)
-        variance = np.einsum("ncp,pq,ncq->nc", J, now.covariance, J, optimize=True)
+        shift = np.linalg.norm(steady.as_seen_by(points, now.interior) - points, axis=1)
+        variance = replace(steady, covariance=now.covariance).point_covariance(points)
         found.append({
             "temperature": now.temperature,
             "rms_correction_px": float(np.sqrt(np.mean(shift**2))),
             "largest_correction_px": float(shift.max()),
-            "rms_left_over_px": float(np.sqrt(np.mean(variance))),
+            "rms_left_over_px": float(np.sqrt(np.mean(variance.diagonal(axis1=1, axis2=2)))),
             "extrapolated_K": now.extrapolated,
         })  # fmt: skip
-    return Maps(sensor, steady, camera.model.T0 if to is None else to), along.values, found
+    return Maps(sensor, steady.values, steady.temperature), along.values, found
 
 
 def _predict(
     camera: ThermalCamera, log: TemperatureLog, times: Array, to: float | None,
     temperature_sd: float, extrapolate: bool,
-) -> tuple[Array, Along]:  # fmt: skip
-    """Return the steady camera (10,) at a temperature, and the camera at times relative to it."""
+) -> tuple[Camera, Along]:  # fmt: skip
+    """Return the steady camera at a temperature, and the camera at times relative to it."""
     target = camera.model.T0 if to is None else to
     along = camera.along(
         log.times, log.channels, times, extrapolate, relative_to=target,
         temperature_sd=temperature_sd,
     )  # fmt: skip
-    return camera.at(target, extrapolate=True).values, along
+    return camera.at(target, extrapolate=True), along
 
 
 _QUALITY = 95  # of a JPEG: its losses are below the noise of a camera

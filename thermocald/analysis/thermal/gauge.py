@@ -31,7 +31,6 @@ from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
-    IOP_NAMES,
     CameraSpec,
     ExteriorOrientation,
     partials,
@@ -42,6 +41,7 @@ from thermocald.photogrammetry.epoch.measuring import resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.photogrammetry.linalg import inverse_of_determined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -113,10 +113,11 @@ class Movement:
 
 
 class GaugeCalibrator(EpochCalibrator):
-    """A calibrator that predicts and poses the epochs of one camera in turn.
+    """A calibrator that predicts and poses the epochs of one camera, and observes the results.
 
     control, finder: the control points and what measures them, or None; mount_sd_deg: the random
-    walk of the mount about each axis, ° in an hour, NaN if unknown.
+    walk of the mount about each axis, ° in an hour, None if unknown; tell(kind, text, utc, epoch):
+    takes the events that `observe` finds.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class GaugeCalibrator(EpochCalibrator):
         thermal: ThermalCamera,
         control: TestField | None = None,
         finder: Tracker | Templates | None = None,
-        mount_sd_deg: float = math.nan,
+        mount_sd_deg: float | None = None,
         snooping_alpha: float = 0.001,
     ) -> None:
         self.thermal = thermal
@@ -132,7 +133,7 @@ class GaugeCalibrator(EpochCalibrator):
         self.testfield = control or TestField.build([], np.empty((0, 3)))
         self.predictor = Predictor(thermal)
         self._finder = finder
-        self._mount = math.radians(mount_sd_deg)
+        self._mount = mount_sd_deg
         self._alpha = snooping_alpha
         self.pose: Pose | None = None
         """The last pose from control points."""
@@ -142,6 +143,8 @@ class GaugeCalibrator(EpochCalibrator):
         self._number = 0
         self.movement: Movement | None = None
         """The movement of the camera that the last epoch showed, if any."""
+        self.tell: Callable[[str, str, float, int], None] = lambda *_: None
+        self._status = self._reason = ""
 
     def outlook(self) -> str:
         """Describe the control points, and the pose that they give in the reference frame."""
@@ -206,12 +209,12 @@ class GaugeCalibrator(EpochCalibrator):
             names = next(iter(epoch.temperatures), "the reference thermometer")
             bad = failed("no_temperature", f"no reading of {names} so far", measured)
             return CalibratedEpoch(epoch, bad, {})
-        beyond = now.camera.extrapolated
+        beyond, T = now.camera.extrapolated, now.camera.temperature
         extra = {
             "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": beyond,
         }  # fmt: skip
-        outside = self.thermal.validity.place(now.camera.temperature) if beyond else ""
-        if now.far:
+        outside = self.thermal.validity.place(T) if beyond else ""
+        if self.thermal.validity.is_far(T):
             bad = failed("outside_range", f"{outside}: nothing is predicted there", measured)
             return CalibratedEpoch(epoch, bad, extra)
         result = self._posed(epoch, now, measured, why, in_order)
@@ -258,9 +261,9 @@ class GaugeCalibrator(EpochCalibrator):
             count = 0 if seen is None else len(seen)
             return self._without_pose(epoch, now, seen, f"{count} control points are seen ({why})")
         start = None if self.pose is None else self.pose.eop
-        camera = now.camera
+        interior, covariance = now.camera.interior, now.camera.covariance
         place = partial(
-            resect, self.sensor, camera.interior, camera.covariance, self.testfield, seen,
+            resect, self.sensor, interior, covariance, self.testfield, seen,
             snooping_alpha=self._alpha,
         )  # fmt: skip
         result = place(start)
@@ -279,34 +282,30 @@ class GaugeCalibrator(EpochCalibrator):
             self.pose = pose
         return replace(result, status="resected", reason="")
 
-    def _unposed(self, status: str, reason: str, now: PredictedCamera) -> Adjustment:
-        camera = now.camera
-        known = tuple(n for n, sd in camera.sd.items() if sd > 0)
-        blank = failed(status, reason, None, known)
-        covariance = np.zeros((16, 16))
-        covariance[IOP, IOP] = camera.covariance
-        return replace(blank, interior=camera.interior, covariance=covariance)
+    def _unposed(
+        self, status: str, reason: str, now: PredictedCamera, seen: Observations | None = None
+    ) -> Adjustment:
+        known = tuple(n for n, sd in now.camera.sd.items() if sd > 0)
+        blank = failed(status, reason, seen, known)
+        blank.covariance[IOP, IOP] = now.camera.covariance
+        return replace(blank, interior=now.camera.interior)
 
     def _without_pose(
         self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str
     ) -> Adjustment:
         """Return the last pose, widened by what the mount may have moved; without one, no pose."""
         last = self.pose
-        targets = np.empty(0, dtype=np.int64) if seen is None else seen.targets
         if last is None:
             return self._unposed("predicted", f"no pose so far: {why}", now)
         hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
-        still = "; the mount is taken not to have moved since, as its movement is not known"
-        if math.isfinite(self._mount):
-            still = f"; the mount may have moved for {hours:.2f} h"
-        result = self._unposed("last_pose", why + still, now)
+        still = f"; the mount may have moved for {hours:.2f} h"
+        if self._mount is None:
+            still = "; the mount is taken not to have moved since, as its movement is not known"
+        result = self._unposed("last_pose", why + still, now, seen)
         result.covariance[EOP, EOP] = last.covariance
-        if math.isfinite(self._mount):
-            result.covariance[range(10, 13), range(10, 13)] += self._mount**2 * hours
-        return replace(
-            result, exterior=last.eop, targets=targets,
-            residuals=np.full((len(targets), 2), np.nan),
-        )  # fmt: skip
+        turned = math.radians(self._mount or 0.0) ** 2 * hours
+        result.covariance[range(10, 13), range(10, 13)] += turned
+        return replace(result, exterior=last.eop)
 
     def _watch(self, pose: Pose) -> None:
         """Compare a pose with the reference; two different poses in a row are a movement."""
@@ -347,8 +346,7 @@ class GaugeCalibrator(EpochCalibrator):
         A = A.reshape(-1, 16)
         noise = (_matching(a) ** 2 + _matching(b) ** 2 + _UNMODELLED_PX**2).ravel()
         N = A[:, EOP].T @ (A[:, EOP] / noise[:, None])
-        scale = np.sqrt(np.diag(N))
-        inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+        inverse = inverse_of_determined(N)
         gain = inverse @ (A[:, EOP] / noise[:, None]).T
         lever = gain @ A[:, IOP]
         drift = lever @ self._change_covariance(before, after) @ lever.T
@@ -356,39 +354,25 @@ class GaugeCalibrator(EpochCalibrator):
 
     def _change_covariance(self, before: PredictedCamera, after: PredictedCamera) -> Array:
         """Return the covariance (10, 10) of the camera's predicted change."""
-        change_k = after.camera.temperature - before.camera.temperature
-        thermal = self.thermal
-        rows = [k for k, n in enumerate(thermal.parameters) if n.startswith("rates.")]
-        names = [IOP_NAMES.index(thermal.parameters[k].split(".")[1]) for k in rows]
-        covariance = np.zeros((10, 10))
-        covariance[np.ix_(names, names)] = thermal.covariance[np.ix_(rows, rows)] * change_k**2
+        T = before.camera.temperature, after.camera.temperature
+        _, covariance = self.thermal.steady_change(*T)
         unsure_k = math.hypot(before.temperature_sd, after.temperature_sd)
-        rates, unknown = thermal.model.rate_vector, after.unknown - before.unknown
+        rates, unknown = self.thermal.model.rate_vector, after.unknown - before.unknown
         return covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
 
-
-class GaugeObserver:
-    """An observer that reports a gauge's events: changes of its rows' status, and movements.
-
-    tell(kind, text, utc, epoch) takes the events.
-    """
-
-    def __init__(
-        self, gauge: GaugeCalibrator, tell: Callable[[str, str, float, int], None]
-    ) -> None:
-        self._gauge, self._tell = gauge, tell
-        self._status = self._reason = ""
-
     def observe(self, calibrated: CalibratedEpoch, *_: object) -> dict[str, float]:
-        """Observe an epoch; returns no columns to store, as a gauge has no series to adjust."""
+        """Report changes of the rows' status, and movements.
+
+        Returns no columns to store, as a gauge has no series to adjust.
+        """
         epoch, result = calibrated.epoch, calibrated.adjustment
         if result.status == "repeated_frame":  # the camera's own event is `frozen`
             return {}
-        if (moved := self._gauge.movement) is not None:
-            self._tell("camera_moved", moved.sentence(), moved.since, epoch.number)
+        if (moved := self.movement) is not None:
+            self.tell("camera_moved", moved.sentence(), moved.since, epoch.number)
         if result.status != self._status and (self._status or result.status not in _USUAL):
             text = result.reason or f"{result.status} again"
-            self._tell(result.status, text, epoch.frame_time, epoch.number)
+            self.tell(result.status, text, epoch.frame_time, epoch.number)
         self._status, self._reason = result.status, result.reason
         return {}
 
@@ -402,9 +386,8 @@ def plan_gauge(
     mount_sd_deg: float | None, snooping_alpha: float,
 ) -> tuple[GaugeCalibrator, list[float]]:  # fmt: skip
     """Return the calibrator of a gauge and the origin (3,) of its coordinates, mm."""
-    mount = math.nan if mount_sd_deg is None else mount_sd_deg
     if control is None:
-        return GaugeCalibrator(thermal, mount_sd_deg=mount), [0.0, 0.0, 0.0]
+        return GaugeCalibrator(thermal, mount_sd_deg=mount_sd_deg), [0.0, 0.0, 0.0]
     given = ControlPoints.read(control, unit)
     finder: Tracker | Templates
     if reference is None:
@@ -424,9 +407,8 @@ def plan_gauge(
                 f"control_reference {reference}: has {size[0]}×{size[1]} px, the camera's frames "
                 f"{sensor.width}×{sensor.height} px"
             )
-    return GaugeCalibrator(thermal, given.field, finder, mount, snooping_alpha), [
-        float(v) for v in given.origin
-    ]
+    gauge = GaugeCalibrator(thermal, given.field, finder, mount_sd_deg, snooping_alpha)
+    return gauge, given.origin.tolist()
 
 
 def _matching(seen: Observations) -> Array:

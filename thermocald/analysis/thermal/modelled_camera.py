@@ -23,6 +23,8 @@ from thermocald.store.logger.dialect import to_celsius
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from numpy.typing import ArrayLike
+
     from thermocald.arrays import Array
     from thermocald.physics.history import History
     from thermocald.physics.model import ThermalModel
@@ -49,14 +51,14 @@ class Validity:
     high: float
     of: str = ""
 
-    def beyond(self, T: float) -> float:
-        """Return by how many kelvin a temperature is outside."""
-        beyond = max(self.low - T, T - self.high)
-        return beyond if beyond > _MARGIN_K else 0.0
+    def beyond(self, T: ArrayLike) -> Array:
+        """Return by how many kelvin temperatures are outside."""
+        beyond = np.maximum(self.low - np.asarray(T), np.asarray(T) - self.high)
+        return np.where(beyond > _MARGIN_K, beyond, 0.0)
 
     def is_far(self, T: float) -> bool:
         """Return whether a temperature is too far outside to be used."""
-        return self.beyond(T) > _REFUSED_FRACTION * max(self.high - self.low, 1.0)
+        return bool(self.beyond(T) > _REFUSED_FRACTION * max(self.high - self.low, 1.0))
 
     def worst(self, temperatures: Array) -> float:
         """Return the temperature that is furthest outside; the median if that is far outside."""
@@ -85,8 +87,7 @@ class Validity:
 
         Raises UsageError if one is far outside, unless `extrapolate`.
         """
-        beyond = np.maximum(self.low - temperatures, temperatures - self.high)
-        outside: Array = np.where(beyond > _MARGIN_K, beyond, 0.0)
+        outside = self.beyond(temperatures)
         if outside.any():
             T = self.worst(temperatures)
             if self.is_far(T) and not extrapolate:
@@ -152,25 +153,22 @@ def steady_camera(
 def predict_orientations(
     model: ThermalModel,
     names: tuple[str, ...],
-    of_names: Array,
     history: History,
     drive: Array,
-    noise: Array | None = None,
-    steady: Array | None = None,
     driven: Mapping[tuple[str, float], Array] | None = None,
-) -> tuple[Array, Array]:
-    """Return a model's interior orientations (E, 10) and their covariances (E, 10, 10).
+) -> tuple[Array, Array, Array]:
+    """Return a model's cameras: values (E, 10), slopes (E, 10) per K, derivatives (E, 10, p).
 
-    names: of the parameters with covariance `of_names`; drive (E,) °C: what the rates follow; noise
-    (E,) K²: variance of a reading; steady: derivatives (10, p) of the camera whose difference is
-    wanted; driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
+    names: of the parameters whose derivatives are wanted; drive (E,) °C: what the rates follow;
+    driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
     """
     linear = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
     for effect in model.effects:
         if not catalogue.get(effect.name).is_drive:
             linear = linear + model.influence(effect.name, history)
-    J = np.zeros((*linear.shape, len(names)))
-    for i, name in enumerate(names):
+    J = np.zeros((*linear.shape, 1 + len(names)))
+    J[..., 0] = model.rate_vector
+    for i, name in enumerate(names, 1):
         group, key = name.rsplit(".", 1)  # a formula may contain dots
         if group == "interior":
             J[:, IOP_NAMES.index(key), i] = 1.0
@@ -187,15 +185,8 @@ def predict_orientations(
                 ]
                 up, down = (moved[:, None] * model.rate_vector for moved in drives)
             J[:, :, i] = (up - down) / (2.0 * _step(model, name))
-    J = model.carried_derivatives(linear, J, names)
-    if steady is not None:
-        J -= steady
-    covariance: Array = np.einsum("epi,ij,eqj->epq", J, of_names, J, optimize=True)
-    if noise is not None:
-        rates = np.broadcast_to(model.rate_vector[:, None], (len(J), 10, 1))
-        slope = model.carried_derivatives(linear, rates)
-        covariance += noise[:, None, None] * slope * np.swapaxes(slope, 1, 2)
-    return model.carried(linear), covariance
+    carried = model.carried_derivatives(linear, J, ("slope", *names))
+    return model.carried(linear), carried[..., 0], carried[..., 1:]
 
 
 def moved_model(model: ThermalModel, name: str, sign: float) -> ThermalModel:

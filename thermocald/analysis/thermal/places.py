@@ -25,7 +25,7 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
 from thermocald.files import QuantityReader, read_yaml
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials, project
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 from thermocald.result import Result, jsonable, new_figure, with_sds
 
@@ -52,6 +52,8 @@ _SOME = 50  # places for which this is computed
 _NONE = 1e-6  # share of a variance, or mm, that is rounding
 _TOO_GOOD = 0.1  # sigma0 below which standard deviations are not those of these points
 _CONTRADICTED = 1e-3  # heights whose differences are less probable contradict each other
+_DOUBTED = 0.05  # residuals that are less probable may hide an error that nothing checks
+_BESIDE_MM = 300.0  # a staff's width: an image point further from it may be of something else
 
 
 def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
@@ -226,6 +228,11 @@ class Places(Result):
                 f"; the others hardly check {', '.join(self.unchecked)}: a gross error there could "
                 f"move a place by {self.unnoticed_mm:.0f} mm unnoticed; add control points"
             )
+            f, s0 = self.pose.redundancy, self.pose.sigma0
+            if f > 0 and chdtrc(f, f * s0**2) < _DOUBTED:
+                pose += (
+                    f"; there may be one, as sigma0 is {s0:.2f}: check before you use the places"
+                )
         names = list(self.names)
         if np.ptp(self.times):
             names = [f"{n} {_utc(t):%H:%M:%S}" for n, t in zip(names, self.times, strict=True)]
@@ -277,9 +284,8 @@ def measure_places(
         raise DataError("the control points have no x, y, sx, sy: add their image points, px")
     noise = camera.reading_sd
     then = camera.along(log.times, log.channels, [when], extrapolate, temperature_sd=noise)
-    seen_at = float(then.temperatures[0])
     moments, member = np.unique(times, return_inverse=True)
-    now = camera.along(log.times, log.channels, moments, extrapolate, seen_at, noise)
+    now = camera.along(log.times, log.channels, moments, extrapolate, None, noise, when)
     sensor = camera.model.sensor
     pose = control.pose(then[0])
     image, sigmas = observed[:, :2], observed[:, 2:]
@@ -294,13 +300,27 @@ def measure_places(
             f"image point {names[row]} at {image[row, 0]:.0f}, {image[row, 1]:.0f} px is outside "
             f"the camera's {sensor.width} × {sensor.height} px"
         )
-    unchecked, unnoticed = _reliability(sensor, control, pose, image, surface, covariance)
+    exact: Plane | Line | Profile = replace(surface, sd_mm=0.0)
+    if isinstance(exact, Plane):
+        exact = replace(exact, sd_tilt=0.0)
+    unchecked, unnoticed = _reliability(sensor, control, pose, image, exact, covariance)
+    if not isinstance(surface, Plane):
+        eop = pose.values[EOP]
+        on = project(sensor, states[member][:, IOP], eop, points[:, None])[:, 0]
+        scale = sensor.pixel_pitch / states[member, 0] * np.linalg.norm(points - eop[3:], axis=1)
+        beside = np.linalg.norm(on - image, axis=1) * scale
+        if beside.max() > _BESIDE_MM:
+            row = int(np.argmax(beside))
+            warnings.warn(
+                f"image point {names[row]} is {beside[row] / 1000:.1f} m beside the line that its "
+                "height is read on: is it a point of the staff or profile?",
+                stacklevel=3,
+            )
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
     levels: tuple[Level, ...] = ()
     if not isinstance(surface, Plane):
-        on = replace(surface, sd_mm=0.0)
-        _, seen = place_on(sensor, states[member], pose.covariance, image, sigmas, on)
+        _, seen = place_on(sensor, states[member], pose.covariance, image, sigmas, exact)
         steep = seen.diagonal()[2::3] > 0  # a place on a horizontal line determines no height
         levels = _levels(points, covariance, moments, np.where(steep, member, -1))
     return Places(
@@ -316,17 +336,15 @@ def _reliability(
     control: ControlPoints,
     pose: Adjustment,
     image: Array,
-    surface: Plane | Line | Profile,
+    exact: Plane | Line | Profile,
     covariance: Array,
 ) -> tuple[tuple[str, ...], float]:
     """Return the control points that the others hardly check, and what they may do, mm.
 
-    covariance (3n, 3n) mm²: of the places. It is the external reliability: the largest movement of
-    a place by a gross error that data snooping misses. Source: Baarda (1968).
+    exact: the surface without sds; covariance (3n, 3n) mm²: of the places. It is the external
+    reliability: the largest movement of a place by a gross error that data snooping misses. Source:
+    Baarda (1968).
     """
-    exact: Plane | Line | Profile = replace(surface, sd_mm=0.0)
-    if isinstance(exact, Plane):
-        exact = replace(exact, sd_tilt=0.0)
     seen = control.seen.select(~np.isin(control.seen.targets, pose.rejected))
     some = spread_rows(len(image), _SOME)
     sd = np.sqrt(covariance.diagonal()).reshape(-1, 3)[some].ravel()

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.errors import DataError
 from thermocald.numbers import plain
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.device import CameraDevice, read_camera_device, read_programme
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field
@@ -94,15 +93,9 @@ def _read_store(source: Path, wanted: str | None) -> tuple[TemperatureLog, Camer
             raise DataError(
                 f"{store.path}: there is no channel {wanted!r}; there are: {', '.join(names)}"
             )
-        parts: list[list[np.ndarray[tuple[int], np.dtype[np.float64]]]] = []
-        for series in every:
-            own = list(series.head.channels)
-            columns = store.series_columns(series, ["temperature_time", *own])
-            times = columns["temperature_time"]
-            absent = np.full(times.size, np.nan)
-            parts.append([times, *(columns[n] if n in own else absent for n in names)])
+        parts = [store.series_columns(series, ["temperature_time", *names]) for series in every]
         path, camera = store.path, every[0].head.camera
-    table = np.array([np.concatenate(column) for column in zip(*parts, strict=True)])
+    table = np.concatenate([list(columns.values()) for columns in parts], axis=1)
     table = table[:, np.isfinite(table[0])]
     if not table.shape[1]:
         raise DataError(f"{path}: holds no temperatures")
@@ -121,10 +114,10 @@ def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> tuple[float |
     """
     if len(along) < 10:
         raise DataError("a warm-up needs a history of at least 10 times")
-    points = image_grid(along.sensor)
-    r = rays(along.sensor, along.values, np.broadcast_to(points, (len(along), *points.shape)))
-    places = distance_mm * r[..., :2] / -r[..., 2:]
-    error = np.linalg.norm(places - places[-1], axis=2).max(axis=1)
+    last = along[-1]
+    error = np.array([
+        along[i].object_distance(last, distance_mm).max() for i in range(len(along))
+    ])  # fmt: skip
     times = along.times - along.times[0]
     settled = error[-len(error) // 10 :].max() <= max(0.1 * wanted_mm, 1e-9)
     above = np.flatnonzero(error > wanted_mm)
@@ -192,14 +185,10 @@ def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool
         log.times, log.channels, log.times[known], extrapolate=extrapolate,
         temperature_sd=thermal.thermometer_sd or 0.0,
     )  # fmt: skip
-    sds = along.sd
     header = ["time", "temperature", *IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES), "extrapolated_K"]
-    rows = [
-        [time, temperature, *values, *sd, outside]
-        for time, temperature, values, sd, outside in zip(
-            along.times, along.temperatures, along.values, sds, along.extrapolated, strict=True
-        )
-    ]
+    rows = np.column_stack(
+        [along.times, along.temperatures, along.values, along.sd, along.extrapolated]
+    ).tolist()
     document = {
         "format": "thermocald-prediction/1",
         "camera": thermal.model.camera,

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.photogrammetry.camera.camera_model import IOP, partials, rays
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.thermal.thermal_camera import LiveCamera, ThermalCamera
     from thermocald.arrays import Array
 
@@ -40,8 +39,7 @@ class PredictedCamera:
 
     age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age and
     the excess over the limits of the fit; unknown (10,): one standard deviation due to the unknown
-    past, and unknown_px, its largest effect in the image; far: whether the temperature is so far
-    outside those of the fit that nothing should be predicted.
+    past, and unknown_px, its largest effect in the image.
     """
 
     camera: Camera
@@ -49,7 +47,6 @@ class PredictedCamera:
     temperature_sd: float
     unknown: Array
     unknown_px: float
-    far: bool
 
 
 class Predictor:
@@ -64,7 +61,6 @@ class Predictor:
         self._now: tuple[Camera, Camera] | None = None
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
         self._since_begin = 0
-        self._across: Array | None = None
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
         """Take readings {channel: °C}, the reference first; failed ones are NaN or missing.
@@ -103,16 +99,15 @@ class Predictor:
             camera, age = self._free.along(times, rows, [time])[0], 0.0
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
-        covariance = camera.covariance + np.outer(unknown, unknown)
         drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > GAP_S else 0.0)
-        covariance = covariance + drifted**2 * np.outer(rates, rates)
-        beyond, far = self.thermal.validity.beyond(T), self.thermal.validity.is_far(T)
-        covariance = covariance + np.diag((rates * beyond) ** 2)
-        model = self.thermal.model
-        now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
-        shift = self._largest_px(camera.values, unknown)
-        spread = math.hypot(drifted, beyond)
-        return PredictedCamera(now, age, spread, unknown, shift, far)
+        beyond = float(self.thermal.validity.beyond(T))
+        covariance = camera.covariance + np.outer(unknown, unknown)
+        covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
+        now = replace(camera, covariance=covariance, extrapolated=beyond)
+        alone = replace(camera, covariance=np.outer(unknown, unknown))
+        variance = alone.point_covariance(image_grid(camera.sensor)).trace(axis1=1, axis2=2)
+        largest = math.sqrt(variance.max())
+        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest)
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""
@@ -165,14 +160,3 @@ class Predictor:
         span = self.thermal.validity.high - self.thermal.validity.low
         spread = (span if math.isfinite(span) else _USUAL_RANGE_K) / math.sqrt(12.0)
         return spread * math.sqrt(-math.expm1(-2.0 * seconds / _CORRELATED_S))
-
-    def _largest_px(self, values: Array, shift: Array) -> float:
-        """Return the largest shift of an image point, px, for a change of interior orientation."""
-        if not shift.any():
-            return 0.0
-        if self._across is None:  # rays of a grid, which temperature hardly changes
-            sensor = self.thermal.model.sensor
-            across = rays(sensor, values, image_grid(sensor))
-            self._across = across / -across[:, 2:]
-        J = partials(self.thermal.model.sensor, values, np.zeros(6), self._across)[1][..., IOP]
-        return float(np.linalg.norm(J @ shift, axis=1).max())

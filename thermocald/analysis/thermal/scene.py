@@ -407,8 +407,7 @@ def follow_scene(
     thermal = thermal.for_images(reference.shape[1], reference.shape[0])
     along = thermal.along(log.times, log.channels, times)
     since = thermal.along(
-        log.times, log.channels, times, relative_to=float(along.temperatures[0]),
-        temperature_sd=thermal.reading_sd,
+        log.times, log.channels, times, temperature_sd=thermal.reading_sd, since=frames[0][1]
     ).sd  # fmt: skip
     corners = detect_features(reference)
     E = len(frames)

@@ -112,8 +112,8 @@ class ThermalCamera(Result):
     @property
     def _limits(self) -> tuple[float, float]:
         """The temperatures of the fit, °C; 15 K about T0 for a model that does not state them."""
-        T0 = self.model.T0
-        return next(iter(self.model.validity.values()), (T0 - 15.0, T0 + 15.0))
+        low, high, T0 = self.validity.low, self.validity.high, self.model.T0
+        return (low, high) if math.isfinite(low) else (T0 - 15.0, T0 + 15.0)
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
@@ -127,18 +127,11 @@ class ThermalCamera(Result):
         thermometers are taken to be as warm.
         """
         T = np.linspace(*self._limits, 60)
-
-        def at(t: float) -> tuple[Array, Array, Array]:
-            alike = dict.fromkeys(self.channels, t)
-            return steady_camera(self.model, self.parameters, alike, t)
-
-        base, _, J0 = at(self.model.T0)
-        values, _, J = zip(*map(at, T.tolist()), strict=True)
-        changes, by = np.array(values) - base, np.array(J) - J0  # the level cancels in a change
-        sds = np.sqrt(np.einsum("epi,ij,epj->ep", by, self.covariance, by))
+        found = [self.steady_change(self.model.T0, t) for t in T.tolist()]
         figure, axes = new_figure(3)
         for k, axis in enumerate(axes[:, 0]):
-            y, band = 1e3 * changes[:, k], 1e3 * BAND * sds[:, k]
+            y = 1e3 * np.array([change[k] for change, _ in found])
+            band = 1e3 * BAND * np.sqrt([covariance[k, k] for _, covariance in found])
             axis.plot(T, y)
             axis.fill_between(T, y - band, y + band, alpha=0.3)
             axis.set_ylabel(f"change of {parameter_label(IOP_NAMES[k])} in µm")
@@ -146,6 +139,17 @@ class ThermalCamera(Result):
         axes[0, 0].set_title(f"{self.model.camera}, from {self.model.T0:g} °C")
         axes[-1, 0].set_xlabel("temperature in °C")
         return figure
+
+    def steady_change(self, since: float, T: float) -> tuple[Array, Array]:
+        """Return the change (10,) of the steady camera from one temperature to another, °C.
+
+        Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
+        """
+        (then, _, J0), (now, _, J) = (
+            steady_camera(self.model, self.parameters, dict.fromkeys(self.channels, t), t)
+            for t in (since, T)
+        )
+        return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
         """Return a camera that follows a thermometer, reading by reading.
@@ -271,13 +275,20 @@ class ThermalCamera(Result):
         if channels is not None:
             self._require_channels(channels)
         values, slope, J = steady_camera(self.model, self.parameters, channels, T)
-        covariance = J @ self.covariance @ J.T
-        if temperature_sd:
-            covariance += temperature_sd**2 * np.outer(slope, slope)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
         (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
-        covariance += np.diag(drift)
+        covariance = self._propagated(J, slope, temperature_sd**2) + np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
+
+    def _propagated(self, J: Array, slope: Array, noise: Array | float = 0.0) -> Array:
+        """Return covariances (…, 10, 10) from derivatives (…, 10, p) and slopes (…, 10) per K.
+
+        noise (…): the variance of the temperature, K².
+        """
+        covariance = np.einsum("...pi,ij,...qj->...pq", J, self.covariance, J, optimize=True)
+        of_reading = slope[..., :, None] * slope[..., None, :]
+        total: Array = covariance + np.asarray(noise)[..., None, None] * of_reading
+        return total
 
     def along(
         self,
@@ -287,14 +298,16 @@ class ThermalCamera(Result):
         extrapolate: bool = False,
         relative_to: float | None = None,
         temperature_sd: float = 0.0,
+        since: Any = None,
     ) -> Along:
         """Return the camera along a temperature log, including effects with a memory.
 
         times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
         the reference first; at (E,): the times to predict for, by default `times`. The history
         begins with the first time. relative_to °C: the covariance is that of the difference from
-        the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
-        the covariance (as if no effect had a memory, which would average it). Raises UsageError far
+        the steady camera at this temperature; since s or datetime64: instead, of the difference
+        from the camera at this time; temperature_sd K: of a reading, is propagated into the
+        covariance (as if no effect had a memory, which would average it). Raises UsageError far
         outside the model's validity (unless `extrapolate`), for lengths that differ and for times
         that run backwards, DataError for times `at` that the log does not cover.
 
@@ -331,21 +344,25 @@ class ThermalCamera(Result):
             history.temperature(), others, self.model.rate_vector, extrapolate
         )
         values, covariance = [], []
-        steady = None
+        base: Array | float = 0.0  # derivatives of the camera whose difference is wanted,
+        of_base = np.zeros(len(t))  # and the weights of the readings that give its temperature
+
+        def predicted(part: History) -> tuple[Array, Array, Array]:
+            return predict_orientations(self.model, self.parameters, part, self.model.drive(part))
+
         if relative_to is not None:
-            steady = steady_camera(self.model, self.parameters, None, relative_to)[2]
+            base = steady_camera(self.model, self.parameters, None, relative_to)[2]
+        elif since is not None:
+            then = np.atleast_1d(seconds(since)) - begin
+            base = predicted(history.at(then))[2]
+            of_base = interpolation_matrix(t - begin, then).toarray()[0]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
-            noise = None
-            if temperature_sd:
-                shares = interpolation_matrix(t - begin, part.times).power(2).sum(axis=1)
-                noise = temperature_sd**2 * shares
-            drive = self.model.drive(part)
-            found = predict_orientations(
-                self.model, self.parameters, self.covariance, part, drive, noise, steady
-            )
-            values.append(found[0])
-            covariance.append(found[1])
+            W = interpolation_matrix(t - begin, part.times)
+            shares = W.power(2).sum(axis=1) - 2.0 * (W @ of_base) + of_base @ of_base
+            found, slope, J = predicted(part)
+            values.append(found)
+            covariance.append(self._propagated(J - base, slope, temperature_sd**2 * shares))
         Q = np.concatenate(covariance)
         Q[:, range(10), range(10)] += drift
         return Along(
@@ -495,11 +512,11 @@ class LiveCamera:
         driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
         history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
-        values, covariance = predict_orientations(
-            model, thermal.parameters, thermal.covariance, history, drive, driven=driven
+        (values,), slopes, J = predict_orientations(
+            model, thermal.parameters, history, drive, driven
         )
-        Q = covariance[0] + np.diag(drift[0])
-        self._now = Camera(model.sensor, row[0], values[0], Q, float(beyond), model.camera)
+        Q = thermal._propagated(J, slopes)[0] + np.diag(drift[0])
+        self._now = Camera(model.sensor, row[0], values, Q, float(beyond), model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:

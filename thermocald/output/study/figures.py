@@ -77,7 +77,7 @@ def _readable(camera: CameraStudy, name: str) -> tuple[float, str]:
 
 def deviation_figure(camera: CameraStudy) -> Figure:
     """Draw every parameter minus its first value over time (Figures 3 and 5)."""
-    panels, ratios, words = [], [], []
+    panels, ratios = [], []
     temperatures: dict[str, list[Curve]] = {}
     for name in _free_parameters(camera):
         k, (scale, label), curves = IOP_NAMES.index(name), _readable(camera, name), []
@@ -88,7 +88,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
             curves.append(Curve(s.name, t, y, "line", colour, half))
         panels.append(Panel(f"Δ{parameter_label(name)}", "time in min", label, tuple(curves)))
     for study, colour in _coloured(camera):
-        s, d = study.series, study.deviations
+        s = study.series
         minutes = s.time_s / 60
         t, ratio = thin(minutes, s.sigma0 / s.sigma0[0])
         ratios.append(Curve(s.name, t, ratio, "line", colour))
@@ -97,9 +97,6 @@ def deviation_figure(camera: CameraStudy) -> Figure:
                 t, celsius = thin(minutes, thermometer.values)
                 curve = Curve(s.name, t, celsius, "line", colour)
                 temperatures.setdefault(thermometer.name, []).append(curve)
-        if "x0" in d and "y0" in d:
-            farthest = float(np.hypot(*s.path_px.T).max())
-            words.append(f"in {s.name} by up to {plain(farthest, 'px', 3)}")
     panels.append(Panel("σ₀ / first σ₀", "time in min", "ratio (no unit)", tuple(ratios)))
     panels += [
         Panel(parameter_label(name), "time in min", "temperature in °C", tuple(curves))
@@ -108,8 +105,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     return Figure(
         "deviations", "Deviations from the first epoch",
         "Each parameter minus its value in the first epoch. The bands are the 95 % uncertainty of "
-        "one epoch's adjustment; a line that leaves its band shows a change."
-        + (f" The principal point has moved {enumerated(words)}." if words else ""),
+        "one epoch's adjustment; a line that leaves its band shows a change.",
         tuple(panels),
     )  # fmt: skip
 
@@ -224,7 +220,7 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
 
     only: parameters to show, by default all.
     """
-    panels, close = [], []
+    panels = []
     for name in only or [*_free_parameters(camera), "sigma0"]:
         shown = [
             (study, colour)
@@ -239,19 +235,12 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
         curves = [c for study, colour in shown for c in _fitted(study, name, scale, colour)]
         reference = parameter_label(shown[0][0].channels[0].thermometer.name)
         panels.append(Panel(parameter_label(name), f"{reference} in °C", label, tuple(curves)))
-        if min(abs(study.channels[0].dependences[name].r) for study, _ in shown) >= 0.9:
-            close.append(parameter_label(name))
     if not panels:
         return None
-    follow = (
-        f"{', '.join(close)} follow{'s' if len(close) == 1 else ''} it closely (|r| ≥ 0.9)."
-        if close
-        else "No parameter follows it closely (|r| ≥ 0.9)."
-    )
     return Figure(
         "temperature-dependence", "Dependence on the temperature",
         "Each parameter against the reference temperature, with a straight line whose fit takes "
-        f"the noise of both into account. {follow}",
+        "the noise of both into account.",
         tuple(panels),
     )  # fmt: skip
 

@@ -332,14 +332,12 @@ def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
     text = (
         f"The camera, along its own path, stays within {limit_mm / 10:g} cm at {enumerated(parts)}."
     )
-    strong = []
     known = sum(len(study.series) for study in camera.series) >= FEWEST_FOR_R
-    for i, j in ((1, 2), (0, 1), (0, 2)) if known else ():
-        over_time = float(camera.over_time[i, j])
-        if not abs(over_time) >= _TOGETHER:
-            continue
-        words = f"{parameter_label(IOP_NAMES[i])} and {parameter_label(IOP_NAMES[j])}"
-        strong.append(f"{words} {coefficient(over_time)}")
+    strong = [
+        f"{parameter_label(IOP_NAMES[i])} and {parameter_label(IOP_NAMES[j])} {coefficient(r)}"
+        for i, j in ((1, 2), (0, 1), (0, 2))
+        if known and abs(r := float(camera.over_time[i, j])) >= _TOGETHER
+    ]
     if strong and camera.correlations is not None:
         drawn = coefficient(float(camera.correlations.median[1, 2]))
         text += (

@@ -110,12 +110,17 @@ class Sheet:
         return (upwards[0], lowest[-1]) if len(lowest) > 1 else (upwards[0], upwards[-1])
 
 
-def paper_size(text: str, *, landscape: bool = False) -> tuple[float, float]:
-    """Return the size in mm of `A3` or `300x400` (width × height, mm); UsageError for others."""
+def paper_size(
+    text: str, landscape: bool | None = None, *, usual: bool = False
+) -> tuple[float, float]:
+    """Return the size in mm of `A3` or `300x400` (width × height, mm); UsageError for others.
+
+    landscape: None for the usual orientation of a named paper, and for that of a size in mm.
+    """
     name = text.strip().upper()
     if name in PAPERS:
         w, h = PAPERS[name]
-        return (h, w) if landscape else (w, h)
+        return (h, w) if (usual if landscape is None else landscape) else (w, h)
     parts = name.replace("×", "X").split("X")
     try:
         w, h = (float(part) for part in parts)

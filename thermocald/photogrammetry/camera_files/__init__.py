@@ -225,7 +225,11 @@ def _read_text(path: Path, format_: str | None = None) -> tuple[str, Format]:
     for candidate in FORMATS.values():
         if candidate.recognises(text):
             return text, candidate
-    raise ConfigurationError(f"{path}: not a camera file of any format: {', '.join(FORMATS)}")
+    thermal = "; it is a thermal model: `thermocald camera at` writes its camera at a temperature"
+    raise ConfigurationError(
+        f"{path}: not a camera file of any format: {', '.join(FORMATS)}"
+        + thermal * text.startswith("format: thermocald-model/")
+    )
 
 
 def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:

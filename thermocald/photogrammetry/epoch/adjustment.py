@@ -19,7 +19,6 @@ geodetic networks; the elimination as Mikhail and Ackermann (1976), chapter 11.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from math import sqrt
 from typing import TYPE_CHECKING
 
@@ -29,6 +28,7 @@ from thermocald.errors import ConfigurationError, GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     DEFAULT_FREE,
     EOP,
+    EOP_COLUMNS,
     EOP_NAMES,
     IOP,
     IOP_NAMES,
@@ -36,6 +36,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
+    free_columns,
     rotation,
 )
 from thermocald.photogrammetry.epoch.gauss_markov import (
@@ -197,15 +198,7 @@ class AdjustmentSettings:
     @property
     def unknowns(self) -> Index:
         """Positions of the unknowns in `PARAMETER_NAMES`."""
-        return _positions(self.free)
-
-
-@lru_cache(maxsize=64)
-def _positions(free: tuple[str, ...]) -> Index:
-    names = {*free, *EOP_NAMES}
-    rows = np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
-    rows.flags.writeable = False
-    return rows
+        return np.array([*free_columns(self.free), *EOP_COLUMNS], dtype=np.int64)
 
 
 _USUAL = AdjustmentSettings()

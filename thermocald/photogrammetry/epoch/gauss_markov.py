@@ -83,7 +83,6 @@ _ITERATIONS = 30
 _SMALL = 0.3  # standard deviations; after a last step below it, c, x0, y0 are good to 1e-3 px
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
 _SINGULAR = 1e-8  # of a correlation matrix's eigenvalues
-_NO_PRIORS = np.empty(0)
 
 
 class NoConvergenceError(Exception):
@@ -96,7 +95,7 @@ class Problem:
 
     points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
     unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight (u, u), prior_value (u,): parameters
-    observed beforehand, with weight 0 for the others; both empty if there are no priors.
+    observed beforehand, with weight 0 for the others.
     """
 
     sensor: Sensor
@@ -120,7 +119,7 @@ class Problem:
 
         known: values (16,) and covariance (16, 16) of parameters that were observed beforehand.
         """
-        weight = value = _NO_PRIORS
+        weight, value = np.zeros((len(unknowns), len(unknowns))), np.zeros(len(unknowns))
         if known is not None:
             value = known[0][unknowns]
             weight = _weight_of(known[1][np.ix_(unknowns, unknowns)])
@@ -148,9 +147,8 @@ class Problem:
         # flat @ flat.T would be NumPy's symmetric product, three times as slow at this size.
         products = flat[:-1] @ flat.T
         N, gradient = products[:, :-1], products[:, -1]
-        if len(self.prior_weight):
-            N += self.prior_weight
-            gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
+        N += self.prior_weight
+        gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
         return N, gradient, float(residuals @ residuals)
 
     def cost(self, v: Array, values: Array) -> float:
@@ -158,12 +156,8 @@ class Problem:
 
         v: whitened residuals of the points in use; values (16,).
         """
-        flat = v.ravel()
-        square = float(flat @ flat)
-        if len(self.prior_weight):
-            difference = values[self.unknowns] - self.prior_value
-            square += float(difference @ self.prior_weight @ difference)
-        return square
+        flat, difference = v.ravel(), values[self.unknowns] - self.prior_value
+        return float(flat @ flat + difference @ self.prior_weight @ difference)
 
 
 def _weight_of(covariance: Array) -> Array:
@@ -261,12 +255,11 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         whole, size = _whole_step(gradient, root)
         if size < _SMALL:
             return _apply_step(Solution(values, whitened, whitening, root), u, whole)
-        if size < _LINEAR and size < 0.5 * last:
+        near, last = size < _LINEAR and size < 0.5 * last, size
+        if near:
             values = values.copy()
             values[u] += whole
-            last = size
             continue
-        last = size
         cost = problem.cost(whitened[-1][:, use], values)
         for step in _trial_steps(N, u, gradient, whole):
             trial = values.copy()

@@ -109,7 +109,7 @@ def choose_exterior(
     if movement.memory:
         part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
         slowly = f"over about {movement.memory:.0f} epochs"
-        how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
+        how = f", {100 * part:.0f} % of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
         at = f"at row {', '.join(map(str, movement.jumps))}"
         how += f", with jumps {'in a sample of the epochs' if series.windows else at}"
@@ -213,7 +213,8 @@ def result(
     estimate, s, use = replace(estimate, system=system), series.s, system.use
     unit, sigma0, redundancy = series.noise(estimate)
     pooled = series.variance(estimate)
-    if series.shown_share(estimate) < NOISE_SHOWN:
+    noise_shown = series.shown_share(estimate) >= NOISE_SHOWN
+    if not noise_shown:
         unit, sigma0 = np.maximum(unit, pooled), np.maximum(sigma0, np.sqrt(pooled))
     relative, level, trend = all_cofactors(system)
     excess, own, sound = np.zeros(16), system.design.own, system.good
@@ -283,6 +284,7 @@ def result(
         perspective_sd=np.sqrt(pooled) * perspective_cofactor_roots(system),
         field_ratio=float(np.sqrt(series.field_variance)),
         outer_noise=_outer_noise(series, estimate),
+        noise_shown=noise_shown,
         noise_ratio=float(np.median(known)) if len(known) else 1.0,
         affinity=held_affinity,
         movement=movement,
@@ -294,8 +296,13 @@ def result(
 
 
 def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, float]:
-    """Return the noise of the outermost target over that in the image's middle, and its sd."""
+    """Return the noise of the outermost target over that in the image's middle, and its sd.
+
+    NaN if the weights do not follow the targets' own noise.
+    """
     system = estimate.system
+    if series.freedom is None:
+        return float("nan"), float("nan")
     radius = np.linalg.norm(system.design.at.predicted - series.sensor.centre, axis=1)
     tests = point_tests(system, estimate.residuals)
     tests *= np.broadcast_to(series.ratios, (len(radius), 3))[:, 0]

@@ -136,12 +136,13 @@ class SeriesAdjustment:
     memory; perspective_sd (16,): of an epoch with a completely free mount, NaN if the EOP are per
     epoch; field_ratio: estimated over stated standard deviations of the field's coordinates, at
     least 1; outer_noise: noise of the outermost target over that in the image's middle, and its
-    standard deviation; noise_ratio: estimated over stated noise; affinity: of held C1 and C2;
-    movement: of the mount; choice: how the exterior orientation was estimated, and why; slow:
-    errors common to all epochs but for a factor, each as that course (E,) and the covariance (16,
-    16) of a change by 1: slow errors of targets, jumps of the mount; step: the first epoch (row)
-    after targets moved against one another, 0 for none; pairs: of coordinates with correlated
-    errors.
+    standard deviation, NaN if weights do not follow it; noise_shown: whether residuals show the
+    noise rather than the field's errors; noise_ratio: estimated over stated noise; affinity: of
+    held C1 and C2; movement: of the mount; choice: how the exterior orientation was estimated, and
+    why; slow: errors common to all epochs but for a factor, each as that course (E,) and the
+    covariance (16, 16) of a change by 1: slow errors of targets, jumps of the mount; step: the
+    first epoch (row) after targets moved against one another, 0 for none; pairs: of coordinates
+    with correlated errors.
     """
 
     settings: SeriesSettings
@@ -162,6 +163,7 @@ class SeriesAdjustment:
     perspective_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
     field_ratio: float = 1.0
     outer_noise: tuple[float, float] = (float("nan"), float("nan"))
+    noise_shown: bool = True
     noise_ratio: float = 1.0
     affinity: HeldAffinity | None = None
     movement: Movement = STILL

@@ -4,9 +4,8 @@ Source: PNG (ISO/IEC 15948), 11.2.2 IHDR; JPEG (ITU T.81), B.2.2 frame header; T
 
 A JPEG can only be decoded from its start. Restart markers, which many phones and some webcams
 write, divide it into segments that can be decoded separately: those around the targets are joined
-to a smaller JPEG, which any decoder reads. Without them, decoding stops after the last row needed.
-The grey values are exactly those of the whole image, since each block of 8 × 8 px is transformed
-separately and the luminance is not interpolated.
+to a smaller JPEG, which any decoder reads. The grey values are exactly those of the whole image,
+since each block of 8 × 8 px is transformed separately and the luminance is not interpolated.
 
 Source: ITU-T Recommendation T.81, B.2 (markers and headers) and A.2 (order of the blocks).
 
@@ -104,39 +103,53 @@ _WORTH_IT = 0.98  # of the image; beyond, it is decoded as a whole
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """The layout of a JPEG.
+    """The layout of a JPEG with restart markers.
 
-    width, height: px; size_at: where the frame header states them; scan: where the coded bits
-    start; unit: width and height, px, of a minimum coded unit; interval: units between two restart
-    markers, 0 without them.
+    size: width and height, px; size_at: where the frame header states them; scan: where the coded
+    bits start; tile: width and height, px, of the tile that a segment covers; tiles: columns and
+    rows of tiles; coded: height of all minimum coded units, px.
     """
 
-    width: int
-    height: int
+    size: tuple[int, int]
     size_at: int
     scan: int
-    unit: tuple[int, int]
-    interval: int
+    tile: tuple[int, int]
+    tiles: tuple[int, int]
+    coded: int
 
-    @property
-    def units(self) -> tuple[int, int]:
-        """The number of units in a row, and of rows of them."""
-        return -(-self.width // self.unit[0]), -(-self.height // self.unit[1])
 
-    @property
-    def tiles(self) -> tuple[int, int, int, int] | None:
-        """Width and height, px, of the tile that a segment covers, and columns and rows of tiles.
+def _layout(data: bytes) -> _Layout | None:
+    """Return the layout of a sequential JPEG with one scan and restart markers.
 
-        None if segments are neither equal parts of a row of units nor whole rows.
-        """
-        across, down = self.units
-        if across % self.interval == 0:
-            columns = across // self.interval
-            return self.interval * self.unit[0], self.unit[1], columns, down
-        if self.interval % across == 0:
-            rows = self.interval // across
-            return across * self.unit[0], rows * self.unit[1], 1, -(-down // rows)
+    None for others, and if segments are neither equal parts of a row of units nor whole rows.
+    """
+    at = {marker: begin for marker, begin, _ in _segments(data)}
+    frame = next((at[marker] for marker in _BASELINE if marker in at), None)
+    if frame is None or not {_SOS, _DRI} <= at.keys() or (_FRAMES - _BASELINE) & at.keys():
         return None
+
+    def word(place: int) -> int:
+        return int.from_bytes(data[place : place + 2], "big")
+
+    head, interval = at[_SOS], word(at[_DRI] + 4)
+    precision, components = data[frame + 4], data[frame + 9]
+    if precision != 8 or components not in (1, 3) or data[head + 4] != components:
+        return None
+    sampling = [data[frame + 11 + 3 * k] for k in range(components)]
+    wide, high = ([s >> 4 for s in sampling], [s & 15 for s in sampling])
+    height, width = word(frame + 5), word(frame + 7)
+    if max(wide) != wide[0] or max(high) != high[0] or not (height and width and interval):
+        return None
+    # the blocks of a single component are in order, whatever its sampling
+    unit = (8, 8) if components == 1 else (8 * wide[0], 8 * high[0])
+    across, down = -(-width // unit[0]), -(-height // unit[1])
+    if across % interval and interval % across:
+        return None
+    columns, rows = max(across // interval, 1), max(interval // across, 1)
+    return _Layout(
+        (width, height), frame + 5, head + 2 + word(head + 2),
+        (across // columns * unit[0], rows * unit[1]), (columns, -(-down // rows)), down * unit[1],
+    )  # fmt: skip
 
 
 def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | None:
@@ -148,76 +161,26 @@ def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | N
     """
     try:
         layout = _layout(data)
-        if layout is None:
-            return None
-        low, high = np.clip(boxes.reshape(-1, 2, 2), 0, (layout.width, layout.height)).swapaxes(
-            0, 1
-        )
-        seen = (high > low).all(axis=1)
-        if not seen.any():
-            return None
-        low, high = low[seen], high[seen]
-        grey = _by_segments(data, layout, low, high) if layout.interval else None
-        return _upper_rows(data, layout, int(high[:, 1].max())) if grey is None else grey
+        return None if layout is None else _decode_tiles(data, layout, boxes)
     except (IndexError, ValueError):
         return None  # damaged; decoding the whole file reports how
 
 
-def _layout(data: bytes) -> _Layout | None:
-    """Return the layout of a sequential JPEG with one scan; None for others."""
-    at = {marker: begin for marker, begin, _ in _segments(data)}
-    frame = next((at[marker] for marker in _BASELINE if marker in at), None)
-    if frame is None or _SOS not in at or (_FRAMES - _BASELINE) & at.keys():
-        return None
-    head = at[_SOS]
-    scan = head + 2 + int.from_bytes(data[head + 2 : head + 4], "big")
-    restart = at.get(_DRI)
-    interval = 0 if restart is None else int.from_bytes(data[restart + 4 : restart + 6], "big")
-    precision, components = data[frame + 4], data[frame + 9]
-    if precision != 8 or components not in (1, 3) or data[head + 4] != components:
-        return None
-    sampling = [data[frame + 11 + 3 * k] for k in range(components)]
-    across, down = ([s >> 4 for s in sampling], [s & 15 for s in sampling])
-    if max(across) != across[0] or max(down) != down[0]:
-        return None
-    # the blocks of a single component are in order, whatever its sampling
-    unit = (8, 8) if components == 1 else (8 * across[0], 8 * down[0])
-    height, width = (int.from_bytes(data[frame + k : frame + k + 2], "big") for k in (5, 7))
-    if not height or not width:
-        return None
-    return _Layout(width, height, frame + 5, scan, unit, interval)
-
-
-def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> NDArray[np.uint8] | None:
-    """Return the image down to the row `bottom`, undefined below; None if that saves no time."""
-    height = -(-bottom // layout.unit[1]) * layout.unit[1]
-    if height > _WORTH_IT * layout.height:
-        return None
-    grey: NDArray[np.uint8] = scratch("parts", (layout.height, layout.width), np.uint8)
-    file = scratch("file", (len(data),), np.uint8)
-    file[:] = np.frombuffer(data, np.uint8)
-    file[layout.size_at : layout.size_at + 2] = divmod(height, 256)
-    # not strict, since the data after the last row cause a warning
-    simplejpeg.decode_jpeg(file.data, colorspace="GRAY", buffer=grey[:height], strict=False)
-    return grey
-
-
-def _by_segments(
-    data: bytes, layout: _Layout, low: NDArray[np.int64], high: NDArray[np.int64]
+def _decode_tiles(
+    data: bytes, layout: _Layout, boxes: NDArray[np.int64]
 ) -> NDArray[np.uint8] | None:
-    """Return the image, valid where segments meet boxes; None if that saves no time."""
-    if layout.tiles is None:
-        return None
-    tile_width, tile_height, columns, rows = layout.tiles
+    low, high = np.clip(boxes.reshape(-1, 2, 2), 0, layout.size).swapaxes(0, 1)
+    seen = (high > low).all(axis=1)
+    (tile_width, tile_height), (columns, rows) = layout.tile, layout.tiles
     # which tiles meet a box, by cumulative sums of the boxes' corners
-    left, top = (low // (tile_width, tile_height)).T
-    right, bottom = ((high - 1) // (tile_width, tile_height) + 1).T
+    left, top = (low[seen] // layout.tile).T
+    right, bottom = ((high[seen] - 1) // layout.tile + 1).T
     count = np.zeros((rows + 1, columns + 1), dtype=np.int64)
     for y, x, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
         np.add.at(count, (y, x), sign)
     chosen = np.flatnonzero(count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1].ravel() > 0)
     segments = _bits(data, layout, columns * rows)
-    if segments is None or len(chosen) > _WORTH_IT * columns * rows:
+    if segments is None or not 0 < len(chosen) <= _WORTH_IT * columns * rows:
         return None
     row, column = np.divmod(chosen, columns)
     lines = -(-len(chosen) // columns)
@@ -225,7 +188,7 @@ def _by_segments(
     filled = np.r_[chosen, np.repeat(chosen[-1:], lines * columns - len(chosen))]
     width, height = columns * tile_width, lines * tile_height
     if row[-1] == rows - 1:  # the last tiles may have fewer rows of units
-        height -= rows * tile_height - layout.units[1] * layout.unit[1]
+        height -= rows * tile_height - layout.coded
     size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
     parts = [data[: layout.size_at] + size + data[layout.size_at + 4 : layout.scan]]
     for k, i in enumerate(filled.tolist()):
@@ -239,7 +202,7 @@ def _by_segments(
     image.reshape(rows, *shape)[row, :, column] = packed.reshape(lines, *shape)[
         places // columns, :, places % columns
     ]
-    return np.ascontiguousarray(image[: layout.height, : layout.width])
+    return np.ascontiguousarray(image[: layout.size[1], : layout.size[0]])
 
 
 def _bits(data: bytes, layout: _Layout, count: int) -> NDArray[np.int64] | None:

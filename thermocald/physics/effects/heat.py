@@ -10,13 +10,12 @@ from thermocald.errors import DataError
 from thermocald.physics.effect import (
     Effect,
     OfTime,
-    Operated,
     Parameter,
-    Proportional,
     Steady,
     coefficient_units,
     say_estimate,
 )
+from thermocald.physics.formula import OfFormula, Proportional
 from thermocald.physics.history import Follower, History, follow_delay, follow_lag
 from thermocald.physics.operators import interpolation_matrix
 
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from thermocald.physics.effect import Estimates, Values
 
 
-class ThermalLag(Operated):
+class ThermalLag(OfFormula):
     """A first-order lag: L replaces T in the linear terms; τ dL/dt = T - L, L = T at the start.
 
     The body has a lumped capacity: τ = heat capacity × thermal resistance to the thermometer.
@@ -37,7 +36,7 @@ class ThermalLag(Operated):
     """
 
     name = "thermal_lag"
-    operator = "lag"
+    formula = "lag(T, tau)"
     noun = "a thermal lag"
     says = "the camera follows the thermometer with a lag of {tau}"
     kind = "drive"
@@ -106,7 +105,7 @@ class TimeOffset(Effect):
         return interpolation_matrix(p.times, history.times - d) @ p.matrix
 
 
-class ThermalGradient(Operated):
+class ThermalGradient(OfFormula):
     """A signal a dT/dt: the temperature difference across a plate through which heat flows.
 
     The difference bows the plate; in a body that warms steadily it is proportional to the rate.
@@ -114,7 +113,7 @@ class ThermalGradient(Operated):
     """
 
     name = "thermal_gradient"
-    operator = "rate"
+    formula = "rate(T)"
     noun = "a thermal gradient"
     linear: Mapping[str, str] = coefficient_units("(K/s)")
     usual = ("c", "x0", "y0")
@@ -128,10 +127,6 @@ class ThermalGradient(Operated):
         "cycle": "changes its sign between up and down",
         "idle": "does nothing",
     }
-
-    def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
-        """Return the jump of the rate, as of a lamp that is switched between two readings."""
-        return rate_jump
 
 
 class SelfHeating(OfTime):

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.physics.effect import Proportional, Steady, coefficient_units
+from thermocald.physics.effect import Steady, coefficient_units
+from thermocald.physics.formula import Proportional
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,7 +25,7 @@ class NonlinearExpansion(Proportional):
 
     name = "nonlinear_expansion"
     noun = "a quadratic expansion"
-    power = 2
+    formula = "square(offset(T, T0))"
     linear: Mapping[str, str] = coefficient_units("K2")
     steady_signal = Steady((0.0, 0.0, 1.0))
     behaviour: Mapping[str, str] = {

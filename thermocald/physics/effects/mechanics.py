@@ -6,6 +6,7 @@ the test field and its targets.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,13 +15,12 @@ from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics.effect import (
     OfTime,
-    Operated,
     Parameter,
-    Proportional,
     Steady,
     coefficient_units,
     say_estimate,
 )
+from thermocald.physics.formula import Node, OfFormula, Proportional
 from thermocald.physics.history import Follower, History, follow_play
 from thermocald.physics.operators import play_turns
 
@@ -28,13 +28,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
     from thermocald.physics.effect import Estimates, Prediction, Values
 
 
-class Hysteresis(Operated):
+class Hysteresis(OfFormula):
     """A play of half-width r: P = min(max(P, T - r), T + r) replaces T in the linear terms.
 
     P rests until T is r away from it, and then follows; the loop closes. P = T at the start.
@@ -42,7 +41,7 @@ class Hysteresis(Operated):
     """
 
     name = "hysteresis"
-    operator = "play"
+    formula = "play(T, half_width)"
     noun = "hysteresis"
     says = "the way up is not the way down: the camera follows with a play of ± {half_width}"
     kind = "drive"
@@ -64,7 +63,7 @@ class Hysteresis(Operated):
         return play_turns(p.times, p.values, half_width, history.times)
 
 
-class Softening(Operated):
+class Softening(OfFormula):
     """A signal a max(T - T_k, 0): a second slope above the knee T_k.
 
     Source: the expansion of a polymer is two straight lines that meet at the glass transition (ISO
@@ -72,7 +71,7 @@ class Softening(Operated):
     """
 
     name = "softening"
-    operator = "above"
+    formula = "above(T, T_k)"
     noun = "softening"
     says = "something gives way above {T_k}"
     nonlinear: Mapping[str, Parameter] = {
@@ -93,7 +92,7 @@ class Softening(Operated):
         return Steady(knee=float(values["T_k"]), knee_name="T_k")
 
 
-class PermanentSet(Operated):
+class PermanentSet(OfFormula):
     """A signal a (max of T so far - T₀), from the start of the series on.
 
     Source: the reference study found it in the RPi camera v2.1 (Elias et al. 2020, Sensors 20, 643,
@@ -101,7 +100,7 @@ class PermanentSet(Operated):
     """
 
     name = "permanent_set"
-    operator = "maximum"
+    formula = "offset(maximum(T), T0)"
     noun = "a permanent set"
     linear: Mapping[str, str] = coefficient_units("K")
     usual = ("c", "x0", "y0")
@@ -115,9 +114,6 @@ class PermanentSet(Operated):
         "rate": "is the same at any rate",
         "idle": "does nothing",
     }
-
-    def signal(self, history: History, **_: Any) -> Array:
-        return (self.drive(history) - history.T0)[:, None]
 
 
 class Creep(OfTime):
@@ -176,7 +172,7 @@ class HousingTilt(Proportional):
     }  # fmt: skip
 
 
-class MountMotion(Operated):
+class MountMotion(OfFormula):
     """A signal a (L - T₀) in the exterior orientation; τ dL/dt = T - L, L = T at the start.
 
     Without tau, or with tau = 0, L is T. A bracket of length l and expansion α shifts the camera by
@@ -185,7 +181,7 @@ class MountMotion(Operated):
     """
 
     name = "mount_motion"
-    operator = "lag"
+    formula = "offset(lag(T, tau), T0)"
     noun = "a motion of the mount"
     nonlinear: Mapping[str, Parameter] = {
         "tau": Parameter("s", 2.0, 3000.0, 300.0, log=True, role="time_constant")
@@ -202,14 +198,9 @@ class MountMotion(Operated):
         "shade": "moves the image of any field by the same amount",
     }
 
-    def signal(self, history: History, tau: float = 0.0, **_: Any) -> Array:
-        lagged = self.drive(history, tau=tau) if tau > 0 else history.temperature()
-        return (lagged - history.T0)[:, None]
-
-    def sensitivity(self, history: History, tau: float = 0.0, **_: Any) -> csr_array:
-        if tau > 0:
-            return super().sensitivity(history, tau=tau)
-        return history.temperature_matrix()
+    def bound(self, history: History, tau: float = 0.0, **_: Any) -> Node:
+        node = super().bound(history, tau=tau)
+        return node if tau > 0 else replace(node, inputs=node.inputs[0].inputs)  # without the lag
 
     def sentence(self, estimates: Estimates) -> str:
         moved = ", ".join(f"{k} = {say_estimate(e)}" for k, e in estimates.items() if k != "tau")

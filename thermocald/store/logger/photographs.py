@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
+from thermocald.names import file_name
 from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
@@ -367,6 +368,7 @@ def read_series(
         reading = f"{at_frame[i]:.3f} °C" if known[i] else "no temperature"
         notes.append(f"  {placed[i].path.name}  {iso(times[i])}  {reading}")
     thermometers = dict.fromkeys(channels, Channel())
+    series = file_name(series, "series", UsageError)
     head = Head(f"{spec.name}-{series}", series, max(interval, 0.001), spec, thermometers)
     none = np.empty((0, 3))
     field = TestField.build((), none, none, (), (), ()) if testfield is None else testfield

@@ -7,23 +7,23 @@ Apache Parquet is read ten times as fast as CSV and has a third of its size; the
 same to the bit. It needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk of it has the
 interface of a CSV table's chunk, so both pass the same checks.
 
-A CSV file that is too long for memory is read several times by some analyses. At the second time
-its text is parsed into a Parquet copy in the folder of the user's cache.
+A CSV file that is too long for memory is read several times by an analysis. Its text is parsed only
+once, into a Parquet copy in the user's cache, found by the text's path, inode, size and time.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import shutil
-import weakref
+import time
 from bisect import bisect_left, bisect_right
-from contextlib import ExitStack
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -52,6 +52,7 @@ _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 LONG_FROM_BYTES = 100_000_000
 _ROWS = 1 << 18
 _CHUNKS_IN_GROUP = 32  # of rows that are written together
+_KEPT_DAYS = 14.0  # since a copy was last read
 
 log = logging.getLogger(__name__)
 
@@ -111,9 +112,9 @@ class ObservationFile:
         self, path: Path, field: TestField, numbers: NDArray[np.int64], sensor: Sensor
     ) -> None:
         is_text = path.suffix != ".parquet"
-        self._table = (Table if is_text else ParquetTable)(path, REQUIRED)
+        table = (Table if is_text else ParquetTable)(path, REQUIRED)
         self.is_long = path.stat().st_size >= LONG_FROM_BYTES
-        self._was_read = False
+        self._table = _parse_once(table) if is_text and self.is_long else table
         self._field, self._numbers, self._sensor = field, numbers, sensor
         self._has_covariances = "sxy" in self._table.columns
         extras = [n for n in self._table.columns if n not in {*REQUIRED, "sxy", ""}]
@@ -165,9 +166,6 @@ class ObservationFile:
         if not self.is_long:
             yield from ((self._whole, window.start, window.stop) for window in every)
             return
-        if self._was_read and type(self._table) is Table:
-            self._table = _parse_once(self._table)
-        self._was_read = True
         columns = [*REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
         # text is read once for all windows
         seeks = isinstance(self._table, ParquetTable)
@@ -351,28 +349,46 @@ class ColumnChunk(Chunk):
 
 
 def _parse_once(table: Table) -> Table:
-    """Return a binary copy of a text table, in a file without a name that ends with its reader.
+    """Return the binary copy of a text table from the user's cache; write it if there is none.
 
     Without pyarrow or space on the disk, or if something in the text is wrong, the table itself is
     returned: reading it then reports it.
     """
     try:
-        # /tmp may be in memory
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thermocald"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if shutil.disk_usage(folder).free < 2 * table.path.stat().st_size:
-            return table
-        with ExitStack() as kept:
-            path = Path(f"/dev/fd/{kept.enter_context(TemporaryFile(dir=folder)).fileno()}")
-            _write(path, _typed(table, lambda _: None))
-            copy = ParquetTable(path, REQUIRED, table)
-            weakref.finalize(copy, kept.pop_all().close)
-            return copy
+        found = table.path.stat()
+        key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
+        folder = _cache()
+        copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
+        if copy.exists():
+            with suppress(OSError):  # a cache that is read-only
+                os.utime(copy)
+        else:
+            for old in folder.glob("*.parquet"):
+                with suppress(OSError):
+                    if old.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
+                        old.unlink()
+            if shutil.disk_usage(folder).free < 2 * found.st_size:
+                return table
+            partial = copy.with_name(f"{copy.stem}-{os.getpid()}.parquet")
+            try:
+                _write(partial, _typed(table, lambda _: None))
+                partial.replace(copy)
+            finally:
+                partial.unlink(missing_ok=True)
+        return ParquetTable(copy, REQUIRED, table)
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
     except (OSError, RuntimeError, ValueError, RecordingError) as cause:  # pyarrow, or no home
         log.debug("%s has no binary copy: %s", table.path, cause)
     return table
+
+
+def _cache() -> Path:
+    """Return the user's folder of copies. Raises OSError or RuntimeError if there is none."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "thermocald"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return folder
 
 
 def _write(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:

@@ -286,6 +286,12 @@ def test_a_prediction_is_the_camera_and_is_held_against_series(camera, M1, world
     assert str(tc.predict(camera, test=[M1])) == said.strip().replace("M1:", f"{world / 'M1'}:")
 
 
+def test_one_point_is_corrected(camera, world, tmp_path):
+    head, first, *_ = (world / "points.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "one.csv").write_text(head + first)
+    assert "1 point corrected" in str(tc.correct(tmp_path / "one.csv", camera, log=world / "M1"))
+
+
 def test_calibrations_at_two_temperatures_give_the_camera_back(camera, world):
     found = tc.fit_calibrations({str(world / "cold.json"): 26.0, str(world / "warm.json"): 45.0})
 

@@ -20,8 +20,10 @@ from tests.pictures import (
     TAKEN,
     save_photograph,
 )
-from thermocald.errors import ThermocaldError
+from thermocald.errors import DataError, ThermocaldError
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.logger.dialect import log_options
+from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.testfield_file import write_testfield
 
@@ -280,16 +282,13 @@ def test_what_the_logger_did_not_measure_is_left_empty(place, values, left):
     ],
 )
 @pytest.mark.parametrize("back", [False, True])
-def test_a_unit_that_changes_midway_is_refused(place, later, words, back):
+def test_a_unit_that_changes_midway_is_refused(tmp_path, later, words, back):
     values = [21.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6]
     mixed = [v if i < 4 else round(later(v), 2) for i, v in enumerate(values)]
-    log_of(place, mixed[::-1] if back else mixed)
-    with pytest.raises(ThermocaldError) as caught:
-        run(*arguments(place, "--timezone", "Europe/Berlin"))
-    said = str(caught.value)
-    assert "log.csv, line 6, column 'Temperature': the unit seems to change" in said
-    assert back or words in said
-    assert "--unit" in said
+    log_of(tmp_path, mixed[::-1] if back else mixed)
+    where = "log.csv, line 6, column 'Temperature': the unit seems to change"
+    with pytest.raises(DataError, match=f"{where}{'' if back else f' {words}'}.*--unit"):
+        read_log(tmp_path / "log.csv", log_options(timezone="Europe/Berlin"))
 
 
 def test_a_unit_that_is_stated_is_taken(place):

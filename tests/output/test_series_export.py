@@ -106,7 +106,7 @@ def test_unknown_columns_of_a_recording_are_extra(recording, tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("mm", "seconds", ",", "."), "--units mm"),
+        (("mm", "seconds", ",", "."), "--units mm: must be one of"),
         (("", "local", ",", "."), "--time local"),
         (("", "iso", "x", "."), "--separator x"),
         (("", "iso", ",", ","), "needs another --separator"),

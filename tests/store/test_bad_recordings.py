@@ -108,14 +108,8 @@ def in_metres(path) -> None:
     path.write_text("\n".join([header, *map(",".join, metres)]) + "\n")
 
 
-def in_kelvin(path) -> None:
-    for line in range(2, 7):
-        set_field(path, line, "temperature", "294.5")
-
-
-def at_one_time(path) -> None:
-    for line in range(2, 7):
-        set_field(path, line, "frame_time", "1600000000")
+def in_every_row(column: str, value: str):
+    return lambda path: [set_field(path, line, column, value) for line in range(2, 7)]
 
 
 def without_its_end(path) -> None:
@@ -124,12 +118,13 @@ def without_its_end(path) -> None:
 
 # a file, its damage, part of the message
 FILES = {
-    "kelvin": ("epochs.csv", in_kelvin, r"kelvin: subtract 273\.15"),
+    "kelvin": ("epochs.csv", in_every_row("temperature", "294.5"), r"kelvin: subtract 273\.15"),
     "kelvin in every reading": (
         "readings.csv", lambda path: path.write_text(
             "time,temperature,board_temperature\n1600000000,20,294.5\n1600000001,20,294.6\n"),
         r"line 2, column board_temperature: seems to be in kelvin"),
-    "one time": ("epochs.csv", at_one_time, "all epochs have the same time"),
+    "one time": (
+        "epochs.csv", in_every_row("frame_time", "1600000000"), "all epochs have the same time"),
     "semicolons": (
         "epochs.csv", lambda path: path.write_text(path.read_text().replace(",", ";")),
         "separate the columns with commas"),

@@ -13,7 +13,7 @@ from thermocald.store.database import columns
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
 
-EPOCHS = 40
+EPOCHS = 36
 NAMES = ["epoch", "frame_time", "c", "sd_x0", "status", "temperature", "blur"]
 
 
@@ -58,7 +58,7 @@ def test_a_flipped_bit_is_never_given_out(whole, store_path, caplog):
     truth = content(store_path)
     rng = np.random.default_rng(17)
     silent, unseen = [], []
-    for _ in range(80):
+    for _ in range(50):
         at, bit = int(rng.integers(len(whole))), int(rng.integers(8))
         data = bytearray(whole)
         data[at] ^= 1 << bit

@@ -32,6 +32,9 @@ def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):
     assert np.array_equal(stored.result.sd, result.sd)
     assert (stored.result.status, stored.result.rejected) == ("ok", (1, 5))
     assert (stored.extra, stored.clock_trusted, stored.revision) == ({"blur": 3.5}, True, 0)
+    covariances = store.covariances(series, [3, 7, 99])
+    assert np.array_equal(covariances[1], result.covariance)
+    assert np.isnan(covariances[2]).all()
 
 
 def test_columns_have_names_and_nan_where_nothing_is(filled, make_result):
@@ -60,13 +63,6 @@ def test_fixed_parameters_have_no_sd(filled, make_result):
     assert columns["C1"][-1] == 1.0
     assert np.isnan(columns["sd_C1"][-1])
     assert columns["sd_C2"][-1] > 0
-
-
-def test_covariances_by_number(filled, make_result):
-    store, series = filled
-    covariances = store.covariances(series, [3, 11, 99])
-    assert np.array_equal(covariances[1], make_result(11).covariance)
-    assert np.isnan(covariances[2]).all()
 
 
 @pytest.mark.parametrize("number", [20, 5])

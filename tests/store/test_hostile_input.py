@@ -14,7 +14,7 @@ from thermocald.store.recording.testfield_file import read_testfield
 
 FILES = ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
 QUICK = settings(
-    max_examples=40,
+    max_examples=25,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

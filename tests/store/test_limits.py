@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.cli.test_import import photograph
+from tests.store.test_bad_recordings import edit
 from thermocald.cli.common import printable
 from thermocald.errors import (
     ConfigurationError,
@@ -28,28 +29,6 @@ from thermocald.store.logger.photographs import find_copies, read_photograph
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield
-
-HEAD = """format: thermocald-recording/1
-name: x
-series: M1
-interval: 10
-camera: {name: c, width: 640, height: 480, pixel_pitch: 0.003}
-temperatures: {housing: {unit: degC}}
-"""
-FIELD = "target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
-    f"{i},{100 * (i % 2)},{100 * (i // 2)},0,10,0.1,0.1,0.1\n" for i in range(4)
-)
-EPOCHS = "epoch,frame_time,temperature_time,housing,frame\n1,10,10,{},\n2,20,20,{},\n"
-
-
-@pytest.fixture
-def recording(tmp_path):
-    (tmp_path / "recording.yaml").write_text(HEAD)
-    (tmp_path / "testfield.csv").write_text(FIELD)
-    (tmp_path / "epochs.csv").write_text(EPOCHS.format("21.5", "21.6"))
-    (tmp_path / "observations.csv").write_text("epoch,target,x,y,sx,sy\n1,0,5,5,1,1\n")
-    read_recording(tmp_path)
-    return tmp_path
 
 
 def png_of_nothing(width, height):
@@ -102,11 +81,11 @@ def test_a_field_of_twenty_thousand_targets_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "name", ["observations.csv", "epochs.csv", "testfield.csv", "recording.yaml"]
 )
-def test_links_to_devices_are_refused(recording, name):
-    (recording / name).unlink()
-    os.symlink("/dev/zero", recording / name)
+def test_links_to_devices_are_refused(recording_path, name):
+    (recording_path / name).unlink()
+    os.symlink("/dev/zero", recording_path / name)
     with pytest.raises((RecordingError, TestFieldError), match=r"is not a file|is missing"):
-        read_recording(recording)
+        read_recording(recording_path)
 
 
 @pytest.mark.parametrize(
@@ -118,11 +97,11 @@ def test_deep_yaml_is_refused(tmp_path, text):
         read_yaml(tmp_path / "x.yaml")
 
 
-def test_a_width_of_ten_to_the_400_is_refused(recording, tmp_path):
+def test_a_width_of_ten_to_the_400_is_refused(recording_path, tmp_path):
     huge = "1" + "0" * 400
-    (recording / "recording.yaml").write_text(HEAD.replace("640", huge))
+    edit(recording_path / "recording.yaml", "3280", huge)
     with pytest.raises(RecordingError, match=r"camera\.width"):
-        read_recording(recording)
+        read_recording(recording_path)
     (tmp_path / "camera.yaml").write_text(f"width: {huge}\nheight: 480\npixel_pitch: 0.003\n")
     with pytest.raises(ConfigurationError, match="key width"):
         read_camera(tmp_path / "camera.yaml")
@@ -130,15 +109,16 @@ def test_a_width_of_ten_to_the_400_is_refused(recording, tmp_path):
         number(10**400, "fx")
 
 
-def test_names_that_a_terminal_would_obey_are_refused_or_shown_as_codes(recording):
-    (recording / "recording.yaml").write_text(HEAD.replace("name: x", 'name: "x\\e[2J"'))
-    with pytest.raises(RecordingError, match="printable") as refused:
-        read_recording(recording)
-    assert "\x1b" not in str(refused.value)
-    (recording / "recording.yaml").write_text(HEAD)
-    (recording / "testfield.csv").write_text(FIELD.replace("\n0,", "\n0\x1b[2J,"))
-    with pytest.raises(TestFieldError, match="printable") as refused:
-        read_recording(recording)
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [("recording.yaml", "name: small", 'name: "x\\\\e[2J"'), ("testfield.csv", "t1", "t1\x1b[2J")],
+)
+def test_names_that_a_terminal_would_obey_are_refused_or_shown_as_codes(
+    recording_path, name, old, new
+):
+    edit(recording_path / name, old, new)
+    with pytest.raises((RecordingError, TestFieldError), match="printable") as refused:
+        read_recording(recording_path)
     assert "\x1b" not in str(refused.value)
     assert printable("a\x1b[31mb\x9b°\nc") == "a\\x1b[31mb\\x9b°\nc"
 

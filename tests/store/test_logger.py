@@ -87,12 +87,6 @@ VENDORS = {
     "months as words": (
         b'Timestamp,Temperature (C)\n"Jun 14, 2026 12:00 PM",21.5\n"Jun 14, 2026 12:01 PM",21.75\n'
     ),
-    # Campbell Scientific TOA5: four lines of header, all in quotes
-    "TOA5": (
-        b'"TOA5","box","CR300","1234","CR300.Std.10","CPU:box.CR3","55","Table1"\n'
-        b'"TIMESTAMP","RECORD","BattV","AirTC"\n"TS","RN","Volts","Deg C"\n"","","Min","Avg"\n'
-        b'"2026-06-14 12:00:00",1,12.9,21.5\n"2026-06-14 12:01:00",2,12.9,21.75\n'
-    ),
     # T&D Thermo Recorder: the time again as a spreadsheet's day number
     "T&D Ondotori": (
         b'"Date/Time","Date/Time","No.1"\n"","","Temp.(C)"\n'
@@ -368,11 +362,9 @@ TWO = """"Plot Title: x"
 
 
 def test_columns_are_called_as_their_owner_calls_them(tmp_path):
-    path = tmp_path / "hobo.csv"
-    path.write_text(TWO, encoding="utf-8")
-    assert list(read_log(path, LogOptions(clock=BERLIN)).channels) == ["housing", "Temp"]
-    given = log_options(timezone="Europe/Berlin", name=["Temp, °C (LGR S/N: 1, SEN S/N: 2)=相机"])
-    assert list(read_log(path, given).channels) == ["housing", "相机"]
+    assert list(logged(tmp_path, TWO).channels) == ["housing", "Temp"]
+    given = log_options(name=["Temp, °C (LGR S/N: 1, SEN S/N: 2)=相机"]).names
+    assert list(logged(tmp_path, TWO, names=given).channels) == ["housing", "相机"]
 
 
 @pytest.mark.parametrize(
@@ -380,10 +372,8 @@ def test_columns_are_called_as_their_owner_calls_them(tmp_path):
                         ("lens=x", "no column 'lens'")]
 )  # fmt: skip
 def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
-    path = tmp_path / "hobo.csv"
-    path.write_text(TWO, encoding="utf-8")
     with pytest.raises((UsageError, DataError), match=words):
-        read_log(path, log_options(timezone="Europe/Berlin", name=[name]))
+        logged(tmp_path, TWO, names=log_options(name=[name]).names)
 
 
 @pytest.mark.parametrize(
@@ -400,12 +390,8 @@ def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
 )
 def test_the_unit_is_found_in_any_head(tmp_path, head):
     """If the head is not found, °F is read as °C."""
-    path = tmp_path / "log.csv"
     rows = "".join(f"2026-06-14 12:0{i}:00,{70 + i}.25\n" for i in range(6))
-    path.write_text(f"{head}\n{rows}", encoding="utf-8")
-    (values,) = read_log(
-        path, LogOptions(clock=DeviceClock(zone=time_zone("UTC")))
-    ).channels.values()
+    (values,) = logged(tmp_path, f"{head}\n{rows}").channels.values()
     assert values == pytest.approx((np.arange(70.25, 76) - 32) / 1.8)
 
 
@@ -522,34 +508,35 @@ def test_a_row_that_is_cut_off_is_left_out(tmp_path):
     assert "the last row is cut off" in found.notes[-1]
 
 
-def test_rows_without_seconds_are_doubtful(tmp_path):
-    found = read(
-        tmp_path,
-        ["time,T °C"],
-        lambda m, t, i: f"{START + timedelta(seconds=60 * (i // 6)):%Y-%m-%d %H:%M},{t}",
-    )
-    assert "doubtful: 10 rows with the time of the row before" in found.notes[-1]
-    assert "the times have no seconds" in found.notes[-1]
+DOUBTFUL = {
+    "no seconds": (
+        "T °C", lambda m, t, i: f"{START + timedelta(seconds=60 * (i // 6)):%Y-%m-%d %H:%M},{t}",
+        "doubtful: 10 rows with the time of the row before: left out; the times have no seconds"),
+    "hours without AM and PM": (
+        "T °C", lambda m, t, i: f"{m - timedelta(minutes=60):%d.%m.%Y %I:%M},{t}",
+        "run back 1 time, the first by 43140 s"),
+    **{f"no unit: {head}": (
+        head, lambda m, t, i: f"{int(m.timestamp())},{1.8 * t + 32:.2f}",
+        "70.7 is taken as °C; if it is °F, it is 21.5 °C: give --unit")
+       for head in ("temp", "T1", "Sensor 1", "value")},
+    # nothing but what a thermometer gives without a measurement
+    **{value: (
+        "temp °C", lambda m, t, i, value=value: f"{int(m.timestamp())},{value}",
+        f"all 12 readings are {float(value):g} °C")
+       for value in ("85.00", "0.0", "127.94", "-40.0", "125.00", "-45.00")},
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("head", ["temp", "T1", "Sensor 1", "value"])
-def test_fahrenheit_without_a_unit_is_doubtful(tmp_path, head):
-    def row(m, t, i):
-        return f"{int(m.timestamp())},{1.8 * t + 32:.2f}"
-
+@pytest.mark.parametrize("name", DOUBTFUL)
+def test_what_is_doubtful_is_told(tmp_path, name):
+    head, row, words = DOUBTFUL[name]
     found = read(tmp_path, [f"time,{head}"], row)
     (note,) = [note for note in found.notes if "doubtful" in note]
-    assert "70.7 is taken as °C; if it is °F, it is 21.5 °C: give --unit" in note
-    found = read(tmp_path, [f"time,{head}"], row, "degF")
-    assert not [note for note in found.notes if "doubtful" in note]
-    assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)
-
-
-@pytest.mark.parametrize("value", ["85.00", "0.0", "127.94", "-40.0", "125.00", "-45.00"])
-def test_a_log_of_nothing_but_what_is_no_measurement_is_doubtful(tmp_path, value):
-    found = read(tmp_path, ["time,temp °C"], lambda m, t, i: f"{int(m.timestamp())},{value}")
-    (note,) = [note for note in found.notes if "doubtful" in note]
-    assert f"all 12 readings are {float(value):g} °C" in note
+    assert words in note
+    if "no unit" in name:
+        found = read(tmp_path, [f"time,{head}"], row, "degF")
+        assert not [note for note in found.notes if "doubtful" in note]
+        assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)
 
 
 @pytest.mark.parametrize("head", ["Temp housing", "T1", "Settle tank T", "spot temp"])
@@ -577,26 +564,18 @@ def test_a_column_of_another_quantity_is_no_temperature(tmp_path, head):
     assert list(found.channels) == ["Temp"]
 
 
-def test_hours_without_am_and_pm_are_doubtful(tmp_path):
-    found = read(
-        tmp_path, ["time,T °C"], lambda m, t, i: f"{m - timedelta(minutes=60):%d.%m.%Y %I:%M},{t}"
-    )
-    (note,) = [note for note in found.notes if "doubtful" in note]
-    assert "run back 1 time, the first by 43140 s" in note
-
-
-def test_rows_before_the_clock_was_set_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"line 4, column 'time': is 26 years after the row before"):
-        read(
-            tmp_path,
-            ["time,T °C"],
-            lambda m, t, i: f"{m.replace(year=2026 if i > 1 else 2000):%Y-%m-%d %H:%M},{t}",
-        )
-
-
-def test_a_time_of_unknown_form_is_shown(tmp_path):
-    with pytest.raises(DataError, match=r"as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"):
-        read(tmp_path, ["time,T °C"], lambda m, t, i: f"{m:%H:%M},{t}")
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (lambda m, t, i: f"{m.replace(year=2026 if i > 1 else 2000):%Y-%m-%d %H:%M},{t}",
+         r"line 4, column 'time': is 26 years after the row before"),
+        (lambda m, t, i: f"{m:%H:%M},{t}",
+         r"as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"),
+    ],
+)  # fmt: skip
+def test_what_is_no_time_is_refused(tmp_path, row, words):
+    with pytest.raises(DataError, match=words):
+        read(tmp_path, ["time,T °C"], row)
 
 
 def test_the_minus_of_scandinavian_spreadsheets_is_one(tmp_path):

@@ -80,6 +80,8 @@ def test_text_that_cannot_be_read_is_not_converted(recording_path):
     done = call("convert", recording_path, "--to", "parquet")
     assert "line 2, column x: '1,5' is not a number; write decimals with a point" in done.stderr
     assert (done.returncode, csv.read_text()) == (1, text)
+    csv.write_text(f"{head}\n")
+    assert "holds no observations" in call("convert", recording_path, "--to", "parquet").stderr
     csv.write_text("\n".join(["", head, first, *rest]))
     before = read_recording(recording_path)
     convert(recording_path, "parquet")

@@ -240,7 +240,7 @@ def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     first = list(open_recording(recording_path).iter_epochs())
     assert len(list(long_from_nothing.glob("*.parquet"))) == 1
-    monkeypatch.setattr(observation_file, "_parse", None)
+    monkeypatch.setattr(observation_file, "_typed", None)
     second = list(open_recording(recording_path).iter_epochs())
     for a, b, c in zip(from_text, first, second, strict=True):
         assert same(a.observations, b.observations)
@@ -264,8 +264,8 @@ def test_a_copy_says_where_the_text_is_wrong(
     recording_path, long_from_nothing, column, value, words
 ):
     """An error found in the binary copy names the line of the text."""
-    set_field(recording_path / "observations.csv", 4, column, value)
-    with pytest.raises(RecordingError, match=r"observations\.csv, line 4") as error:
+    set_field(recording_path / "observations.csv", 40, column, value)
+    with pytest.raises(RecordingError, match=r"observations\.csv, line 40") as error:
         list(open_recording(recording_path).iter_epochs())
     assert words in str(error.value)
 

@@ -157,9 +157,6 @@ DOUBTS = {
     "a thermometer in another time zone": (
         lambda p: change(p, "epochs.csv", temperature_time=scaled(1, 3600)),
         "read 3600 s after their frames"),
-    "a thermometer whose clock is a day late": (
-        lambda p: change(p, "epochs.csv", temperature_time=scaled(1, -86400)),
-        "read 86400 s before their frames"),
     "°F from the beginning": (
         lambda p: change(p, "epochs.csv", temperature=scaled(1.8, 32)), "are they °F?"),
     "nothing but 85.00": (
@@ -171,7 +168,7 @@ DOUBTS = {
 }  # fmt: skip
 
 
-REPLAYED = ("the pixels of a binned mode", "85.00 of a DS18B20", "°C, then °F")
+REPLAYED = ("the pixels of a binned mode", "85.00 of a DS18B20")
 
 
 @pytest.mark.parametrize("name", DOUBTS)
@@ -266,7 +263,7 @@ def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_pat
         DOUBTS[name][0](recording)
         messages.append(DOUBTS[name][1])
     series = tc.open(recording)
-    results = (tc.study(series, sets=100), tc.fit(series), tc.discover(series))
+    results = (tc.study(series, sets=20), tc.fit(series), tc.discover(series))
     results[0].report(tmp_path / "study.html")
     results[2].report(tmp_path / "discovery.html")
     results[1].report(tmp_path / "fit.html")

@@ -38,7 +38,7 @@ def test_every_flip_that_loses_epochs_is_reported(crashed):
     wal = crashed.with_name(f"{crashed.name}-wal")
     whole, database = wal.read_bytes(), crashed.read_bytes()
     rng = np.random.default_rng(3)
-    for _ in range(25):
+    for _ in range(15):
         data = bytearray(whole)
         data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
         crashed.write_bytes(database)

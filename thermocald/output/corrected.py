@@ -93,7 +93,8 @@ class Correction(Result):
         if not self.points:
             return [f"{self.path}: not corrected yet; write(path) does it"]
         moved, rest = self._rms(self._moved), self._rms(self._left_over)
-        return [f"{self.points} points corrected by {moved:.3f} px (RMS); {left} {rest:.3f} px"]
+        corrected = counted(self.points, "point")
+        return [f"{corrected} corrected by {moved:.3f} px (RMS); {left} {rest:.3f} px"]
 
     def write(self, out: Path | str, advance: Callable[[int], None] | None = None) -> None:
         """Write the corrected CSV, or the corrected images into a folder.

@@ -64,7 +64,9 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
     wanted = [u.strip() for u in units.split(",") if u.strip()]
     for unit in wanted:
         if unit not in UNITS:
-            raise UsageError(f"--units {unit}: must be of {', '.join(UNITS)}, separated by commas")
+            raise UsageError(
+                f"--units {unit}: must be one of {', '.join(UNITS)}; separate several by commas"
+            )
     if time not in ("seconds", "iso"):
         raise UsageError(f"--time {time}: must be seconds or iso")
     mark = {"tab": "\t", "\\t": "\t"}.get(separator, separator)

@@ -222,8 +222,8 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
         raise StoreError(f"{path}: {doing}: the store is damaged ({cause})") from cause
 
 
-def _name(cause: sqlite3.Error) -> str:
-    """Return SQLite's name of an error, such as SQLITE_IOERR_WRITE; empty if Python raised it."""
+def _name(cause: BaseException) -> str:
+    """Return SQLite's name of an error, such as SQLITE_IOERR_WRITE; empty for others."""
     return getattr(cause, "sqlite_errorname", "") or ""
 
 
@@ -272,20 +272,16 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
 
 
 def _open(path: Path, mode: Mode) -> sqlite3.Connection:
-    if mode == "append":
-        return _connect(path, "rwc")
-    connection = _connect(path, "ro")
+    connection = _connect(path, "rwc" if mode == "append" else "ro")
     try:
-        connection.execute("SELECT 1 FROM sqlite_master").fetchone()
-    except sqlite3.OperationalError as cause:
+        if mode == "read":
+            connection.execute("SELECT 1 FROM sqlite_master").fetchone()
+    except BaseException as cause:
         connection.close()
         # WAL's helper files cannot be created if the folder is read-only
         if not _name(cause).startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY")):
             raise
         return open_copy(path)
-    except BaseException:
-        connection.close()
-        raise
     return connection
 
 

@@ -148,6 +148,10 @@ class LoggerFile:
         place = self.names.index(name)
         return [row[place] for row in self.sample]
 
+    def of_kind(self, *kinds: str) -> list[str]:
+        """Return the names of the columns that hold one of some kinds of values, see `_kind`."""
+        return [name for name in self.names if _kind(self.column(name)) in kinds]
+
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield each row with its line, with one field per name; missing ones are empty."""
         width = len(self.names)
@@ -439,17 +443,13 @@ def require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tu
 def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if options.times:
         return require_columns(file, options.times, "--time-column")
-    kinds = {name: _kind(file.column(name)) for name in file.names}
-    ours = [n for n in OUR_TIMES if kinds.get(n) in ("number", "seconds")]
-    moments = [n for n, kind in kinds.items() if kind == "moment"]
-    moments += [n for n, kind in kinds.items() if kind == "seconds" and TIME_NAME.search(n)]
-    if ours or moments:
-        return ((ours or moments)[0],)
-    dates = [n for n, kind in kinds.items() if kind == "date"]
-    clocks = [n for n, kind in kinds.items() if kind == "time"]
+    numeric, seconds = file.of_kind("number", "seconds"), file.of_kind("seconds")
+    found = [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
+    if found := found or list(filter(TIME_NAME.search, seconds)):
+        return (found[0],)
+    dates, clocks = file.of_kind("date"), file.of_kind("time")
     if dates and clocks:
         return (dates[0], clocks[0])
-    seconds = [n for n, kind in kinds.items() if kind == "seconds"]
     if len(seconds) == 1:
         return (seconds[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in file.names)
@@ -477,20 +477,16 @@ def find_date_order(
         return None, []
     places = [file.names.index(name) for name in names]
     first = last = ""
-    orders: set[str] = set()
-    same = True
+    pairs: set[tuple[int, int]] = set()
     for _, row in file.rows():
-        found = day_and_month(row[places[0]])
-        if found is None:
-            continue
-        last = " ".join(row[place] for place in places)
-        first = first or last
-        same &= found[0] == found[1]
-        if max(found) > 12:
-            orders.add("dmy" if found[0] > 12 else "mdy")
+        if found := day_and_month(row[places[0]]):
+            pairs.add(found)
+            last = " ".join(row[place] for place in places)
+            first = first or last
+    orders = {"dmy" if a > 12 else "mdy" for a, b in pairs if max(a, b) > 12}
     if len(orders) == 1:
         return orders.pop(), []
-    if same:
+    if all(a == b for a, b in pairs):
         return "dmy", []
     if not orders:
         spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in _WORDS}
@@ -529,11 +525,7 @@ def find_temperature_columns(
     if options.temperatures:
         return require_columns(file, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
-    numeric = [
-        name
-        for name in file.names
-        if name not in times and _kind(file.column(name)) in ("number", "seconds")
-    ]
+    numeric = [n for n in file.of_kind("number", "seconds") if n not in times]
     of_name = [n for n in numeric if _TEMPERATURE_NAME.search(n)]
     plain = [n for n in of_name if not OTHER_NAME.search(n)]
     # a mean is a reading unless it is one of another column

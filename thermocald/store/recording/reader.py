@@ -142,21 +142,18 @@ class Recording:
         rows = range(len(self))[window]
         part = slice(rows.start, rows.stop)
         seen = self._observation_file.stream(part) if self.has_observations else repeat(None)
-        for i, observations in zip(rows, seen, strict=False):
-            yield self._epoch(i, observations)
-
-    def _epoch(self, i: int, observations: Observations | None) -> Epoch:
         columns = self.columns
-        frame = columns.frames[i]
-        return Epoch(
-            number=int(columns.numbers[i]),
-            frame_time=float(columns.frame_time[i]),
-            temperature_time=float(columns.temperature_time[i]),
-            temperatures={name: float(t[i]) for name, t in columns.temperatures.items()},
-            frame=self.path / frame if frame else None,
-            observations=observations,
-            note="" if frame or observations is not None else "neither frame nor observations",
-        )
+        for i, observations in zip(rows, seen, strict=False):
+            frame = columns.frames[i]
+            yield Epoch(
+                number=int(columns.numbers[i]),
+                frame_time=float(columns.frame_time[i]),
+                temperature_time=float(columns.temperature_time[i]),
+                temperatures={name: float(t[i]) for name, t in columns.temperatures.items()},
+                frame=self.path / frame if frame else None,
+                observations=observations,
+                note="" if frame or observations is not None else "neither frame nor observations",
+            )
 
     def __len__(self) -> int:
         return len(self.columns)

@@ -294,13 +294,15 @@ def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = Non
         found = re.match(r"\s*(?:[A-Za-z_]+[\s_]*)?(\d{1,4})[\s,;]+(.*)", text)
         if found is None or text.lstrip().startswith("#"):
             continue
-        fields = [f for f in re.split(r"[\s,;]+", found[2]) if f]
         try:
-            point = [float(f) for f in fields[:3]]
+            point = [float(f) for f in re.split(r"[\s,;]+", found[2].strip(" ,;"))[:3]]
         except ValueError:
-            raise TestFieldError(f"{path}, line {line}: {found[2][:40]!r} is not X, Y, Z") from None
+            point = []
         if len(point) < 3 or not np.isfinite(point).all():
-            raise TestFieldError(f"{path}, line {line}: X, Y, Z (mm) are needed after the label")
+            raise TestFieldError(
+                f"{path}, line {line}: X, Y, Z (mm) are needed after the label, not "
+                f"{found[2][:40]!r}"
+            )
         numbers.append(int(found[1]))
         points.append(point)
     if not numbers:

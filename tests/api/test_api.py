@@ -289,7 +289,9 @@ def test_a_prediction_is_the_camera_and_is_held_against_series(camera, M1, world
 def test_one_point_is_corrected(camera, world, tmp_path):
     head, first, *_ = (world / "points.csv").read_text().splitlines(keepends=True)
     (tmp_path / "one.csv").write_text(head + first)
-    assert "1 point corrected" in str(tc.correct(tmp_path / "one.csv", camera, log=world / "M1"))
+    one = tc.correct(tmp_path / "one.csv", camera, log=world / "M1")
+    one.write(tmp_path / "corrected.csv")
+    assert "1 point corrected" in str(one)
 
 
 def test_calibrations_at_two_temperatures_give_the_camera_back(camera, world):

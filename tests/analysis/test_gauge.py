@@ -15,8 +15,7 @@ import pytest
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.gauge import GaugeCalibrator
-from thermocald.analysis.thermal.predictor import Predictor
+from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor

@@ -73,13 +73,6 @@ def test_a_model_of_m1_predicts_m2(fitted):
     assert worse.rms_px > 1.5 * error.rms_px
 
 
-def test_two_series_are_better_than_one(fitted):
-    both = fit_thermal_model(fitted[1], [START])
-    assert both.model.sd("thermal_lag.tau") < 0.85 * fitted[0].model.sd("thermal_lag.tau")
-    assert abs(both.model.effects[0].values["tau"] - 70.0) < 3 * both.model.sd("thermal_lag.tau")
-    assert len(both.model.fitted_on) == 2
-
-
 @pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.slow) for k in (4, 5))])
 def test_sixteen_targets_suffice(seed):
     """Most epochs show at least twelve of them; fewer than three such epochs are refused."""

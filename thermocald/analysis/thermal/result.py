@@ -16,13 +16,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.series.course import carried_by_c
-from thermocald.analysis.thermal.level import (
+from thermocald.analysis.thermal.prediction_test import (
     AFFINITY_SD,
     average_residuals,
     estimate_level,
+    image_partials,
     project_targets,
+    thermometer_noise,
 )
-from thermocald.analysis.thermal.prediction_test import image_partials, thermometer_noise
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -43,7 +44,7 @@ from thermocald.thermal.series import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.thermal.level import Moved
+    from thermocald.analysis.thermal.prediction_test import Moved
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Unknowns

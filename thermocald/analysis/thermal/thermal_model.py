@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.level import estimate_step
-from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step, predicted_error
 from thermocald.analysis.thermal.result import build_camera, with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError

@@ -386,6 +386,11 @@ def test_places_that_a_moved_control_point_falsifies_are_doubted():
     assert false > 3
     assert np.abs(sure).max() < 3.5
     assert np.sqrt(np.mean(np.square(sure))) == pytest.approx(1.0, abs=0.25)
+    world = few(34, 5, 200.0)  # ten standard deviations off, with a sigma0 of 1.9
+    image = project(PLACES, POSE, **world.interior(20.0))
+    image += world.rng.normal(0, NOISE_PX, image.shape)
+    found = places(world, world.seen(20.0), image)
+    assert "there may be one, as sigma0 is 1." in found.lines()[0]
 
 
 def test_what_an_error_may_do_unnoticed_is_what_it_does():

@@ -15,8 +15,7 @@ import pytest
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.gauge import GaugeCalibrator
-from thermocald.analysis.thermal.predictor import Predictor
+from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
@@ -145,25 +144,26 @@ def test_the_covariance_grows_while_a_thermometer_is_lost():
     assert [kind for kind, _ in events] == ["no_temperature", "predicted"]
 
 
-def unknown(predictor: Predictor, begin: float, T: float) -> list[float]:
-    """Return the effects of the unknown past, px, at 1000 readings of a temperature."""
+def unknown(predictor: Predictor, begin: float, T: float, *rows: int) -> list[float]:
+    """Return the effects of the unknown past, px, at some of 750 readings of a temperature."""
     found = []
-    for time in begin + 10.0 * np.arange(1000):
-        predictor.take(time, {"h": T})
-        found.append(predictor.at(time).unknown_px)
+    for k in range(750):
+        predictor.take(begin + 10.0 * k, {"h": T})
+        if k in rows:
+            found.append(predictor.at(begin + 10.0 * k).unknown_px)
     return found
 
 
 def test_the_effects_of_the_unknown_past_and_of_a_gap_fade():
     """With a lag of 600 s it is more than a pixel at first, and nothing after two hours."""
     predictor = Predictor(thermal_camera(TAU))
-    first = unknown(predictor, START, 20.0)
-    assert first[0] > 1.0
-    assert first[60] / first[0] == pytest.approx(np.exp(-600.0 / TAU), rel=0.05)
-    assert first[720] < 1e-3
-    after = unknown(predictor, START + 9990.0 + 3 * 3600.0, 24.0)
-    assert after[0] > 0.2
-    assert after[500] < 1e-3 * after[0]
+    first, later, last = unknown(predictor, START, 20.0, 0, 60, 720)
+    assert first > 1.0
+    assert later / first == pytest.approx(np.exp(-600.0 / TAU), rel=0.05)
+    assert last < 1e-3
+    after, end = unknown(predictor, START + 7490.0 + 3 * 3600.0, 24.0, 0, 500)
+    assert after > 0.2
+    assert end < 1e-3 * after
 
 
 @pytest.mark.slow
@@ -190,7 +190,7 @@ def test_remembered_epochs_restore_the_state():
     world = World(3)
     camera = thermal_camera(TAU)
     whole = GaugeCalibrator(camera, world.field)
-    epochs = [world.epoch(k, 20.0 + 0.02 * k) for k in range(1, 300)]
+    epochs = [world.epoch(k, 20.0 + 0.06 * k) for k in range(1, 100)]
     results, *_ = followed(whole, epochs)
     second = GaugeCalibrator(camera, world.field)
 
@@ -225,12 +225,12 @@ def test_the_last_pose_is_kept_with_growing_covariance_while_points_are_hidden()
 def test_a_moved_camera_is_reported_with_time_turn_and_shift():
     turn = np.array([0.0, np.deg2rad(0.05), 0.0, 0.0, 0.0, 0.0])
     found = 0
-    for seed in range(10):
+    for seed in range(6):
         world = World(200 + seed)
         gauge = GaugeCalibrator(thermal_camera(), world.field)
-        epochs = [world.epoch(k, 20.0 + 0.1 * k) for k in range(1, 31)]
+        epochs = [world.epoch(k, 20.0 + 0.1 * k) for k in range(16, 31)]
         world.pose = POSE + turn
-        epochs += [world.epoch(k, 20.0 + 0.1 * k) for k in range(31, 41)]
+        epochs += [world.epoch(k, 20.0 + 0.1 * k) for k in range(31, 37)]
         results, _, events = followed(gauge, epochs)
         moved = [r.epoch.number for r in results if "event" in r.extra]
         assert [kind for kind, _ in events] == ["camera_moved"] * len(moved)
@@ -239,7 +239,7 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
             found += moved[0] == 32
             assert "turned by 0.0" in events[0][1]
             assert "looks the same" not in events[0][1]
-    assert found == 10
+    assert found == 6
 
 
 def test_a_repeated_frame_is_no_second_pose():

@@ -118,13 +118,6 @@ def test_no_false_band_is_stated(outside, course):
         assert f.model.evidence["fit"]["effect_missing"] or error.rms_px < 1.1 * error.floor_px
 
 
-def test_inside_the_family_nothing_is_missing():
-    for listed in ((), (LAG,)):
-        f = fit_thermal_model([reduced(simulated(3, listed=listed))], listed)
-        assert not f.model.evidence["fit"]["effect_missing"]
-        assert not f.model.misses_an_effect
-
-
 @pytest.mark.slow
 def test_a_misfit_too_small_for_an_effect_is_stated(tmp_path):
     """The preset's distortion also drifts: 0.015 px, which no 95 % band leaves out."""

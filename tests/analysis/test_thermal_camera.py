@@ -12,7 +12,7 @@ from thermocald.analysis.camera.undistortion import ideal_points
 from thermocald.analysis.thermal.modelled_camera import ExtrapolationWarning
 from thermocald.analysis.thermal.predictions import predict_along, warm_up
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -128,29 +128,8 @@ def test_missing_readings_are_refused():
     assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda camera: camera.at(30.0, temperature_sd="0.1"),
-        lambda camera: camera.at(30.0, channels=[30.0]),
-        lambda camera: camera.along([0, 1], [25.0, 26.0], relative_to="x"),
-        lambda camera: camera.live(size=("640", "480")),
-        lambda camera: camera.live(size=640),
-        lambda camera: camera.live().correct([[1, 2], [3, 4]]),
-        lambda camera: tc.load_camera(None),
-    ],
-)
-def test_a_wrong_type_is_one_clear_error(call):
-    with pytest.raises(UsageError, match=r"(is|is a) .*(give|must be)"):
-        call(ThermalCamera(thermal_model()))
-
-
-def test_images_of_another_camera_a_crop_and_a_binning():
+def test_binned_images_have_the_same_rays():
     camera = ThermalCamera(thermal_model())
-    with pytest.raises(ConfigurationError, match="belongs to one camera"):
-        camera.for_images(3280, 2464, "nexus5")
-    with pytest.raises(ConfigurationError, match="a crop, which cannot be converted"):
-        camera.for_images(1920, 1080)
     half = camera.for_images(1640, 1232)
     centre = np.array([[100.0, 50.0]])
     full = camera.at(30.0).rays(centre * 2 + 0.5)  # the middle of the four binned pixels
@@ -184,7 +163,7 @@ def test_the_object_error_equals_differences():
 
 def test_warm_up_time_of_an_exponential():
     camera = ThermalCamera(thermal_model())
-    t = np.arange(0.0, 6000.0, 5.0)
+    t = np.arange(0.0, 3000.0, 5.0)
     T = 25.0 + 20.0 * (1 - np.exp(-t / 300.0))
     steady_from, error = warm_up(camera.along(t, T), 10_000.0, 2.0)
     worst = error[0]

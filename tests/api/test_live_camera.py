@@ -181,6 +181,8 @@ def test_another_thermometer_outside_its_range_widens_too(camera):
 
 def test_what_is_wrong_is_said():
     live = tc.ThermalCamera(thermal_model()).live((1640, 1232))
+    with pytest.raises(UsageError, match="the frame is a list: give an array"):
+        live.correct([[1, 2], [3, 4]])
     with pytest.raises(UsageError, match="no reading yet"):
         live.correct(np.zeros((1232, 1640), np.uint8))
     live.update(0.0, 30.0)

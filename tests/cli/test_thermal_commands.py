@@ -271,21 +271,6 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
     assert abs(other - first) > 0.1
 
 
-def test_binned_points_are_scaled(folder, tmp_path):
-    """Points of 2 × 2 binned images get half the correction."""
-    time = times_of(folder)[40]
-    moved = {}
-    for size, x, y in (("3280x2464", 2000.5, 800.5), ("1640x1232", 1000.0, 400.0)):
-        (tmp_path / "p.csv").write_text(f"time,x,y\n{time:.2f},{x},{y}\n")
-        succeed("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--log",
-                   folder / "M1" / "epochs.csv", "--size", size,
-                   "--out", tmp_path / "o.csv")  # fmt: skip
-        table = np.genfromtxt(tmp_path / "o.csv", delimiter=",", names=True)
-        moved[size] = np.array([table["dx"], table["dy"]])
-    assert np.abs(moved["3280x2464"]).max() > 0.5
-    assert moved["1640x1232"] * 2 == pytest.approx(moved["3280x2464"], rel=1e-3, abs=1e-4)
-
-
 def test_what_is_outside_is_said(folder, tmp_path):
     """Far outside by name, and a recording in fahrenheit, with which the model is tested."""
     shutil.copytree(folder / "M2", tmp_path / "warm")
@@ -390,17 +375,6 @@ def test_rows_of_standard_input_are_corrected_as_they_come(folder):
         assert f"line {line}: not corrected: " in told
         assert reason in told
     assert "4 of 6 rows were not corrected: lines 3, 4, 5, 6" in told
-
-
-def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
-    times = times_of(folder)
-    points = "time,x,y\n" + "".join(f"{t:.2f},{500 + i},400\n" for i, t in enumerate(times))
-    (tmp_path / "p.csv").write_text(points)
-    told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]
-    of_file = run("correct", tmp_path / "p.csv", *told)
-    piped = succeed("correct", "-", *told, given=points)
-    assert piped.stdout == of_file.stdout
-    assert len(piped.stdout.splitlines()) == len(times) + 1
 
 
 # --- cameras of other programs as initial values -----------------------------------------------

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.thermal.level import Moved
+from thermocald.analysis.thermal.prediction_test import Moved
 from thermocald.analysis.thermal.result import build_camera, with_covariance
 from thermocald.discovery import criteria
 from thermocald.discovery.entries import (

@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from thermocald.figures import BAND, Curve, Figure, Panel
 from thermocald.numbers import UNITS, parameter_label, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
@@ -21,10 +19,10 @@ from thermocald.store.recording.sense import doubt_lines
 from thermocald.thermal.criteria import NEGLIGIBLE_PX, SIGNIFICANT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
-    from thermocald.analysis.camera.camera import Camera
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 _UNSEEN = 0.5
@@ -149,24 +147,22 @@ _DISTANCE_MM = 10_000.0
 
 
 def render_certificate(
-    document: Mapping[str, Any], states: Sequence[Camera], title: str = ""
-) -> str:
+    document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float], drift: Figure,
+    title: str = "",
+) -> str:  # fmt: skip
     """Return the page as HTML text.
 
-    document: of the thermal camera; states: the camera at temperatures over the range, in order;
+    document: of the thermal camera; limits: the range of its temperatures, °C; drift: over it;
     title: by default the camera's name.
     """
-    sensor, T = states[0].sensor, np.array([state.temperature for state in states])
-    low, high = T[[0, -1]].tolist()
-    values = np.array([state.interior.as_array() for state in states])
-    sds = np.array([[state.sd.get(name, 0.0) for name in IOP_NAMES] for state in states])
+    low, high = limits
     missing = bool(document.get("effect_missing"))
     series = ", ".join(str(s["name"]) for s in document.get("series", ()))
     return Chapter(
         title or f"Thermal model of {document['camera']}",
         Answer(
             _sentence(document, sensor.pixel_pitch, low, high),
-            _drift(T, values, sds, missing),
+            drift,
             (_assess_misfit(document),),
             ("Find the missing effect: thermocald discover.",) if missing
             else ("Correct measurements with: thermocald correct.",),
@@ -222,20 +218,22 @@ def _assess_misfit(document: Mapping[str, Any]) -> str:
     return "The residuals have no smooth trajectories beyond the noise."
 
 
-def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:
-    middle = len(T) // 2
+def drift_figure(T: Array, T0: float, changes: Array, sds: Array | None) -> Figure:
+    """Draw the changes (n, 10) since T0 of the steady camera against temperatures (n,) °C.
+
+    sds (n, 10): of the changes, for 95 % bands; None for a model that misses an effect.
+    """
     panels = []
     for name in ("c", "x0", "y0"):
         k = IOP_NAMES.index(name)
-        y, half = 1e3 * (values[:, k] - values[middle, k]), 1e3 * BAND * sds[:, k]
-        curve = Curve("", T, y, half=None if missing else half)
+        half = None if sds is None else 1e3 * BAND * sds[:, k]
+        curve = Curve("", T, 1e3 * changes[:, k], half=half)
         label = parameter_label(name)
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
-    band = "no band is given" if missing else "bands: 95 %, with the uncertainty of the level"
+    band = "no band is given" if sds is None else "bands: 95 %"
     return Figure(
         "drift", "Change of the camera with its temperature",
-        "Each parameter minus its value in the middle of the range, at steady temperatures; "
-        f"{band}.",
+        f"Each parameter minus its value at {T0:g} °C, at steady temperatures; {band}.",
         tuple(panels),
     )  # fmt: skip
 

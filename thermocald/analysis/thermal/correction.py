@@ -148,7 +148,7 @@ class FrameCorrector:
         self.sensor, self.to = thermal.model.sensor, thermal.model.T0
         self._camera, self._origin = camera, list(origin)
         self._steady = thermal.at(self.to, extrapolate=True)
-        self._maps: Maps | None = None
+        self._maps = Maps(self._steady.sensor, self._steady.values, self.to)
 
     def correct(self, encoded: bytes, calibrated: CalibratedEpoch) -> bytes:
         """Return a frame as the steady camera would have seen it, as a JPEG.
@@ -166,7 +166,6 @@ class FrameCorrector:
                 f"the frame has {image.shape[1]}×{image.shape[0]} px, the model's camera "
                 f"{sensor.width}×{sensor.height}"
             )
-        self._maps = self._maps or Maps(self._steady.sensor, self._steady.values, self.to)
         resampled = self._maps.resample(image, result.interior.as_array())
         _, data = cv2.imencode(".jpg", resampled, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         jpeg = with_metadata(data.tobytes(), encoded)
@@ -325,9 +324,9 @@ def _block(
 
 
 def _moment(text: str) -> float | datetime:
-    seconds = _float(text)
-    if np.isfinite(seconds):
-        return seconds
+    with suppress(ValueError):
+        if math.isfinite(seconds := float(text)):
+            return seconds
     with suppress(ValueError):
         if isinstance(moment := parse_moment(text), datetime):
             return moment
@@ -335,16 +334,11 @@ def _moment(text: str) -> float | datetime:
 
 
 def _number(column: str, text: str) -> float:
-    value = _float(text)
-    if not np.isfinite(value):
+    value = math.nan
+    with suppress(ValueError):
+        value = float(text)
+    if not math.isfinite(value):
         raise ValueError(f"column {column}: {text!r} is not a number")
     if column in ("sx", "sy") and value <= 0:
         raise ValueError(f"column {column}: a standard deviation must be above 0")
     return value
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

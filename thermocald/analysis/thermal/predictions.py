@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.errors import DataError
 from thermocald.numbers import plain
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
 from thermocald.physics.device import CameraDevice, read_camera_device, read_programme
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field
@@ -114,10 +115,10 @@ def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> tuple[float |
     """
     if len(along) < 10:
         raise DataError("a warm-up needs a history of at least 10 times")
-    last = along[-1]
-    error = np.array([
-        along[i].object_distance(last, distance_mm).max() for i in range(len(along))
-    ])  # fmt: skip
+    points = image_grid(along.sensor)
+    r = rays(along.sensor, along.values, np.broadcast_to(points, (len(along), *points.shape)))
+    places = distance_mm * r[..., :2] / -r[..., 2:]
+    error = np.linalg.norm(places - places[-1], axis=2).max(axis=1)
     times = along.times - along.times[0]
     settled = error[-len(error) // 10 :].max() <= max(0.1 * wanted_mm, 1e-9)
     above = np.flatnonzero(error > wanted_mm)

@@ -16,13 +16,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.series.course import carried_by_c
-from thermocald.analysis.thermal.level import (
+from thermocald.analysis.thermal.prediction_test import (
     AFFINITY_SD,
     average_residuals,
     estimate_level,
+    image_partials,
     project_targets,
+    thermometer_noise,
 )
-from thermocald.analysis.thermal.prediction_test import image_partials, thermometer_noise
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -43,7 +44,7 @@ from thermocald.thermal.series import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.thermal.level import Moved
+    from thermocald.analysis.thermal.prediction_test import Moved
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Unknowns
@@ -302,16 +303,21 @@ def build_camera(
     if found and any(map(detect_tremble, series)):
         verdict["trembles"] = True
     first = models[0]
-    channels = dict.fromkeys(
-        c for s in series for c, read in s.source.readings.items() if np.isfinite(read).any()
-    )
+    readings: dict[str, Array] = {}
+    for s in series:
+        for channel, read in s.source.readings.items():
+            if len(finite := read[np.isfinite(read)]):
+                readings[channel] = np.append(readings.get(channel, finite[:0]), finite)
     values = np.array([first.value(n) for n in names])
     certain = with_covariance(first, tuple(names), values, covariance)
     model = replace(
         certain,
         effects=tuple(_with_event_sd(e, series[0]) for e in certain.effects),
         image_sigma=sigma,
-        validity={c: _span(series, c) for c in channels},
+        validity={
+            c: (float(np.floor(10 * T.min()) / 10), float(np.ceil(10 * T.max()) / 10))
+            for c, T in readings.items()
+        },
         fitted_on=tuple(
             {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
              "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
@@ -386,12 +392,6 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
     empty = np.diag(M) <= 0
     M[empty, empty] = 1e12  # a coefficient of a series that does not take part
     return M
-
-
-def _span(series: Sequence[ReducedSeries], channel: str) -> tuple[float, float]:
-    values = [s.source.readings[channel] for s in series if channel in s.source.readings]
-    both = 10 * np.concatenate(values)
-    return float(np.floor(np.nanmin(both)) / 10), float(np.ceil(np.nanmax(both)) / 10)
 
 
 def _rms(series: ReducedSeries, model: ThermalModel) -> float:

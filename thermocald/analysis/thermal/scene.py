@@ -405,10 +405,9 @@ def follow_scene(
     times = np.array([time for _, time in frames])
     reference = decode_grey(frames[0][0])
     thermal = thermal.for_images(reference.shape[1], reference.shape[0])
-    along = thermal.along(log.times, log.channels, times)
-    since = thermal.along(
+    along = thermal.along(
         log.times, log.channels, times, temperature_sd=thermal.reading_sd, since=frames[0][1]
-    ).sd  # fmt: skip
+    )
     corners = detect_features(reference)
     E = len(frames)
     values, covariance = np.full((E, 4), np.nan), np.full((E, 4, 4), np.nan)
@@ -440,7 +439,7 @@ def follow_scene(
     if recording is not None:
         write_scene(recording, along[0], log, times, points, tracks)
     interior = InteriorOrientation.from_array(along.values[0])
-    unsure = since[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
+    unsure = along.sd[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
     return SceneCourse(
         thermal.model.camera, tuple(path.name for path, _ in frames), times, along.temperatures,
         values, covariance, unsure, count, tuple(reasons), locked,

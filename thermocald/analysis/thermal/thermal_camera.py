@@ -27,7 +27,7 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
-from thermocald.analysis.thermal.certificate import model_lines, render_certificate
+from thermocald.analysis.thermal.certificate import drift_figure, model_lines, render_certificate
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
@@ -40,21 +40,21 @@ from thermocald.analysis.thermal.modelled_camera import (
 )
 from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
-from thermocald.figures import BAND
+from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
-from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
 from thermocald.physics.operators import interpolation_matrix
-from thermocald.result import Result, jsonable, new_figure
+from thermocald.result import Result, jsonable
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
+    from thermocald.figures import Figure
     from thermocald.physics.model import ThermalModel
 
 
@@ -117,28 +117,23 @@ class ThermalCamera(Result):
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
-        states = [self.at(float(t)) for t in np.linspace(*self._limits, 41)]
-        return render_certificate(self.as_dict(), states, title)
+        sensor = self.model.sensor
+        drift = self._drift(band=not self.model.misses_an_effect)
+        return render_certificate(self.as_dict(), sensor, self._limits, drift, title)
 
-    def plot(self) -> Figure:
+    def plot(self) -> Drawing:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
         Covers the range that the model was fitted on, with 95 % bands of these changes; other
         thermometers are taken to be as warm.
         """
-        T = np.linspace(*self._limits, 60)
-        found = [self.steady_change(self.model.T0, t) for t in T.tolist()]
-        figure, axes = new_figure(3)
-        for k, axis in enumerate(axes[:, 0]):
-            y = 1e3 * np.array([change[k] for change, _ in found])
-            band = 1e3 * BAND * np.sqrt([covariance[k, k] for _, covariance in found])
-            axis.plot(T, y)
-            axis.fill_between(T, y - band, y + band, alpha=0.3)
-            axis.set_ylabel(f"change of {parameter_label(IOP_NAMES[k])} in µm")
-            axis.grid(alpha=0.3)
-        axes[0, 0].set_title(f"{self.model.camera}, from {self.model.T0:g} °C")
-        axes[-1, 0].set_xlabel("temperature in °C")
-        return figure
+        return draw_figure(replace(self._drift(band=True), columns=1))
+
+    def _drift(self, *, band: bool) -> Figure:
+        T, T0 = np.linspace(*self._limits, 60), self.model.T0
+        changes, Q = map(np.array, zip(*(self.steady_change(T0, t) for t in T), strict=True))
+        sds = np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) if band else None
+        return drift_figure(T, T0, changes, sds)
 
     def steady_change(self, since: float, T: float) -> tuple[Array, Array]:
         """Return the change (10,) of the steady camera from one temperature to another, °C.
@@ -298,15 +293,15 @@ class ThermalCamera(Result):
         extrapolate: bool = False,
         relative_to: float | None = None,
         temperature_sd: float = 0.0,
-        since: Any = None,
+        since: float | None = None,
     ) -> Along:
         """Return the camera along a temperature log, including effects with a memory.
 
         times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
         the reference first; at (E,): the times to predict for, by default `times`. The history
         begins with the first time. relative_to °C: the covariance is that of the difference from
-        the steady camera at this temperature; since s or datetime64: instead, of the difference
-        from the camera at this time; temperature_sd K: of a reading, is propagated into the
+        the steady camera at this temperature; since s: instead, of the difference from the camera
+        at this time; temperature_sd K: of a reading, is propagated into the
         covariance (as if no effect had a memory, which would average it). Raises UsageError far
         outside the model's validity (unless `extrapolate`), for lengths that differ and for times
         that run backwards, DataError for times `at` that the log does not cover.
@@ -353,7 +348,7 @@ class ThermalCamera(Result):
         if relative_to is not None:
             base = steady_camera(self.model, self.parameters, None, relative_to)[2]
         elif since is not None:
-            then = np.atleast_1d(seconds(since)) - begin
+            then = np.array([since - begin])
             base = predicted(history.at(then))[2]
             of_base = interpolation_matrix(t - begin, then).toarray()[0]
         for first in range(0, len(instants), _CHUNK):

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.level import estimate_step
-from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step, predicted_error
 from thermocald.analysis.thermal.result import build_camera, with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
@@ -195,8 +194,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     values = np.array([[m.value(n) for n in names] for m in models])
     n = len(models)
     people = population(values, np.array([m.covariance_of(names) for m in models]))
-    low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
-    high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
+    low, high = zip(*(next(iter(m.validity.values())) for m in models if m.validity), strict=True)
     channel = next(iter(first.validity), "temperature")
     mean = with_covariance(first, names, people.mean, people.prior)
     own = {k: v for k, v in mean.sds.items() if k.split(".")[0] in ("interior", "rates")}
@@ -207,7 +205,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
         exterior=None,
         sds=own,
         evidence={},
-        validity={channel: (low, high)} if low < high else first.validity,
+        validity={channel: (max(low), min(high))} if max(low) < min(high) else first.validity,
         fitted_on=tuple({"camera": m.camera, "version": m.version} for m in models),
     )
 

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, distort, image_to_px
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 
 if TYPE_CHECKING:
@@ -174,16 +174,9 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
     return {**found, "exact": float(values[8] == 0 and values[9] == 0)}
 
 
-def _pixels(sensor: Sensor, x: Array, y: Array) -> Array:
-    """Return image points (n, 2) px from x, y mm; unlike `image_to_px`, also of complex numbers."""
-    return np.column_stack([x, -y]) / sensor.pixel_pitch + sensor.centre
-
-
 def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
-    c, x0, y0, *_, C1, C2 = iop
-    x, y = c * directions[:, 0], -c * directions[:, 1]
-    dx, dy = _balanced_correction(iop, 0.0, x, y)
-    return _pixels(sensor, x0 + x + dx + C1 * x + C2 * y, y0 + y + dy)
+    x, y = distort(iop, iop[0] * directions[:, 0], -iop[0] * directions[:, 1])
+    return image_to_px(sensor, np.column_stack([x, y]))
 
 
 BROWN = Family(
@@ -263,23 +256,18 @@ def _project_metashape(sensor: Sensor, values: Array, directions: Array) -> Arra
 
 def _metashape_of_brown(sensor: Sensor, iop: Array) -> Array:
     """Convert our parameters to Metashape's; exact without affinity and shear, or distortion."""
-    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = iop
-    p = sensor.pixel_pitch
-    return np.array(
-        [
-            c / p, x0 / p, -y0 / p, C1 * c / p, -C2 * c / p,
-            A1 * c**2, A2 * c**4, A3 * c**6, 0.0, B1 * c, -B2 * c,
-        ]
-    )  # fmt: skip
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, *_ = _opencv_of_brown(sensor, iop)
+    x, y = np.array([cx, cy]) - sensor.centre
+    return np.array([fy, x, y, fx - fy, -iop[9] * fy, k1, k2, k3, k4, p2, p1])
 
 
 def _brown_of_metashape(sensor: Sensor, values: Array) -> Array:
     """Convert Metashape's parameters to ours; k4 has no counterpart."""
     f, cx, cy, b1, b2, k1, k2, k3, _, p1, p2 = values
-    p, c = sensor.pixel_pitch, f * sensor.pixel_pitch
-    return np.array(
-        [c, cx * p, -cy * p, k1 / c**2, k2 / c**4, k3 / c**6, p1 / c, -p2 / c, b1 / f, -b2 / f]
-    )
+    x, y = np.array([cx, cy]) + sensor.centre
+    brown = _brown_of_opencv(sensor, np.array([f + b1, f, x, y, k1, k2, p2, p1, k3]))
+    brown[9] = -b2 / f
+    return brown
 
 
 METASHAPE = Family(
@@ -307,7 +295,7 @@ def measured_point(r0: float) -> Family:
                 break
             if not np.isfinite(change):
                 raise GeometryError(f"the {name} does not converge over the image")
-        return _pixels(sensor, x0 + x, y0 + y)
+        return image_to_px(sensor, np.column_stack([x0 + x, y0 + y]))
 
     def of_brown(_: Sensor, iop: Array) -> Array:
         """Keep the distortion terms, the constant part of r0 in c; convert affinity exactly."""
@@ -333,7 +321,7 @@ def aicon(r0: float) -> Family:
         x, y = c * directions[:, 0], -c * directions[:, 1]
         dx, dy = _balanced_correction(values, r0, x, y)
         x, y = x + dx, y + dy
-        return _pixels(sensor, x0 + (1 + C1) * x + C2 * y, y0 + y)
+        return image_to_px(sensor, np.column_stack([x0 + (1 + C1) * x + C2 * y, y0 + y]))
 
     return Family(
         f"AICON model, R0 {r0:g} mm",

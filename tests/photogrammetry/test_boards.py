@@ -88,7 +88,7 @@ def test_corners_in_another_order_are_not_ok():
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array([-150.0, 40.0, 250.0]), middle, 0.3)
     frame = photograph([sheet], CAMERA, station, finer=2)
-    for turn in (1, 2, 3):
+    for turn in (1, 2):
         codes = tuple(f"{c[:-1]}{(int(c[-1]) + turn) % 4}" for c in field.codes)
         status = measure(frame, replace(field, codes=codes)).status
         assert status.word == "other_field"

@@ -132,7 +132,7 @@ def board():
     for step in (0.0, 60.0):
         middle = field.points.mean(axis=0) + np.array([step, 0, 0])
         stand = looking_at(middle + away, middle, 0.3)
-        frames.append(photograph([sheet], SMALL_CAMERA, stand, noise=0.0))
+        frames.append(photograph([sheet], SMALL_CAMERA, stand, noise=0.0, finer=2))
     rng = np.random.default_rng(1)
     return field, [noisy(frames[k], rng, 1.5) for k in (0, 0, 1)]
 
@@ -178,7 +178,7 @@ def test_what_was_hidden_in_the_first_frames_is_found(board, monkeypatch):
     monkeypatch.setattr(
         tracking, "measure", lambda *_: searches.append(1) or Measurement(Observations.none())
     )
-    for k in range(20):
+    for k in range(12):
         assert len(tracker.measure(frames[k % 2]).observations) == whole
     assert len(searches) <= 5
 

@@ -100,11 +100,8 @@ class Sensor:
     def contains(self, points: ArrayLike, margin: float = 0.0) -> Mask:
         """Return which image points (..., 2) are inside the image by at least `margin` px."""
         p = np.asarray(points, dtype=float)
-        low, high_x, high_y = margin - 0.5, self.width - 0.5 - margin, self.height - 0.5 - margin
-        inside: Mask = (
-            (p[..., 0] >= low) & (p[..., 0] <= high_x) & (p[..., 1] >= low) & (p[..., 1] <= high_y)
-        )
-        return inside
+        high = np.array([self.width, self.height]) - 0.5 - margin
+        return np.asarray(((p >= margin - 0.5) & (p <= high)).all(axis=-1))
 
 
 class _Parameters:
@@ -410,26 +407,22 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     xm, ym = measured[..., 0], measured[..., 1]
     x, y = xm - i[..., None, 1], ym - i[..., None, 2]
     tolerance = _RAY_TOLERANCE_PX * sensor.pixel_pitch
-    size = np.full_like(x, np.inf)
-    for _ in range(_RAY_ITERATIONS):
-        xd, yd = distort(i, x, y)
-        jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
-        determinant = jxx * jyy - jxy * jyx
-        rx, ry = xm - xd, ym - yd
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):  # beyond the fold
+        for _ in range(_RAY_ITERATIONS):
+            xd, yd = distort(i, x, y)
+            jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
+            determinant = jxx * jyy - jxy * jyx
+            rx, ry = xm - xd, ym - yd
             x = x + (jyy * rx - jxy * ry) / determinant
             y = y + (jxx * ry - jyx * rx) / determinant
-        with np.errstate(invalid="ignore"):
             size = np.fmax(np.abs(rx), np.abs(ry))
             if bool(np.all(size <= tolerance)):
                 break
-    jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
-    finite = np.isfinite(xm) & np.isfinite(ym)
-    with np.errstate(invalid="ignore"):
-        # Beyond the fold both eigenvalues may be negative, so that their product is not enough.
+        jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
+        # Both eigenvalues may be negative, so that their product is not enough.
         folded = (jxx * jyy - jxy * jyx <= 0) | (jxx + jyy <= 0)
-        folded |= ~(size <= tolerance) | ~np.isfinite(x)
-    failed = finite & folded
+    folded |= ~(size <= tolerance) | ~np.isfinite(x)
+    failed = np.isfinite(xm) & np.isfinite(ym) & folded
     if bool(np.any(failed)):
         where = np.argwhere(failed)[0]
         point = np.asarray(image_points, dtype=float)[tuple(where)]

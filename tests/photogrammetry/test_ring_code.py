@@ -73,13 +73,6 @@ def test_codes_of_a_blurred_image_are_read():
     assert _codes(image) == expected
 
 
-def test_light_on_dark():
-    targets = single_targets(diameters=(16, 24), tilts=(0, 45), bits=14, ink=250.0)
-    image = targets.frame(np.random.default_rng(2), 2.0)
-    assert len(_codes(image, ink=1)) == len(targets.true)
-    assert _codes(image, ink=-1) == set()
-
-
 def test_a_code_seen_twice_is_dropped():
     targets = single_targets(diameters=(24,), tilts=(0, 30), bits=14)
     image = targets.frame(np.random.default_rng(4), 2.0)

@@ -61,10 +61,7 @@ class Shape:
 
     def vertices(self, points: Array) -> Array:
         """Return the vertices (v, 3) mm for targets at points (n, 3) mm."""
-        p = self.offset.copy()
-        for k, target in enumerate(self.targets):
-            p += self.weights[:, k : k + 1] * points[target]
-        return p
+        return self.offset + self.weights @ points[self.targets]
 
 
 def surface_normals(field: TestField) -> Array:

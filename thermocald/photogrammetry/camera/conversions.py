@@ -1,9 +1,9 @@
 """Conversion between our camera model and others: exact where the conventions allow, else fitted.
 
 A `Family` is a camera model; ours is `BROWN`. Each converts our parameters to its own and back, at
-least approximately and often exactly. If the converted parameters reproduce every pixel, they are
-the result. Otherwise they are fitted over the image area, and the result gives the largest and the
-RMS residual in px. Covariances follow from the derivative of the same fit.
+least approximately and often exactly. Unless the converted parameters reproduce every pixel, they
+are fitted over the image area, and the result gives the largest and the RMS residual in px.
+Covariances follow from the derivative of the same fit.
 
 Directions are (X/Z, Y/Z) in OpenCV's axes: x right, y down, looking along +Z. Image points are px
 with (0, 0) at the centre of the top-left pixel; families with another origin convert internally.
@@ -100,14 +100,14 @@ def convert(
     project_source, project_target = (partial(f.project, sensor) for f in (source, target))
     result = target.from_brown(sensor, own)
     residual = project_target(result, checked) - check
-    exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
-    if not exact:
+    if not np.abs(residual).max() < EXACT_PX:
         result = least_squares(
             lambda v: (project_target(v, directions) - grid).ravel(), result,
             partial(_derivative, lambda v: project_target(v, directions)),
             x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=None, max_nfev=50,
         ).x  # fmt: skip
         residual = project_target(result, checked) - check
+    exact = bool(np.abs(residual).max() < EXACT_PX)
     propagated = None
     if covariance is not None:
         G = _derivative(lambda v: project_target(v, directions), result)
@@ -179,9 +179,12 @@ def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
     return image_to_px(sensor, np.column_stack([x, y]))
 
 
-BROWN = Family(
-    "Brown model", IOP_NAMES, _project_brown, lambda _, values: values, lambda _, values: values
-)
+def _same(_: Sensor, values: Array) -> Array:
+    """Return the parameters, which are near enough for a fit to begin with."""
+    return values
+
+
+BROWN = Family("Brown model", IOP_NAMES, _project_brown, _same, _same)
 """Our own model."""
 
 
@@ -297,18 +300,7 @@ def measured_point(r0: float) -> Family:
                 raise GeometryError(f"the {name} does not converge over the image")
         return image_to_px(sensor, np.column_stack([x0 + x, y0 + y]))
 
-    def of_brown(_: Sensor, iop: Array) -> Array:
-        """Keep the distortion terms, the constant part of r0 in c; convert affinity exactly."""
-        values = _balanced(iop, r0)
-        values[8:] /= 1 + values[8]  # x̄ = (x' - x0 - C2 ȳ) / (1 + C1)
-        return values
-
-    def to_brown(_: Sensor, values: Array) -> Array:
-        at_ideal = values.copy()
-        at_ideal[8:] /= 1 - values[8]
-        return _unbalanced(at_ideal, r0)
-
-    return Family(name, IOP_NAMES, project_them, of_brown, to_brown)
+    return Family(name, IOP_NAMES, project_them, _same, _same)
 
 
 def aicon(r0: float) -> Family:
@@ -323,13 +315,7 @@ def aicon(r0: float) -> Family:
         x, y = x + dx, y + dy
         return image_to_px(sensor, np.column_stack([x0 + (1 + C1) * x + C2 * y, y0 + y]))
 
-    return Family(
-        f"AICON model, R0 {r0:g} mm",
-        IOP_NAMES,
-        project_them,
-        lambda _, iop: np.r_[_balanced(iop, r0)[:8], iop[8:]],
-        lambda _, values: np.r_[_unbalanced(values, r0)[:8], values[8:]],
-    )
+    return Family(f"AICON model, R0 {r0:g} mm", IOP_NAMES, project_them, _same, _same)
 
 
 def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[Array, Array]:
@@ -340,36 +326,4 @@ def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[
     return (
         x * radial + B1 * (r2 + 2 * x * x) + 2 * B2 * x * y,
         y * radial + B2 * (r2 + 2 * y * y) + 2 * B1 * x * y,
-    )
-
-
-def _unbalanced(values: Array, r0: float) -> Array:
-    """Return unbalanced terms that give exactly the same image at the ideal point.
-
-    With s = A1 r0² + A2 r0⁴ + A3 r0⁶ the balanced model is the unbalanced one of a camera of
-    principal distance (1-s)c: x̄ becomes (1-s)x̄, and each term is rescaled accordingly.
-    """
-    A1, A2, A3 = values[3:6]
-    return _stretched(values, 1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
-
-
-def _balanced(values: Array, r0: float) -> Array:
-    """Return balanced terms: the inverse of `_unbalanced`, by iteration on the stretch, near 1."""
-    t = 1.0
-    for _ in range(100):
-        A1, A2, A3 = _stretched(values, t)[3:6]
-        # unbalancing stretches by 1 - s, balancing by its inverse
-        last, t = t, 1 / (1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
-        if abs(t - last) < 1e-16:
-            break
-    return _stretched(values, t)
-
-
-def _stretched(values: Array, t: float) -> Array:
-    """Return the terms of a camera whose ideal points are `t` times as far from the principal point
-    and whose image is the same but for the constant radial part t - 1.
-    """
-    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = values
-    return np.array(
-        [c * t, x0, y0, A1 / t**3, A2 / t**5, A3 / t**7, B1 / t**2, B2 / t**2, C1 / t, C2 / t]
     )

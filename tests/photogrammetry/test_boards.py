@@ -100,7 +100,7 @@ def test_all_corners_of_a_charuco_board():
     """As OpenCV drew it before 4.6; a present one: `test_a_printed_board_is_found_…`."""
     field = boards.charuco(9, 6, 30.0, 22.5, "DICT_4X4_50", legacy=True)
     sheet = images.charuco_sheet(9, 6, 30.0, 22.5, "DICT_4X4_50", legacy=True)
-    found, errors, visible = seen(sheet, field, (150.0, -120.0, 380.0))
+    found, errors, visible = seen(sheet, field, (150.0, -120.0, 380.0), finer=2)
     assert found.status.ok
     assert len(found.observations) == visible == len(field)
     chess = np.array([field.kinds[r] == "chess_corner" for r in found.observations.targets])

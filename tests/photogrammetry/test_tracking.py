@@ -126,13 +126,13 @@ def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
 @pytest.fixture(scope="module")
 def board():
     """Return a board and photographs of it: two from one stand, one where a pattern repeats."""
-    pattern = (11, 8, 30.0, 22.5, "DICT_5X5_250")
+    pattern = (7, 5, 45.0, 33.75, "DICT_5X5_250")
     field, sheet = charuco(*pattern), board_images.charuco_sheet(*pattern, legacy=False)
     frames, away = [], np.array([150.0, -120.0, 380.0])
-    for step in (0.0, 60.0):
+    for step in (0.0, 90.0):
         middle = field.points.mean(axis=0) + np.array([step, 0, 0])
         stand = looking_at(middle + away, middle, 0.3)
-        frames.append(photograph([sheet], SMALL_CAMERA, stand, noise=0.0))
+        frames.append(photograph([sheet], SMALL_CAMERA, stand, noise=0.0, finer=2))
     rng = np.random.default_rng(1)
     return field, [noisy(frames[k], rng, 1.5) for k in (0, 0, 1)]
 
@@ -178,7 +178,7 @@ def test_what_was_hidden_in_the_first_frames_is_found(board, monkeypatch):
     monkeypatch.setattr(
         tracking, "measure", lambda *_: searches.append(1) or Measurement(Observations.none())
     )
-    for k in range(20):
+    for k in range(12):
         assert len(tracker.measure(frames[k % 2]).observations) == whole
     assert len(searches) <= 5
 

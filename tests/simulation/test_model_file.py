@@ -202,11 +202,11 @@ def test_a_fault_is_reported_with_file_and_key(tmp_path, kind, path, value, reas
 @pytest.mark.parametrize(
     ("rows", "reason"),
     [
-        ("0,20\n300,21\n1300,22\n", "line 4: a gap of 1000 s"),
-        ("0,20\n300,21\n200,22\n", "line 4: time runs backwards"),
-        ("0,20\n300,\n1300,22\n", "line 3: .* is not a number"),
+        ("0,20\n300,21\n1300,22\n", "line 4, column time: a gap of 1000 s"),
+        ("0,20\n300,21\n200,22\n", "line 4, column time: time runs backwards"),
+        ("0,20\n300,\n1300,22\n", "line 3, column temperature: is empty; a number"),
         ("0,20\n", "two rows"),
-        ("0,20\n300,nan\n900,22\n", "not finite"),
+        ("0,20\n300,nan\n900,22\n", "finite"),
     ],
 )
 def test_faulty_logs(tmp_path, rows, reason):

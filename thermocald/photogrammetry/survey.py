@@ -58,10 +58,8 @@ RingCode = tuple[int, int]
 """Bits and number."""
 
 
-def measure_codes(
-    image: Image, rows: dict[RingCode, int], grows: bool
-) -> tuple[Observations, dict[int, float]]:
-    """Measure the ring-coded targets of an image as ellipses, and their semi-major axes in px.
+def measure_codes(image: Image, rows: dict[RingCode, int], grows: bool) -> Observations:
+    """Measure the ring-coded targets of an image as ellipses, with the quality `semi_axis` px.
 
     rows: row of each code; new codes are added if it `grows` and left out otherwise.
     """
@@ -81,12 +79,10 @@ def measure_codes(
     m11, m12, m22 = fit.parameters[:, 2:5].T
     stretch = np.stack([1 + m11, m12, m12, 1 + m22], axis=-1).reshape(-1, 2, 2)
     outlines = replace(maps, linear=maps.linear @ np.linalg.inv(stretch))
-    axes = outlines.semi_axes[:, 0]
-    good = fit.good
-    return (
-        fit.observations(targets, good),
-        dict(zip(targets[good].tolist(), axes[good].tolist(), strict=True)),
-    )
+    seen = fit.observations(targets, fit.good)
+    order = np.argsort(targets, kind="stable")
+    axes = outlines.semi_axes[order, 0][fit.good[order]]
+    return replace(seen, quality={**seen.quality, "semi_axis": axes})
 
 
 _ONE_SIZE = 0.15
@@ -128,11 +124,14 @@ def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
     return result
 
 
-def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> TestField:
+def field_of_codes(
+    network: Network, names: Sequence[str], photos: Mapping[str, Observations]
+) -> TestField:
     """Return the coded targets of a network as a field.
 
-    radii: semi-major axes px by photograph and target. The diameters follow by comparison with the
-    image of a disc of 1 mm in the plane of the target's neighbours.
+    photos: as by `measure_codes`, whose targets are rows of `names`. The diameters follow from the
+    semi-major axes, by comparison with the image of a disc of 1 mm in the plane of the target's
+    neighbours.
     """
     normals = target_normals(network.points)
     ratios: dict[str, list[float]] = {name: [] for name in network.names}
@@ -142,11 +141,11 @@ def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> 
             network.camera.sensor, interior, s.exterior.as_array(), network.points, normals,
             np.full(len(network.names), 0.5),
         )  # fmt: skip
-        known = np.asarray(np.isfinite(unit.linear).all(axis=(1, 2)), dtype=bool)
-        for i, name in enumerate(network.names):
-            if (s.photo, name) in radii and known[i]:
-                axis = float(np.linalg.svd(unit.linear[i], compute_uv=False)[0])
-                ratios[name].append(radii[s.photo, name] / axis)
+        of_1_mm = dict(zip(network.names, unit.semi_axes[:, 0].tolist(), strict=True))
+        seen = photos[s.photo]
+        for row, axis in zip(seen.targets, seen.quality["semi_axis"].tolist(), strict=True):
+            if np.isfinite(ratio := axis / of_1_mm.get(names[row], np.nan)):
+                ratios[names[row]].append(ratio)
     diameters = np.array([np.median(r) if r else np.nan for r in ratios.values()])
     together = float(np.nanmedian(diameters)) if np.isfinite(diameters).any() else float("nan")
     # sheets are printed with one size: it is assumed where all diameters agree
@@ -263,8 +262,9 @@ def survey(
     Raises GeometryError if the photographs do not determine the field, ImageError if they are
     unusable.
     """
-    sensor, names, photos, sizes, notes = _measure_first(pictures, pixel_pitch, nominal, progress)
+    sensor, names, photos, notes = _measure_first(pictures, pixel_pitch, nominal, progress)
     progress("first adjustment")
+    of_codes = photos
     known = None if nominal is None else nominal.points
     scale = _first_distances(distances, photos, nominal)
     network = adjust_network(
@@ -275,7 +275,7 @@ def survey(
         # their outlines from the surveyed planes of their neighbours
         of_field = None
         if nominal is None:
-            expected = field_of_codes(network, sizes)
+            expected = field_of_codes(network, names, of_codes)
             normals = target_normals(expected.points)
         else:
             expected = expected_field(network, nominal, trusted_only=number > 0)
@@ -321,17 +321,14 @@ def _measure_first(
     pixel_pitch: float,
     nominal: TestField | None,
     progress: Callable[[str], None],
-) -> tuple[
-    Sensor, tuple[str, ...], dict[str, Observations], dict[tuple[str, str], float], dict[str, str]
-]:
+) -> tuple[Sensor, tuple[str, ...], dict[str, Observations], dict[str, str]]:
     """Measure codes and markers in every photograph.
 
     Returns the sensor, the names in the order of the observations' target rows, the observations
-    by photograph, semi-major axes in px by photograph and target, and a note on each photograph.
+    by photograph, and a note on each photograph.
     """
     sensor: Sensor | None = None
     seen: dict[str, Observations] = {}
-    sizes: dict[tuple[str, int], float] = {}
     notes: dict[str, str] = {}
     rows: dict[RingCode, int] = {}
     if nominal is not None:
@@ -351,8 +348,7 @@ def _measure_first(
             notes[name] = status.reason
             continue
         sensor = sensor or Sensor(image.shape[1], image.shape[0], pixel_pitch)
-        found, radii = measure_codes(image, rows, grows=nominal is None)
-        sizes.update({(name, row): radius for row, radius in radii.items()})
+        found = measure_codes(image, rows, grows=nominal is None)
         if nominal is not None:
             found = measure_corners(image, locate_markers(image, nominal)).joined(found)
         notes[name] = f"{len(found)} coded targets"
@@ -366,8 +362,7 @@ def _measure_first(
     # names from which `field_of_codes` reads the codes
     new = (f"R{number}" if bits == 12 else f"R14-{number}" for bits, number in rows)
     names = tuple(new) if nominal is None else nominal.names
-    named = {(photo, names[row]): radius for (photo, row), radius in sizes.items()}
-    return sensor, names, seen, named, notes
+    return sensor, names, seen, notes
 
 
 def _measure_again(

@@ -17,6 +17,7 @@ so is written in model files and commands like any other effect:
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -188,12 +189,11 @@ class Node:
             return {self.name: 1}
         if self.is_leaf:
             return {"K": 1}
-        total: dict[str, int] = {}
+        total = Counter[str]()
         for node in self.inputs:
             for name, power in node.unit().items():
-                total[name] = total.get(name, 0) + power * self.kind.powers
-        if self.kind.seconds:
-            total["s"] = total.get("s", 0) + self.kind.seconds
+                total[name] += power * self.kind.powers
+        total["s"] += self.kind.seconds
         return {name: power for name, power in total.items() if power}
 
     def unit_of(self, constant: Constant) -> str:

@@ -30,6 +30,7 @@ import numpy as np
 
 from thermocald.errors import ConfigurationError
 from thermocald.physics.operators import decayed_sums, lag
+from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -90,7 +91,7 @@ def read_course(
     if isinstance(raw, list):
         course = _read_pieces(reader, key, unit)
     elif isinstance(raw, dict) and "log" in raw:
-        course = _read_log(reader.inner(key), unit, folder)
+        course = _read_log(reader.inner(key), folder)
     else:
         return Course.constant(reader.number(key, unit))
     begin, end = course.times[[0, -1]]
@@ -122,45 +123,21 @@ def _read_pieces(reader: QuantityReader, key: str, unit: str) -> Course:
     return Course(np.append(starts[:1], stops), begin, end)
 
 
-def _read_log(reader: QuantityReader, unit: str, folder: Path) -> Course:
+def _read_log(reader: QuantityReader, folder: Path) -> Course:
     """Read a CSV file with a header and one row per time; time 0 is the first row."""
-    import csv
-
     reader.only(("log", "time", "value", "largest_gap"))
-    path = folder / reader.text("log")
-    columns = reader.text("time", "time"), reader.text("value", "temperature")
+    time, value = columns = reader.text("time", "time"), reader.text("value", "temperature")
     largest = reader.number("largest_gap", "s", 900.0, above=0.0)
-    rows: list[tuple[float, float]] = []
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            table = csv.DictReader(file)
-            for name in columns:
-                if name not in (table.fieldnames or ()):
-                    raise ConfigurationError(f"{path}: there is no column {name!r}")
-            for line in table:
-                try:
-                    rows.append((float(line[columns[0]]), float(line[columns[1]])))
-                except (TypeError, ValueError) as cause:
-                    raise ConfigurationError(
-                        f"{path}, line {table.line_num}: {columns[0]} or {columns[1]} is not "
-                        "a number"
-                    ) from cause
-    except (OSError, UnicodeDecodeError) as cause:
-        raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause
-    if len(rows) < 2:
-        raise ConfigurationError(f"{path}: a log needs at least two rows")
-    times, values = np.array(rows).T
-    if not np.isfinite(times).all() or not np.isfinite(values).all():
-        raise ConfigurationError(f"{path}: holds a value that is not finite (a gap in {unit})")
+    table = Table(folder / reader.text("log"), columns, ConfigurationError)
+    found = table.read(numbers=columns)
+    times = found[time]
+    if len(times) < 2:
+        raise ConfigurationError(f"{table.path}: a log needs at least two rows")
     steps = np.diff(times)
-    if steps.min() <= 0:
-        raise ConfigurationError(f"{path}, line {int(steps.argmin()) + 3}: time runs backwards")
-    if steps.max() > largest:
-        raise ConfigurationError(
-            f"{path}, line {int(steps.argmax()) + 3}: a gap of {steps.max():g} s; the largest that "
-            f"is bridged is {largest:g} s (largest_gap)"
-        )
-    return Course.polygon(times - times[0], values)
+    table.check(time, steps <= 0, "time runs backwards", first=1)
+    why = "a gap of {:g} s; the largest that is bridged is {:g} s (largest_gap)".format
+    table.check(time, steps > largest, lambda row: why(steps[row], largest), first=1)
+    return Course.polygon(times - times[0], found[value])
 
 
 @dataclass(frozen=True, slots=True)

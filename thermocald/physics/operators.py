@@ -319,10 +319,6 @@ def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # no
     return csr_array(_integral(knots, np.eye(n), at))
 
 
-def _change(knots: Array, values: Array, at: Array) -> Array:
-    return np.asarray(np.interp(at, knots, values) - np.interp(0.0, knots, values))
-
-
 def _change_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
     from scipy.sparse import csr_array
 
@@ -402,8 +398,11 @@ OPERATORS: dict[str, Operator] = {
     ),
     "integral": Operator(1, (), "∫ {0} dt", _integral, _integral_matrix, remembers=True,
                          seconds=1),
-    "change": Operator(1, (), "({0} − {0} at the start)", _change, _change_matrix,
-                       remembers=True),
+    "change": Operator(
+        1, (), "({0} − {0} at the start)",
+        lambda knots, x, at: np.asarray(np.interp(at, knots, x) - np.interp(0.0, knots, x)),
+        _change_matrix, remembers=True,
+    ),
     "lag": Operator(1, (_TAU,), "({0}, lagged by {1})", lag, lag_matrix, remembers=True,
                     keeps=True),
     "play": Operator(1, (Constant("r", "width", True),), "({0}, through a play of half-width {1})",

@@ -56,21 +56,13 @@ def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, I
     j = np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     rising = (fb >= fa)[edge]
     cell = np.where(rising, fa[edge] + j, fa[edge] - j)
-    begin, end = a[edge], b[edge]
-    other = 1 - axis
-    delta = end[:, axis] - begin[:, axis]
-    slope = (end[:, other] - begin[:, other]) / np.where(delta != 0.0, delta, 1.0)
-    inner_begin, inner_end = j > 0, j < pieces[edge] - 1
-    line_begin = np.where(rising, cell, cell + 1)
-    line_end = np.where(rising, cell + 1, cell)
-    start = begin[:, other] + (line_begin - begin[:, axis]) * slope
-    stop = begin[:, other] + (line_end - begin[:, axis]) * slope
-    new_a, new_b = np.empty_like(begin), np.empty_like(begin)
-    new_a[:, axis] = np.where(inner_begin, line_begin, begin[:, axis])
-    new_a[:, other] = np.where(inner_begin, start, begin[:, other])
-    new_b[:, axis] = np.where(inner_end, line_end, end[:, axis])
-    new_b[:, other] = np.where(inner_end, stop, end[:, other])
-    return new_a, new_b, cell, edge
+    begin, along = a[edge], (b - a)[edge]
+    length = np.where(along[:, axis] != 0.0, along[:, axis], 1.0)
+    # where the edge enters and leaves the cell, as shares of its length
+    enters = (np.where(rising, cell, cell + 1) - begin[:, axis]) / length
+    leaves = (np.where(rising, cell + 1, cell) - begin[:, axis]) / length
+    first, last = np.where(j > 0, enters, 0.0), np.where(j < pieces[edge] - 1, leaves, 1.0)
+    return begin + first[:, None] * along, begin + last[:, None] * along, cell, edge
 
 
 def coverage_steps(a: Array, b: Array, sign: Array, width: int, height: int) -> Array:

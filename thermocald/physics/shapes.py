@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.field.testfield import plane_fit, target_normals
 from thermocald.photogrammetry.targets import outline, ring_code
-from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
+from thermocald.photogrammetry.targets.markers import marker_cells, marker_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -61,10 +61,7 @@ class Shape:
 
     def vertices(self, points: Array) -> Array:
         """Return the vertices (v, 3) mm for targets at points (n, 3) mm."""
-        p = self.offset.copy()
-        for k, target in enumerate(self.targets):
-            p += self.weights[:, k : k + 1] * points[target]
-        return p
+        return self.offset + self.weights @ points[self.targets]
 
 
 def surface_normals(field: TestField) -> Array:
@@ -129,14 +126,8 @@ def outlines(field: TestField, normals: Array) -> Iterator[Shape]:
 
     Circles without a diameter and markers without all four corners are left out.
     """
-    markers: dict[tuple[str, int], dict[int, int]] = {}
     for i, (kind, code) in enumerate(zip(field.kinds, field.codes, strict=True)):
-        if kind == "marker_corner":
-            if is_marker(code):
-                dictionary, marker, corner = parse_marker(code)
-                if corner is not None:
-                    markers.setdefault((dictionary, marker), {})[corner] = i
-        elif field.diameters[i] > 0:
+        if kind == "circle" and field.diameters[i] > 0:
             # right and down in the plane, for a viewer at whom the normal points
             up = normals[i]
             helper = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
@@ -148,9 +139,11 @@ def outlines(field: TestField, normals: Array) -> Iterator[Shape]:
                 for p in _disc_polygons(float(field.diameters[i]), code)
             ]
             yield Shape.of([i] * 4, up, polygons)
-    for (dictionary, marker), corners in markers.items():
-        if len(corners) == 4:
-            order = [corners[k] for k in range(4)]
+    for dictionary, rows in marker_rows(field).items():
+        for marker in dict.fromkeys(number for number, _ in rows):
+            order = [rows[marker, k] for k in range(4) if (marker, k) in rows]
+            if len(order) < 4:
+                continue
             polygons = []
             for sign, polygon in _marker_polygons(dictionary, marker):
                 u, v = polygon.T

@@ -1,9 +1,9 @@
 """Conversion between our camera model and others: exact where the conventions allow, else fitted.
 
 A `Family` is a camera model; ours is `BROWN`. Each converts our parameters to its own and back, at
-least approximately and often exactly. If the converted parameters reproduce every pixel, they are
-the result. Otherwise they are fitted over the image area, and the result gives the largest and the
-RMS residual in px. Covariances follow from the derivative of the same fit.
+least approximately and often exactly. Unless the converted parameters reproduce every pixel, they
+are fitted over the image area, and the result gives the largest and the RMS residual in px.
+Covariances follow from the derivative of the same fit.
 
 Directions are (X/Z, Y/Z) in OpenCV's axes: x right, y down, looking along +Z. Image points are px
 with (0, 0) at the centre of the top-left pixel; families with another origin convert internally.
@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, distort, image_to_px
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 
 if TYPE_CHECKING:
@@ -100,14 +100,14 @@ def convert(
     project_source, project_target = (partial(f.project, sensor) for f in (source, target))
     result = target.from_brown(sensor, own)
     residual = project_target(result, checked) - check
-    exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
-    if not exact:
+    if not np.abs(residual).max() < EXACT_PX:
         result = least_squares(
             lambda v: (project_target(v, directions) - grid).ravel(), result,
             partial(_derivative, lambda v: project_target(v, directions)),
             x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=None, max_nfev=50,
         ).x  # fmt: skip
         residual = project_target(result, checked) - check
+    exact = bool(np.abs(residual).max() < EXACT_PX)
     propagated = None
     if covariance is not None:
         G = _derivative(lambda v: project_target(v, directions), result)
@@ -174,21 +174,17 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
     return {**found, "exact": float(values[8] == 0 and values[9] == 0)}
 
 
-def _pixels(sensor: Sensor, x: Array, y: Array) -> Array:
-    """Return image points (n, 2) px from x, y mm; unlike `image_to_px`, also of complex numbers."""
-    return np.column_stack([x, -y]) / sensor.pixel_pitch + sensor.centre
-
-
 def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
-    c, x0, y0, *_, C1, C2 = iop
-    x, y = c * directions[:, 0], -c * directions[:, 1]
-    dx, dy = _balanced_correction(iop, 0.0, x, y)
-    return _pixels(sensor, x0 + x + dx + C1 * x + C2 * y, y0 + y + dy)
+    x, y = distort(iop, iop[0] * directions[:, 0], -iop[0] * directions[:, 1])
+    return image_to_px(sensor, np.column_stack([x, y]))
 
 
-BROWN = Family(
-    "Brown model", IOP_NAMES, _project_brown, lambda _, values: values, lambda _, values: values
-)
+def _same(_: Sensor, values: Array) -> Array:
+    """Return the parameters, which are near enough for a fit to begin with."""
+    return values
+
+
+BROWN = Family("Brown model", IOP_NAMES, _project_brown, _same, _same)
 """Our own model."""
 
 
@@ -263,23 +259,18 @@ def _project_metashape(sensor: Sensor, values: Array, directions: Array) -> Arra
 
 def _metashape_of_brown(sensor: Sensor, iop: Array) -> Array:
     """Convert our parameters to Metashape's; exact without affinity and shear, or distortion."""
-    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = iop
-    p = sensor.pixel_pitch
-    return np.array(
-        [
-            c / p, x0 / p, -y0 / p, C1 * c / p, -C2 * c / p,
-            A1 * c**2, A2 * c**4, A3 * c**6, 0.0, B1 * c, -B2 * c,
-        ]
-    )  # fmt: skip
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, *_ = _opencv_of_brown(sensor, iop)
+    x, y = np.array([cx, cy]) - sensor.centre
+    return np.array([fy, x, y, fx - fy, -iop[9] * fy, k1, k2, k3, k4, p2, p1])
 
 
 def _brown_of_metashape(sensor: Sensor, values: Array) -> Array:
     """Convert Metashape's parameters to ours; k4 has no counterpart."""
     f, cx, cy, b1, b2, k1, k2, k3, _, p1, p2 = values
-    p, c = sensor.pixel_pitch, f * sensor.pixel_pitch
-    return np.array(
-        [c, cx * p, -cy * p, k1 / c**2, k2 / c**4, k3 / c**6, p1 / c, -p2 / c, b1 / f, -b2 / f]
-    )
+    x, y = np.array([cx, cy]) + sensor.centre
+    brown = _brown_of_opencv(sensor, np.array([f + b1, f, x, y, k1, k2, p2, p1, k3]))
+    brown[9] = -b2 / f
+    return brown
 
 
 METASHAPE = Family(
@@ -307,20 +298,9 @@ def measured_point(r0: float) -> Family:
                 break
             if not np.isfinite(change):
                 raise GeometryError(f"the {name} does not converge over the image")
-        return _pixels(sensor, x0 + x, y0 + y)
+        return image_to_px(sensor, np.column_stack([x0 + x, y0 + y]))
 
-    def of_brown(_: Sensor, iop: Array) -> Array:
-        """Keep the distortion terms, the constant part of r0 in c; convert affinity exactly."""
-        values = _balanced(iop, r0)
-        values[8:] /= 1 + values[8]  # x̄ = (x' - x0 - C2 ȳ) / (1 + C1)
-        return values
-
-    def to_brown(_: Sensor, values: Array) -> Array:
-        at_ideal = values.copy()
-        at_ideal[8:] /= 1 - values[8]
-        return _unbalanced(at_ideal, r0)
-
-    return Family(name, IOP_NAMES, project_them, of_brown, to_brown)
+    return Family(name, IOP_NAMES, project_them, _same, _same)
 
 
 def aicon(r0: float) -> Family:
@@ -333,15 +313,9 @@ def aicon(r0: float) -> Family:
         x, y = c * directions[:, 0], -c * directions[:, 1]
         dx, dy = _balanced_correction(values, r0, x, y)
         x, y = x + dx, y + dy
-        return _pixels(sensor, x0 + (1 + C1) * x + C2 * y, y0 + y)
+        return image_to_px(sensor, np.column_stack([x0 + (1 + C1) * x + C2 * y, y0 + y]))
 
-    return Family(
-        f"AICON model, R0 {r0:g} mm",
-        IOP_NAMES,
-        project_them,
-        lambda _, iop: np.r_[_balanced(iop, r0)[:8], iop[8:]],
-        lambda _, values: np.r_[_unbalanced(values, r0)[:8], values[8:]],
-    )
+    return Family(f"AICON model, R0 {r0:g} mm", IOP_NAMES, project_them, _same, _same)
 
 
 def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[Array, Array]:
@@ -352,36 +326,4 @@ def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[
     return (
         x * radial + B1 * (r2 + 2 * x * x) + 2 * B2 * x * y,
         y * radial + B2 * (r2 + 2 * y * y) + 2 * B1 * x * y,
-    )
-
-
-def _unbalanced(values: Array, r0: float) -> Array:
-    """Return unbalanced terms that give exactly the same image at the ideal point.
-
-    With s = A1 r0² + A2 r0⁴ + A3 r0⁶ the balanced model is the unbalanced one of a camera of
-    principal distance (1-s)c: x̄ becomes (1-s)x̄, and each term is rescaled accordingly.
-    """
-    A1, A2, A3 = values[3:6]
-    return _stretched(values, 1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
-
-
-def _balanced(values: Array, r0: float) -> Array:
-    """Return balanced terms: the inverse of `_unbalanced`, by iteration on the stretch, near 1."""
-    t = 1.0
-    for _ in range(100):
-        A1, A2, A3 = _stretched(values, t)[3:6]
-        # unbalancing stretches by 1 - s, balancing by its inverse
-        last, t = t, 1 / (1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
-        if abs(t - last) < 1e-16:
-            break
-    return _stretched(values, t)
-
-
-def _stretched(values: Array, t: float) -> Array:
-    """Return the terms of a camera whose ideal points are `t` times as far from the principal point
-    and whose image is the same but for the constant radial part t - 1.
-    """
-    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = values
-    return np.array(
-        [c * t, x0, y0, A1 / t**3, A2 / t**5, A3 / t**7, B1 / t**2, B2 / t**2, C1 / t, C2 / t]
     )

@@ -322,11 +322,11 @@ def _encode_aicon(record: CameraRecord) -> str:
 
 
 def _decode_aicon(text: str) -> CameraRecord:
-    fields = _aicon_record(text)
-    found, spread, name = _read_sheet(text) if fields is None else _read_record(text, fields)
+    record = _aicon_record(text)
+    found, spread, name = _read_sheet(text) if record is None else _read_comments(text, record)
     r0 = number(found.get("R0", 0.0), "R0")
     values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
-    if fields is not None and r0 == 0 and values[3:8].any():
+    if record is not None and r0 == 0 and values[3:8].any():
         raise ConfigurationError(
             "R0 is 0: programs differ in the unit of the terms then; write one name and value per "
             "line instead"
@@ -338,24 +338,24 @@ def _decode_aicon(text: str) -> CameraRecord:
     if not 1 <= pixels[0] < 1e6:
         raise ConfigurationError(f"pixels_x: {pixels[0]:g} columns of pixels are impossible")
     covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES]) if spread else None
-    family = measured_point(r0) if fields is None else aicon(r0)
+    family = measured_point(r0) if record is None else aicon(r0)
     return CameraRecord(pixels, family, values, name, covariance, width / pixels[0])
 
 
-def _aicon_record(text: str) -> list[str] | None:
-    """Return the fields of a record; None if the text is not a record."""
+def _aicon_record(text: str) -> dict[str, str] | None:
+    """Return the values of a record; None if the text is not a record."""
     words = [w for line in text.splitlines() for w in line.split("#")[0].split()]
-    if len(words) != len(_AICON_FIELDS):
-        return None
     try:
-        values = [float(w) for w in words]
+        found = dict(zip(_AICON_FIELDS, words, strict=True))
+        return found if [float(w) for w in words][2] < 0 else None
     except ValueError:
         return None
-    return words if values[2] < 0 else None
 
 
-def _read_record(text: str, fields: list[str]) -> tuple[dict[str, str], dict[str, float], str]:
-    """Return the values of a record; standard deviations and name from the comments we write."""
+def _read_comments(
+    text: str, record: dict[str, str]
+) -> tuple[dict[str, str], dict[str, float], str]:
+    """Return a record, with standard deviations and the name from the comments that we write."""
     spread, name = {}, "camera"
     for line in text.splitlines():
         words = line.split()
@@ -363,7 +363,7 @@ def _read_record(text: str, fields: list[str]) -> tuple[dict[str, str], dict[str
             name = " ".join(words[2:]) or name
         if words[:2] == ["#", "sd"] and len(words) == 4:
             spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
-    return dict(zip(_AICON_FIELDS, fields, strict=True)), spread, name
+    return record, spread, name
 
 
 def _read_sheet(text: str) -> tuple[dict[str, str], dict[str, float], str]:

@@ -208,22 +208,19 @@ class Observations:
             return self
         if len(self) == 0:
             return other
-        targets = np.concatenate([self.targets, other.targets])
-        order = np.argsort(targets, kind="stable")
-        names = [*other.quality, *(k for k in self.quality if k not in other.quality)]
-
-        def column(part: Observations, name: str) -> Array:
-            return part.quality.get(name, np.full(len(part), np.nan))
-
-        assert self.covariances is not None
-        assert other.covariances is not None
-        return Observations(
-            targets[order],
-            np.concatenate([self.points, other.points])[order],
-            np.concatenate([self.sigmas, other.sigmas])[order],
-            np.concatenate([self.covariances, other.covariances])[order],
-            {k: np.concatenate([column(self, k), column(other, k)])[order] for k in names},
+        parts = self, other
+        names = dict.fromkeys([*other.quality, *self.quality])
+        both = Observations(
+            np.concatenate([p.targets for p in parts]),
+            np.concatenate([p.points for p in parts]),
+            np.concatenate([p.sigmas for p in parts]),
+            np.concatenate([p.covariances for p in parts if p.covariances is not None]),
+            {
+                k: np.concatenate([p.quality.get(k, np.full(len(p), np.nan)) for p in parts])
+                for k in names
+            },
         )
+        return both.select(np.argsort(both.targets, kind="stable"))
 
 
 def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any]:

@@ -127,7 +127,6 @@ RENEWED_AT_PX = 0.15
 _LARGEST_BLUR_CHANGE = 0.1
 _LARGEST_LIGHT_CHANGE = 0.2  # of the contrast
 _NEARLY_SATURATED = 0.97
-_ITERATIONS = 6
 _MISFIT = 1.5  # of the epoch's median; a target with more is fitted again
 _LOST_SHARE = 0.3
 _RENEW_SHARE = 0.1
@@ -290,7 +289,7 @@ def _track_circles(
         blur = float(np.median(old[:, 5]))
         others = fit_circles(
             image, weights.maps.select(which).at(old[which, :2] + shift), weights.coded[which],
-            blur, weights.noise, iterations=_ITERATIONS,
+            blur, weights.noise,
         )  # fmt: skip
         fit.put(which, others)
     good = fit.good

@@ -215,7 +215,6 @@ def fit_circles(
     blur: float = 0.9,
     noise: NoiseModel | None = None,
     start: Array | None = None,
-    iterations: int = _ITERATIONS,
 ) -> CircleFit:
     """Fit circles whose approximate outlines are `maps`.
 
@@ -253,7 +252,7 @@ def fit_circles(
         p, value, residual, N, step, settled, _ = fitted = _step(
             w, mine, parameters[w.rows], noise, work
         )
-        for _ in range(iterations - 1):  # only fits that have not converged
+        for _ in range(_ITERATIONS - 1):  # only fits that have not converged
             left = np.flatnonzero(~settled)
             if not len(left):
                 break

@@ -41,7 +41,7 @@ _JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 _BASELINE = {0xC0, 0xC1}
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _DRI, _SOS, _EOI = 0xDD, 0xDA, 0xD9
-_TIFF_TAGS = {256: 0, 257: 1}
+_TIFF_SIZE, _SHORT = (256, 257), 3  # tags of width and height; the type of 16 bit
 _MOST_TAGS = 500
 
 
@@ -86,16 +86,14 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(data: bytes, order: str) -> tuple[int, int] | None:
-    (start,) = struct.unpack(order + "I", data[4:8])
-    (count,) = struct.unpack(order + "H", data[start : start + 2])
-    size = [0, 0]
-    for i in range(min(count, _MOST_TAGS)):
-        at = start + 2 + 12 * i
-        tag, kind = struct.unpack(order + "HH", data[at : at + 4])
-        if tag in _TIFF_TAGS:
-            form, length = ("H", 2) if kind == 3 else ("I", 4)
-            (size[_TIFF_TAGS[tag]],) = struct.unpack(order + form, data[at + 8 : at + 8 + length])
-    return (size[0], size[1]) if all(size) else None
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    tags = data[start + 2 : start + 2 + 12 * min(count, _MOST_TAGS)]
+    size = {}
+    for tag, kind, _, raw in struct.iter_unpack(order + "HHI4s", tags):
+        (size[tag],) = struct.unpack_from(order + ("H" if kind == _SHORT else "I"), raw)
+    width, height = (size.get(tag, 0) for tag in _TIFF_SIZE)
+    return (width, height) if width and height else None
 
 
 _WORTH_IT = 0.98  # of the image; beyond, it is decoded as a whole

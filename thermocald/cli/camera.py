@@ -54,7 +54,7 @@ def calibrate(
     All photographs share one interior orientation. If their geometry cannot determine it and the
     camera file gives one, that one is held fixed and only the poses are estimated.
 
-    Example: thermocald calibrate photos/ --testfield testfield.csv --pixel-pitch 0.00112
+    Example: thermocald calibrate photos/ --testfield field.csv --pixel-pitch 0.00112
     --camera-out camera.json --report calibration.html
     """
     if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):

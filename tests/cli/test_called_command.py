@@ -75,7 +75,9 @@ def test_options_for_experts_stand_apart():
     assert "--window" not in usual
 
 
-def test_no_help_breaks_an_option_in_two():
+def test_every_help_has_an_example_and_breaks_no_option_in_two():
     """A wrapped example was `--pixel-` on one line and `pitch` on the next."""
     for name, _ in every_command():
-        assert not re.search(r"--[a-z-]+-$", call(*name.split(), "--help").stdout, re.MULTILINE)
+        text = call(*name.split(), "--help").stdout
+        assert "Example" in text, name
+        assert not re.search(r"--[a-z-]+-$", text, re.MULTILINE)

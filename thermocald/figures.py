@@ -208,9 +208,7 @@ def inline_svg(drawing: Any, prefix: str, label: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'font-family: [^;"]*', "font-family: sans-serif", text)
     text = re.sub(r">\s+<", "><", text)
-    text = re.sub(r'\bid="', f'id="{prefix}-', text)
-    text = re.sub(r"url\(#", f"url(#{prefix}-", text)
-    text = re.sub(r'href="#', f'href="#{prefix}-', text)
+    text = re.sub(r'\b(id="|url\(#|href="#)', rf"\g<1>{prefix}-", text)
     # numbers to 0.01 pt, a tag on one line
     text = re.sub(
         r"<[^>]*>", lambda tag: re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag[0])), text

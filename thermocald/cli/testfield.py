@@ -10,7 +10,15 @@ import typer
 
 import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import JsonOption, PhotosArgument, PixelPitchOption, say, show, takes
+from thermocald.cli.common import (
+    JsonOption,
+    PhotosArgument,
+    PixelPitchOption,
+    say,
+    show,
+    takes,
+    two_numbers,
+)
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -56,7 +64,7 @@ def _board(
 
     Raises UsageError for two boards, or for counts that cannot be read.
     """
-    from thermocald.output.testfield.print import KINDS, Board, counts_of
+    from thermocald.output.testfield.print import KINDS, Board
 
     given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
     if len(given) > 1:
@@ -66,7 +74,7 @@ def _board(
             raise UsageError("--square, --marker: give --charuco, --chessboard or --aprilgrid too")
         return None
     kind, counts = given[0]
-    columns, rows = counts_of(f"--{kind}", counts)
+    columns, rows = two_numbers(f"--{kind}", counts, "COLUMNSxROWS, up to 1000, such as 9x6", 1000)
     return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
 
 

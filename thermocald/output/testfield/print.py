@@ -167,16 +167,6 @@ class Board:
         return markers_of(self.field(), _APRIL_BORDER if self._tags else 1)
 
 
-def counts_of(option: str, text: str) -> tuple[int, int]:
-    """Return the columns and rows of text such as 9x6; UsageError that names the option."""
-    columns, _, rows = text.lower().replace("×", "x").partition("x")
-    if not (columns.isascii() and columns.isdigit() and rows.isascii() and rows.isdigit()):
-        raise UsageError(f"{option} {text}: write COLUMNSxROWS, such as 9x6")
-    if not 0 < int(columns[:6]) <= 1000 or not 0 < int(rows[:6]) <= 1000:
-        raise UsageError(f"{option} {text}: counts must be from 1 to 1000")
-    return int(columns), int(rows)
-
-
 def _room(page: tuple[float, float]) -> tuple[float, float]:
     """Return the room on a page (mm) beside the strips with the rulers."""
     return page[0] - 2 * TRIM - STRIP, page[1] - 2 * TRIM - STRIP

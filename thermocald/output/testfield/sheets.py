@@ -397,13 +397,14 @@ class Board:
     def _gap(self) -> float:
         return self.spacing * self.marker
 
+    @property
+    def _step(self) -> float:
+        return self.marker + self._gap if self._tags else self.square
+
     def _black(self) -> tuple[float, float]:
         """Return the width and height of the black area, mm."""
-        if self._tags:
-            step = self.marker + self._gap
-            return self.columns * step + self._gap, self.rows * step + self._gap
-        more = 1 if self.kind == "chessboard" else 0
-        return (self.columns + more) * self.square, (self.rows + more) * self.square
+        more = self._gap if self._tags else self.square * (self.kind == "chessboard")
+        return self.columns * self._step + more, self.rows * self._step + more
 
     def _extent(self) -> tuple[float, float]:
         """Return the width and height with the white margin, mm."""
@@ -413,16 +414,12 @@ class Board:
 
     def squares(self) -> Iterator[tuple[float, float, float]]:
         """Yield the black squares that are not markers: lower left x, y and side, mm."""
-        if self._tags:
-            step = self.marker + self._gap
-            for j, i in product(range(self.rows + 1), range(self.columns + 1)):
-                yield i * step - self._gap, j * step - self._gap, self._gap
-        else:
-            s, more = self.square, int(self.kind == "chessboard")
-            white = self.legacy and self.rows % 2 == 0  # the upper left one
-            for j, i in product(range(self.rows + more), range(self.columns + more)):
-                if (i + self.rows + more - 1 - j) % 2 == white:
-                    yield i * s, j * s, s
+        low, side = (-self._gap, self._gap) if self._tags else (0.0, self.square)
+        rows, columns = (n + (self.kind != "charuco") for n in (self.rows, self.columns))
+        white = self.legacy and self.rows % 2 == 0  # the upper left one
+        for j, i in product(range(rows), range(columns)):
+            if self._tags or (i + rows - 1 - j) % 2 == white:
+                yield i * self._step + low, j * self._step + low, side
 
     def markers(self) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
         """Yield the markers, as `markers_of` does."""
@@ -477,8 +474,7 @@ class Printed:
         for sheet in self.sheets:
             if sheet.scale_bar is not None:
                 a, b = (sheet.field.names[row] for row in sheet.scale_bar)
-                dx, dy, _ = np.diff(sheet.field.points[[*sheet.scale_bar]], axis=0)[0]
-                length = float(np.hypot(dx, dy))
+                length = float(np.linalg.norm(np.subtract(*sheet.field.points[[*sheet.scale_bar]])))
                 bars.append({"sheet": sheet.title, "a": a, "b": b, "nominal": length})
         corners = self.field.kinds.count("marker_corner")
         plain = self.field.codes.count("")

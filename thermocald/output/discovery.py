@@ -22,7 +22,6 @@ from thermocald.figures import (
     Curve,
     Figure,
     Panel,
-    drawing_style,
     image_panel,
     label_axes,
     legend_above,
@@ -276,8 +275,7 @@ def _movement(d: Discovery) -> Figure:
 def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) -> Any:
     """Draw bars (name, px, colour) in groups, each group with its noise, px."""
     bars = [bar for _, group in groups for bar in group]
-    with drawing_style():
-        drawing = new_drawing(4.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups))
+    with new_drawing(4.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups)) as drawing:
         axis = drawing.subplots()
         place = 0.0
         for k, (noise, group) in enumerate(groups):
@@ -403,8 +401,7 @@ def _noise_test(d: Discovery) -> Section:
     x = d.examination
     names = x.best.names[len(x.base.terms) :]
     tests = list(zip(names, x.surrogates, strict=False))
-    with drawing_style():
-        drawing = new_drawing(4.0, 0.4 + 1.7 * len(tests))
+    with new_drawing(4.0, 0.4 + 1.7 * len(tests)) as drawing:
         axes = np.atleast_1d(drawing.subplots(len(tests), 1))
         for axis, (name, test) in zip(axes, tests, strict=True):
             _draw_surrogates(axis, name, test)

@@ -15,7 +15,6 @@ The field of another program's board (ChArUco, chessboard, Kalibr's AprilGrid) i
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import count, product
@@ -23,7 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import DriverMissing, UsageError
+from thermocald.errors import UsageError
+from thermocald.figures import drawing_style
 from thermocald.files import new_file
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import boards, ring_code
@@ -544,11 +544,8 @@ def print_board(
 
 def _drawing() -> ModuleType:
     """Return the drawing module; DriverMissing, with the command to run, without matplotlib."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise DriverMissing(
-            "drawing a test field needs matplotlib: pip install 'thermocald[report]'"
-        )
-    return importlib.import_module("thermocald.output.testfield.drawing")
+    with drawing_style():
+        return importlib.import_module("thermocald.output.testfield.drawing")
 
 
 def _publish(

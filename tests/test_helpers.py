@@ -206,10 +206,11 @@ def scaled(factor, item):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_in_order_and_an_error_comes_through(jobs):
-    assert list(in_order(scaled, 3, range(12), jobs)) == [3 * k for k in range(12)]
     assert list(in_order(scaled, 3, [], jobs)) == []
+    results = in_order(scaled, 3, [*range(12), "bad", 2], jobs)
+    assert [next(results) for _ in range(12)] == [3 * k for k in range(12)]
     with pytest.raises(ValueError, match="this one is bad"):
-        list(in_order(scaled, 3, [1, "bad", 2], jobs))
+        next(results)
 
 
 def test_items_are_taken_as_results_are_asked_for():

@@ -27,7 +27,7 @@ from thermocald.store.logger.clock import DeviceClock, time_zone
 from thermocald.store.logger.dialect import LogOptions
 from thermocald.store.logger.temperatures import read_log
 
-FEW = {"max_examples": 40, "deadline": None, "derandomize": True,
+FEW = {"max_examples": 25, "deadline": None, "derandomize": True,
        "suppress_health_check": [HealthCheck.function_scoped_fixture]}  # fmt: skip
 AMOUNTS = pytest.mark.parametrize(
     "amount",

@@ -14,7 +14,7 @@ import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
@@ -163,9 +163,16 @@ def thin(x: Array, *ys: Array) -> tuple[Array, ...]:
 
 @contextmanager
 def drawing_style() -> Iterator[None]:
-    """Set the common style of all drawings while one is made."""
-    import matplotlib as mpl
+    """Set the common style of all drawings while one is made.
 
+    Raises DriverMissing if matplotlib is not installed.
+    """
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        raise DriverMissing(
+            "a drawing needs matplotlib: pip install 'thermocald[report]'"
+        ) from None
     settings: Any = _STYLE
     with mpl.rc_context(settings), warnings.catch_warnings():
         # the browser has the glyphs that this font lacks
@@ -174,28 +181,22 @@ def drawing_style() -> Iterator[None]:
         yield
 
 
+@contextmanager
 def new_drawing(
     width: float, height: float, layout: Literal["constrained"] | None = "constrained"
-) -> Any:
-    """Return an empty drawing, width × height inches.
-
-    Raises DriverMissing if matplotlib is not installed.
-    """
-    # not with pyplot: no global state, no window, nothing to close
-    try:
+) -> Iterator[Any]:
+    """Yield an empty drawing, width × height inches, and set its style while it is made."""
+    with drawing_style():
+        # not with pyplot: no global state, no window, nothing to close
         from matplotlib.figure import Figure as Canvas
-    except ImportError:
-        raise DriverMissing(
-            "a drawing needs matplotlib: pip install 'thermocald[report]'"
-        ) from None
 
-    class Shown(Canvas):
-        """A drawing that a notebook shows without `%matplotlib`."""
+        class Shown(Canvas):
+            """A drawing that a notebook shows without `%matplotlib`."""
 
-        def _repr_svg_(self) -> str:
-            return inline_svg(self, "drawing", "drawing")
+            def _repr_svg_(self) -> str:
+                return inline_svg(self, "drawing", "drawing")
 
-    return Shown(figsize=(width, height), layout=layout)
+        yield Shown(figsize=(width, height), layout=layout)
 
 
 def inline_svg(drawing: Any, prefix: str, label: str) -> str:
@@ -208,9 +209,7 @@ def inline_svg(drawing: Any, prefix: str, label: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'font-family: [^;"]*', "font-family: sans-serif", text)
     text = re.sub(r">\s+<", "><", text)
-    text = re.sub(r'\bid="', f'id="{prefix}-', text)
-    text = re.sub(r"url\(#", f"url(#{prefix}-", text)
-    text = re.sub(r'href="#', f'href="#{prefix}-', text)
+    text = re.sub(r'\b(id="|url\(#|href="#)', rf"\g<1>{prefix}-", text)
     # numbers to 0.01 pt, a tag on one line
     text = re.sub(
         r"<[^>]*>", lambda tag: re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag[0])), text
@@ -247,9 +246,8 @@ def save(drawing: Any, folder: Path, name: str) -> list[Path]:
 
 def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
     """Draw a panel alone."""
-    with drawing_style():
-        # fixed margins fit the short labels; fitting them exactly triples the time of a report
-        drawing = new_drawing(*_PANEL_INCHES, None)
+    # fixed margins fit the short labels; fitting them exactly triples the time of a report
+    with new_drawing(*_PANEL_INCHES, None) as drawing:
         axis = drawing.subplots()
         rows = _fill(axis, panel, legend=legend)
         drawing.subplots_adjust(right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
@@ -264,20 +262,18 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
 
 def draw_figure(figure: Figure) -> Drawing:
     """Draw all panels of a figure in one drawing, for a paper."""
-    drawing: Drawing | None = figure.drawing
-    if drawing is not None:
-        return drawing
-    with drawing_style():
-        columns = figure.in_a_row
-        rows = -(-len(figure.panels) // columns)
-        drawing = new_drawing(_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows)
+    if figure.drawing is not None:
+        return cast("Drawing", figure.drawing)
+    columns = figure.in_a_row
+    rows = -(-len(figure.panels) // columns)
+    with new_drawing(_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows) as drawing:
         axes = np.atleast_1d(drawing.subplots(rows, columns)).ravel()
         for i, axis in enumerate(axes):
             if i < len(figure.panels):
                 _fill(axis, figure.panels[i], legend=i == 0)
             else:
                 axis.set_axis_off()
-        return drawing
+        return cast("Drawing", drawing)
 
 
 def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
@@ -405,11 +401,10 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
 
 def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
     """Draw correlation coefficients (n, n) as coloured cells with numbers; NaN is grey."""
-    with drawing_style():
-        n = len(names)
-        short = [shortened(name, _MATRIX_LETTERS) for name in names]
-        size = 1.3 + 0.31 * n
-        drawing = new_drawing(size, size + 0.3)
+    n = len(names)
+    short = [shortened(name, _MATRIX_LETTERS) for name in names]
+    size = 1.3 + 0.31 * n
+    with new_drawing(size, size + 0.3) as drawing:
         axis = drawing.subplots()
         axis.set_facecolor("#dddddd")
         # not an image, since cells of an SVG stay sharp and can be edited

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from thermocald import __version__
+from thermocald.errors import DriverMissing
 from thermocald.numbers import typeset_powers
 
 if TYPE_CHECKING:
@@ -100,8 +101,11 @@ class Chapter:
 
 
 def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> str:
-    """Return the page of a report as HTML text."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+    """Return the page of a report as HTML text; DriverMissing if Jinja is not installed."""
+    try:
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+    except ImportError:
+        raise DriverMissing("a report needs Jinja: pip install 'thermocald[report]'") from None
 
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),

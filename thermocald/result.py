@@ -94,10 +94,9 @@ def new_figure(
 
     panel: width and height of an axis, inches. Raises DriverMissing if matplotlib is not installed.
     """
-    from thermocald.figures import drawing_style, new_drawing
+    from thermocald.figures import new_drawing
 
-    with drawing_style():
-        figure = new_drawing(panel[0] * columns, panel[1] * rows)
+    with new_drawing(panel[0] * columns, panel[1] * rows) as figure:
         return figure, figure.subplots(rows, columns, squeeze=False, sharex=columns == 1)
 
 

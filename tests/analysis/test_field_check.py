@@ -9,7 +9,7 @@ import pytest
 
 from thermocald.analysis.field import check_field, precision, station_at, usual_station
 from thermocald.errors import GeometryError
-from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
+from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import (
     DEFAULT_FREE,
     IOP_NAMES,

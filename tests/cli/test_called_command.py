@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 
 import pytest
 
-from tests.commands import call
+from tests.commands import call, every_command
 from thermocald.cli.commands import COMMANDS, PANELS
 
 _SAY = """
@@ -72,3 +73,11 @@ def test_options_for_experts_stand_apart():
     assert "--report" in usual
     assert "--window" in advanced
     assert "--window" not in usual
+
+
+def test_every_help_has_an_example_and_breaks_no_option_in_two():
+    """A wrapped example was `--pixel-` on one line and `pitch` on the next."""
+    for name, _ in every_command():
+        text = call(*name.split(), "--help").stdout
+        assert "Example" in text, name
+        assert not re.search(r"--[a-z-]+-$", text, re.MULTILINE)

@@ -18,7 +18,7 @@ from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
 from tests.photogrammetry.printed_sheets import Sheet, photograph, put_up
 from tests.pictures import TAKEN, save_photograph, write_markers
-from thermocald.output.testfield.layout import TRIM, paper_size
+from thermocald.output.testfield.sheets import TRIM, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.physics.model_file import write_model
 from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sqlite3
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 
 from thermocald.errors import ServerError, ServerGone
 from thermocald.fleet.forward import Forwarder, Progress, forward_forever
-from thermocald.store.database.store import Store
 from thermocald.store.series import Event, LoggedReading
 
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
@@ -75,16 +73,6 @@ def test_server_and_store_give_the_same(filled, server, make_result):
         assert [(utc, json.loads(values)) for utc, values in readings] == [
             (reading.utc, reading.values) for reading in store.readings("logger")
         ]
-
-
-def test_what_is_sent_again_is_there_once(filled, server, tmp_path):
-    store, _ = filled
-    for _ in range(2):
-        Forwarder(store.path, address(server), "bank", tmp_path / "cursor", batch=3).send_waiting()
-        (tmp_path / "cursor").unlink()
-    assert count(server, "epoch") == 20
-    Forwarder(store.path, address(server), "hill", tmp_path / "other").send_waiting()
-    assert count(server, "epoch") == 40
 
 
 def test_a_role_that_may_only_insert_is_enough(filled, server, role):
@@ -201,25 +189,6 @@ def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
     numbers = execute(server, "SELECT number FROM epoch ORDER BY 1")
     assert [n for (n,) in numbers] == [n for n in range(1, 21) if n not in (5, 9)]
     assert execute(server, "SELECT refused FROM station") == [(3,)]
-
-
-def test_a_new_store_in_the_place_of_the_old_is_sent_from_its_start(
-    server, tmp_path, head, field, make_epoch
-):
-    """This holds even if the file system gives it the old one's inode."""
-    path = tmp_path / "k.db"
-    for created, epochs in ((1.0, 5), (2.0, 3)):
-        with Store.open(path, "append") as store:
-            series = store.create_series(head, field, created_utc=created)
-            for number in range(1, epochs + 1):
-                store.append(series, make_epoch(number))
-        cursor = path.with_name("k.db.forwarded")
-        if cursor.exists():
-            text = cursor.read_text()
-            cursor.write_text(re.sub(r'"inode": \d+', f'"inode": {path.stat().st_ino}', text))
-        Forwarder(path, address(server), "bank").send_waiting()
-        path.unlink()
-    assert count(server, "epoch") == 8
 
 
 def test_addresses():

@@ -123,17 +123,3 @@ def test_a_scheduler_that_is_not_there_is_said(archive, tmp_path):
     assert done.returncode == 1
     assert "the scheduler cannot be reached" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("reader", ["pandas", "duckdb"])
-def test_the_files_are_read_without_us(calibrated, reader):
-    if reader == "pandas":
-        pandas = pytest.importorskip("pandas", reason="pip install pandas")
-        table = pandas.read_parquet(calibrated)
-        rows, good = len(table), int((table.status == "ok").sum())
-    else:
-        duckdb = pytest.importorskip("duckdb", reason="pip install duckdb")
-        rows, good = duckdb.execute(
-            f"SELECT count(*), count(*) FILTER (status = 'ok') FROM '{calibrated}/*/*.parquet'"
-        ).fetchone()
-    assert (rows, good) == (160, 160)

@@ -13,7 +13,7 @@ from tests.marks import mostly_slow
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import Sheet, photograph, rasterised
 from thermocald.errors import ThermocaldError
-from thermocald.output.testfield.print import Board
+from thermocald.output.testfield.sheets import Board
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.markers import corner_shift

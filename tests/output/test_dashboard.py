@@ -364,10 +364,14 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
 
 
 def test_the_table_of_a_series_without_epochs_has_its_header(tmp_path):
-    head = Head("rpi", "M1", 10.0, CameraSpec("rpi", Sensor(64, 48, 0.003)), {"t": Channel()})
+    """Its camera's name, which no header of an answer may hold, was an error of the server."""
+    head = Head("rpi", "M1", 10.0, CameraSpec("相机", Sensor(64, 48, 0.003)), {"t": Channel()})
     with Store.open(tmp_path / "t.db", "append", durable=False) as store:
         store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
-    header, *rows = "".join(View(tmp_path / "t.db", tmp_path).csv("rpi", "M1")).splitlines()
+    client = Client(build_application(tmp_path / "t.db", tmp_path, None, "::1"), "http://[::1]")
+    answer = client.get("/api/series.csv", params={"camera": "相机", "series": "M1"})
+    assert answer.headers["content-disposition"] == 'attachment; filename="---M1.csv"'
+    header, *rows = answer.text.splitlines()
     assert header.startswith("epoch,frame_time,temperature_time,t,c,x0,")
     assert rows == []
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -19,7 +20,7 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
-from tests.commands import call
+from tests.commands import call, invoke
 from tests.conftest import watch
 from tests.daemon.conftest import make_recording
 from tests.pictures import from_five_places
@@ -29,6 +30,7 @@ from thermocald.analysis.series.recorded import series_epochs
 from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
+from thermocald.errors import DriverMissing
 from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
@@ -477,6 +479,14 @@ def test_a_calibration_without_a_result_says_why(undrawn):
     assert "Not calibrated: " in words
     assert "a.jpg" in words
     assert _MARKS.findall(words) == []
+
+
+@pytest.mark.parametrize(("missing", "named"), [("matplotlib", "matplotlib"), ("jinja2", "Jinja")])
+def test_without_its_extra_a_report_names_it(monkeypatch, tmp_path, missing, named):
+    """It was a traceback."""
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(DriverMissing, match=rf"needs {named}: pip install 'thermocald\[report\]'"):
+        invoke("testfield", "check", "--report", tmp_path / "page.html")
 
 
 def test_three_epochs_are_correlated_by_chance_which_is_not_told(warm_up, undrawn):

@@ -13,8 +13,15 @@ from tests.marks import mostly_slow
 from tests.photogrammetry.printed_sheets import rasterised
 from thermocald.analysis.field import usual_station
 from thermocald.errors import UsageError
-from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
-from thermocald.output.testfield.print import default_diameter, print_testfield
+from thermocald.output.testfield.sheets import (
+    TRIM,
+    Design,
+    default_diameter,
+    field_of,
+    lay_out,
+    paper_size,
+    print_testfield,
+)
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.store.recording.testfield_file import read_testfield

@@ -8,8 +8,7 @@ import pytest
 
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph, put_up
-from thermocald.output.testfield.layout import TRIM, Design, paper_size
-from thermocald.output.testfield.print import print_testfield
+from thermocald.output.testfield.sheets import TRIM, Design, paper_size, print_testfield
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError, ImageError
-from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
+from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.field.testfield import Distance, TestField
 from thermocald.photogrammetry.survey import survey

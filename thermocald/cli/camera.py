@@ -25,6 +25,7 @@ from thermocald.cli.common import (
     say_warning,
     show,
     takes_log_options,
+    two_numbers,
     warnings_said,
     write_json,
     write_parts,
@@ -54,7 +55,7 @@ def calibrate(
     All photographs share one interior orientation. If their geometry cannot determine it and the
     camera file gives one, that one is held fixed and only the poses are estimated.
 
-    Example: thermocald calibrate photos/ --testfield testfield.csv --pixel-pitch 0.00112
+    Example: thermocald calibrate photos/ --testfield field.csv --pixel-pitch 0.00112
     --camera-out camera.json --report calibration.html
     """
     if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):
@@ -246,12 +247,13 @@ def correct(
 
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
-    thermal = tc.load_camera(model)
+    thermal, size = tc.load_camera(model), None
+    if image_size is not None:
+        size = two_numbers("--size", image_size, "WIDTHxHEIGHT in px, such as 1640x1232")
     with warnings_said():
         done = tc.correct(
             points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
-            size=None if image_size is None else _size(image_size), timezone=timezone,
-            ambiguous=ambiguous, extrapolate=extrapolate, say=say,
+            size=size, timezone=timezone, ambiguous=ambiguous, extrapolate=extrapolate, say=say,
         )  # fmt: skip
         if done.of_images and out is None:
             raise UsageError("--out is missing: the folder for the corrected images")
@@ -267,13 +269,6 @@ def correct(
     if json != "-" and out is not None:
         typer.echo(f"{out}: {done}")
     done.require_all()
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not width.isdigit() or not height.isdigit() or int(width) * int(height) == 0:
-        raise UsageError(f"--size {text}: write WIDTHxHEIGHT in px, such as 1640x1232")
-    return int(width), int(height)
 
 
 @takes_log_options

@@ -128,6 +128,12 @@ class Command(TyperCommand):
     cannot be written are refused before anything is computed.
     """
 
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        for parameter in self.params:
+            if parameter.param_type_name == "argument":  # in capitals, as the texts name it
+                parameter.metavar = parameter.metavar or str(parameter.name).upper()
+
     def invoke(self, ctx: Any) -> Any:
         """Check numbers, options and outputs, then run the command."""
         for parameter in self.get_params(ctx):

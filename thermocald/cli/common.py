@@ -6,6 +6,7 @@ import functools
 import inspect
 import json
 import logging
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -222,6 +223,15 @@ def require_config(given: Path | None, instead: str) -> Path:
         there = "there is neither ./config.yaml nor /etc/thermocald/config.yaml"
         raise UsageError(f"{there}; give {instead}")
     return found
+
+
+def two_numbers(option: str, text: str, form: str, most: int = 999_999) -> tuple[int, int]:
+    """Return the numbers of text such as 9x6, from 1 to `most`; UsageError that states the form."""
+    found = re.fullmatch(r"([0-9]{1,6})[x×]([0-9]{1,6})", text.lower())
+    first, second = map(int, found.groups()) if found else (0, 0)
+    if not (0 < first <= most and 0 < second <= most):
+        raise UsageError(f"{option} {text}: write {form}")
+    return first, second
 
 
 def write_json(document: Any, destination: str | None) -> None:

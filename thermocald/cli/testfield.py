@@ -10,11 +10,19 @@ import typer
 
 import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import JsonOption, PhotosArgument, PixelPitchOption, say, show, takes
+from thermocald.cli.common import (
+    JsonOption,
+    PhotosArgument,
+    PixelPitchOption,
+    say,
+    show,
+    takes,
+    two_numbers,
+)
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from thermocald.output.testfield.layout import Design
+    from thermocald.output.testfield.sheets import Design
 
 CameraFile = Annotated[
     Path | None,
@@ -56,7 +64,7 @@ def _board(
 
     Raises UsageError for two boards, or for counts that cannot be read.
     """
-    from thermocald.output.testfield.print import KINDS, Board, counts_of
+    from thermocald.output.testfield.sheets import KINDS, Board
 
     given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
     if len(given) > 1:
@@ -66,7 +74,7 @@ def _board(
             raise UsageError("--square, --marker: give --charuco, --chessboard or --aprilgrid too")
         return None
     kind, counts = given[0]
-    columns, rows = counts_of(f"--{kind}", counts)
+    columns, rows = two_numbers(f"--{kind}", counts, "COLUMNSxROWS, up to 1000, such as 9x6", 1000)
     return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
 
 
@@ -104,11 +112,10 @@ def print_(
 
     Example: thermocald testfield print --aprilgrid 6x6 --paper A2 --out board
     """
-    from thermocald.output.testfield import print as sheets
-    from thermocald.output.testfield.layout import paper_size
+    from thermocald.output.testfield import sheets
 
     if board is not None:  # by default the page has the orientation of the board
-        page = paper_size(paper, landscape, usual=board.columns > board.rows)
+        page = sheets.paper_size(paper, landscape, usual=board.columns > board.rows)
         printed = sheets.print_board(board.filled(page), page, out, replace_printed=force)
     else:
         design = replace(
@@ -256,7 +263,7 @@ def check(
 
     Example: thermocald testfield check field/testfield.csv --from 900 900 700
     """
-    from thermocald.output.testfield.layout import field_of, lay_out
+    from thermocald.output.testfield.sheets import field_of, lay_out
 
     drawn = _design(paper, flat, landscape, diameter)
     targets = field_of(lay_out(drawn)) if field is None else tc.read_testfield(field)
@@ -276,8 +283,7 @@ def check(
 
 def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | None) -> Design:
     """Return the print that these options describe; UsageError for an unknown paper size."""
-    from thermocald.output.testfield.layout import Design, paper_size
-    from thermocald.output.testfield.print import default_diameter
+    from thermocald.output.testfield.sheets import Design, default_diameter, paper_size
 
     page = paper_size(paper, landscape, usual=not flat)
     return Design(

@@ -26,7 +26,7 @@ import numpy as np
 
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
 from thermocald.analysis.statistics.significance import dependence
-from thermocald.figures import BAND, PALETTE, Figure, drawing_style, label_axes, new_drawing
+from thermocald.figures import BAND, PALETTE, Figure, label_axes, new_drawing
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, parameter_label, percent, short_duration, shortened
 from thermocald.photogrammetry.linalg import mad_sd
@@ -520,8 +520,7 @@ def _drawing(
     of_type = kind["rates"][rate]
     mean, spread = 1e3 * of_type["value"], 1e3 * BAND * of_type["sd_between"]
     labelled = len(specimens) <= _MOST_LABELLED
-    with drawing_style():
-        drawing = new_drawing(5.0, 0.9 + (0.2 if labelled else 0.05) * len(specimens))
+    with new_drawing(5.0, 0.9 + (0.2 if labelled else 0.05) * len(specimens)) as drawing:
         axis = drawing.subplots()
         axis.axvspan(mean - spread, mean + spread, color=PALETTE[0], alpha=0.12, lw=0)
         axis.axvline(mean, color=PALETTE[0], lw=1)

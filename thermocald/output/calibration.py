@@ -102,7 +102,7 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     if covered < _LITTLE_COVERED:
         steps.append("Take photographs with the field in the parts of the image that are empty.")
     if result.estimated:
-        steps.append("Write the camera with --camera-out and use it in every later command.")
+        steps.append("Use the camera that --camera-out writes in every later command.")
     return Answer(
         sentence, proof, more, tuple(steps),
         (

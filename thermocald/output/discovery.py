@@ -22,7 +22,6 @@ from thermocald.figures import (
     Curve,
     Figure,
     Panel,
-    drawing_style,
     image_panel,
     label_axes,
     legend_above,
@@ -181,14 +180,19 @@ def _of_readings(d: Discovery) -> Array:
     return np.asarray(rates * e.thermometers[e.history.reference].noise)
 
 
+def _root(e: ReducedSeries) -> Array:
+    """Return R (P, P) with R Rᵀ the mean normal matrix: |p R| is the movement of parameters p."""
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    return np.asarray(U * np.sqrt(np.maximum(size, 0.0)))
+
+
 def _trajectory(d: Discovery) -> Figure:
     """Draw measured and modelled image movement over time and temperature, residuals below."""
     e = d.examination.fitter.series[0]
     base, final = (fit.parameters(0) for fit in (d.base_fit, d.final_fit))
     rests = [_without_level(e, e.values - m) for m in (base, final)]
     found = bool(np.abs(final - base).max() > 0)
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    root = U * np.sqrt(np.maximum(size, 0.0))
+    root = _root(e)
     model = _without_level(e, final - base) if found else rests[0]
     _, _, v = np.linalg.svd(model @ root, full_matrices=False)
     # root-mean-square over the image coordinates
@@ -234,14 +238,12 @@ def _movement(d: Discovery) -> Figure:
     e = d.examination.fitter.series[0]
     seen = e.weights[..., 0].any(axis=0)
     places = e.at.predicted[seen]
-    N = e.N.mean(axis=0)
-    size, U = np.linalg.eigh(N)
-    keep = size > 1e-6 * size.max()
+    root = _root(e)
     drawn = []
     for fit in dict.fromkeys((d.base_fit, d.final_fit)):
         r = _without_level(e, e.values - fit.parameters(0))
-        _, s, v = np.linalg.svd((r @ U) * np.sqrt(np.maximum(size, 0.0)), full_matrices=False)
-        pattern = U[:, keep] @ (v[0][keep] / np.sqrt(size[keep])) * s[0] / np.sqrt(len(r))
+        _, s, v = np.linalg.svd(r @ root, full_matrices=False)
+        pattern = np.linalg.pinv(root, rcond=1e-3).T @ v[0] * s[0] / np.sqrt(len(r))
         misfit = np.sqrt(np.mean(np.einsum("tij,ej->eti", e.columns[seen], r) ** 2))
         drawn.append((float(misfit), np.einsum("tij,j->ti", e.columns[seen], pattern)))
     reading_sd = e.thermometers[e.history.reference].noise
@@ -276,8 +278,7 @@ def _movement(d: Discovery) -> Figure:
 def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) -> Any:
     """Draw bars (name, px, colour) in groups, each group with its noise, px."""
     bars = [bar for _, group in groups for bar in group]
-    with drawing_style():
-        drawing = new_drawing(4.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups))
+    with new_drawing(4.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups)) as drawing:
         axis = drawing.subplots()
         place = 0.0
         for k, (noise, group) in enumerate(groups):
@@ -403,8 +404,7 @@ def _noise_test(d: Discovery) -> Section:
     x = d.examination
     names = x.best.names[len(x.base.terms) :]
     tests = list(zip(names, x.surrogates, strict=False))
-    with drawing_style():
-        drawing = new_drawing(4.0, 0.4 + 1.7 * len(tests))
+    with new_drawing(4.0, 0.4 + 1.7 * len(tests)) as drawing:
         axes = np.atleast_1d(drawing.subplots(len(tests), 1))
         for axis, (name, test) in zip(axes, tests, strict=True):
             _draw_surrogates(axis, name, test)

@@ -19,20 +19,10 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_FOLLOW_C = """\
-    /* the lens preserves the angles of its rays: the distortion scales with c */
-    double s = {c0} / p[0];
-    p[3] *= s * s;
-    p[4] *= s * s * s * s;
-    p[5] *= s * s * s * s * s * s;
-    p[6] *= s;
-    p[7] *= s;
-"""
-
-_FOLLOW_PYTHON = """\
-    s = {c0} / p[0]  # the lens preserves the angles of its rays: the distortion scales with c
-    p[3:8] = p[3] * s**2, p[4] * s**4, p[5] * s**6, p[6] * s, p[7] * s
-"""
+_LENSES = {
+    "angle": "the lens preserves the angles of its rays: the distortion scales with c",
+    "image": "the distortion in the image does not change with c",
+}
 
 
 def write_code(camera: ThermalCamera, path: Path) -> tuple[Path, Path]:
@@ -54,14 +44,14 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
     p, bends = camera.steady_tables()
     rows = [_row(k) for k in bends]
     if kind == "h":
-        follow, knees = _FOLLOW_C, ", ".join([*(f"{{{row}}}" for row in rows), "{0}"])
+        knees = ", ".join([*(f"{{{row}}}" for row in rows), "{0}"])
     else:
-        follow, knees = _FOLLOW_PYTHON, "".join(f"({row}), " for row in rows).strip()
+        knees = "".join(f"({row}), " for row in rows).strip()
     identifier = re.sub(r"\W", "_", name, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"camera_{identifier}"
     reference, limits = next(iter(model.validity.items()), ("the thermometer", (-273.0, 1000.0)))
     affine = any(any(row[8:]) for row in p) or any(any(k[9:]) for k in bends)
-    c0 = repr(float(model.interior.c))
+    scale = f"{float(model.interior.c)!r} / p[0]" if model.distortion == "angle" else "1.0"
     exact = "C1 or C2 are not zero: the projection is exact, OpenCV's parameters are not."
     fields = {
         "name": _plain(model.name or model.camera), "id": identifier,
@@ -70,7 +60,7 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
         "height": sensor.height, "pitch": repr(float(sensor.pixel_pitch)),
         "T0": repr(float(model.T0)), "p0": _row(p[0]), "p1": _row(p[1]), "p2": _row(p[2]),
         "n": len(rows), "knees": knees,
-        "follow": follow.format(c0=c0) if model.distortion == "angle" else "",
+        "scale": scale, "lens": _LENSES[model.distortion],
         "exact": exact if affine else "OpenCV's parameters are exact.",
     }  # fmt: skip
     text = (_TEMPLATES / f"model.{kind}.txt").read_text(encoding="utf-8")

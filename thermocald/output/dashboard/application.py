@@ -12,6 +12,7 @@ import hmac
 import io
 import json
 import math
+import re
 import shutil
 from dataclasses import dataclass
 from functools import cache, partial
@@ -297,9 +298,7 @@ def _csv(view: View, request: Request) -> Response:
     camera, series = _camera_and_series(request)
     text = view.csv(camera, series)
     head = next(text)  # an error is answered before the table begins
-    name = f"{camera}-{series}.csv"
-    if not all(c.isalnum() or c in "._-" for c in name):
-        name = "series.csv"
+    name = re.sub(r"[^\w.-]", "-", f"{camera}-{series}.csv", flags=re.ASCII)  # fits into a header
     return StreamingResponse(
         chain([head], text),
         media_type="text/csv",

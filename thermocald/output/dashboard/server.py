@@ -128,31 +128,27 @@ class Limits:
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._slots = {path: asyncio.Semaphore(most) for path, (most, _) in _COSTLY.items()}
-        self._waiting = dict.fromkeys(_COSTLY, 0)
+        self._asked = dict.fromkeys(_COSTLY, 0)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         path = scope.get("path", "")
         if path not in _COSTLY:
             await self._app(scope, receive, send)
             return
-        slot = self._slots[path]
-        if slot.locked() and self._waiting[path] >= _COSTLY[path][1]:
+        if self._asked[path] >= sum(_COSTLY[path]):
             busy = JSONResponse(
                 {"error": "too many requests at once; try again"}, 503, {"retry-after": "5"}
             )
             await busy(scope, receive, send)
             return
-        self._waiting[path] += 1
+        self._asked[path] += 1
         try:
-            await slot.acquire()
-        finally:
-            self._waiting[path] -= 1
-        try:
-            await self._app(scope, receive, send)
+            async with self._slots[path]:
+                await self._app(scope, receive, send)
         except RuntimeError as error:
             if not isinstance(error.__cause__, ThermocaldError):
                 raise
             # part of the answer is sent already: it can only be cut off
             log.warning("%s: %s", path, error.__cause__)
         finally:
-            slot.release()
+            self._asked[path] -= 1

@@ -20,7 +20,7 @@ from matplotlib.patches import PathPatch, Polygon, Wedge
 from matplotlib.path import Path as Curve
 from matplotlib.transforms import Affine2D
 
-from thermocald.output.testfield.layout import STRIP, TRIM, Sheet, markers_of
+from thermocald.output.testfield.sheets import STRIP, TRIM, Sheet, markers_of
 from thermocald.photogrammetry.targets import outline, ring_code
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.output.testfield.print import Board
+    from thermocald.output.testfield.sheets import Board
 
 
 _MM_PER_INCH = 25.4

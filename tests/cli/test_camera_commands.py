@@ -239,6 +239,7 @@ def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
         (("warm=a.json", "50=b.json"), "'warm' is not a temperature"),
         (("20=a.json", "50=free.json"), "calibrate both with the same --free"),
         (("20=a.json", "M1"), "fit series and calibrations apart"),
+        (("20=M1",), "fit series and calibrations apart"),
         (("20=a.json", "50=none.json"), "no covariance"),
         (("20=a.json", "50=list.json"), "not a camera file of any format"),
     ],
@@ -248,6 +249,7 @@ def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):
     write_document(tmp_path / "a.json", 20, rng)
     write_document(tmp_path / "b.json", 50, rng)
     written(tmp_path / "none.json", COLD)
+    (tmp_path / "M1").mkdir()
     (tmp_path / "list.json").write_text('["thermocald-calibration/1"]')
     C = covariance()
     C[6, 6] = 1e-12

@@ -127,6 +127,7 @@ def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
         ("thermal_lagg", "did you mean 'thermal_lag'?"),
         ("thermal_lag:taw=3", "thermal_lag has no parameter 'taw'; did you mean 'tau'?"),
         ("thermal_lag:tau=fast", "tau=fast is not a number"),
+        ("thermal_lag:", "no parameter after the colon; there are: tau"),
         ("thermal_lag:tau", "tau has no value; give tau=VALUE"),
         ("thermal_lag:tau=-3", "negative"),
         ("second_heat_source", "give it, as in --effect second_heat_source:channel="),

@@ -103,7 +103,7 @@ def test_condensed_evidence_is_the_likelihood(above):
     fit = above.fitter.fit(above.base.terms)
     structure, values = whole.named()
     candidate = Candidate(structure.text(), BASE, "k", np.array([values["k"]]))
-    full = float(Scanner(above.fitter).scan(candidate, fit).gains[0])
+    full = float(Scanner(above.fitter).scan(candidate, fit).gains[0][0])
     assert gain == pytest.approx(full, rel=0.002)
     assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T is in the base
 

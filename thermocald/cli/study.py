@@ -374,7 +374,7 @@ def _temperatures(inputs: list[str]) -> dict[str, float | None]:
         label, equals, rest = text.partition("=")
         name = rest if equals and not Path(text).exists() else text
         if Path(name).suffix != ".json":
-            if found:
+            if found or (name == rest and Path(name).exists()):
                 raise UsageError(f"{text}: is not a calibration; fit series and calibrations apart")
             return {}
         try:

@@ -216,12 +216,13 @@ def _search_beside_knocks(
     whole, inside = (make_candidate(event, names, series) for names in (EOP_NAMES, BASE))
     knocks: tuple[Term, ...] = ()
     for _ in range(KNOCKS):
-        steps = (search.scanner.scan(c, base.fit).events for c in (whole, inside))
+        steps = (search.scanner.scan(c, base.fit).gains for c in (whole, inside))
+        differences = [a - np.maximum(b, 0.0) for a, b in zip(*steps, strict=True)]
         fresh = tuple(
-            ((whole.name, float(e.times[np.argmax(a - b) + 1])),)
-            if np.max(a - b) > criteria.SLIP_NOT_KNOCK
+            ((whole.name, float(e.times[np.argmax(more) + 1])),)
+            if np.max(more) > criteria.SLIP_NOT_KNOCK
             else None
-            for e, a, b in zip(series, *steps, strict=True)
+            for e, more in zip(series, differences, strict=True)
         )
         if not any(fresh):
             break

@@ -167,11 +167,11 @@ class Search:
             penalty = (count + (value is not None)) * each + once
             penalty += 2 * float(np.log(max(self._trials[key], 1.0)))
             term = candidate.term(value, len(self.fitter.series))
-            return Scanned(term, float(scan.gains[best]) - penalty, penalty)
+            return Scanned(term, sum(float(g[best]) for g in scan.gains) - penalty, penalty)
         # an event occurs in the first series, and in others if it shows there, at its own time
         fresh: list[tuple[tuple[str, float], ...] | None] = []
         total, penalty, single = 0.0, once, (count + 2) * each
-        for s, gains in enumerate(scan.events):
+        for s, gains in enumerate(scan.gains):
             best = int(np.argmax(gains))
             if gains[best] > single + self.margin or s == 0:
                 fresh.append(((candidate.name, float(self.fitter.series[s].times[best + 1])),))
@@ -179,7 +179,7 @@ class Search:
                 penalty += single
             else:
                 fresh.append(None)
-        term = replace(candidate.term(None, len(scan.events)), fresh=tuple(fresh))
+        term = replace(candidate.term(None, len(scan.gains)), fresh=tuple(fresh))
         return Scanned(term, total - penalty, penalty)
 
     # -- growing and shrinking ----------------------------------------------------------------
@@ -287,7 +287,7 @@ class Search:
             candidate = next((c for c in self.candidates if (c.effect, c.parameters) == key), None)
             if candidate is None:  # a knock of the mount
                 continue
-            gains = self.scanner.scan(candidate, solution.fit).events
+            gains = self.scanner.scan(candidate, solution.fit).gains
             for s, now in enumerate(term.fresh):
                 if now is None:
                     continue

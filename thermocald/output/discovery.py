@@ -372,10 +372,12 @@ def _effect(effect: EffectFound) -> Section:
     if excluded:
         text.append("These data cannot exclude the following alternatives.")
     items = [
-        (a["effect"], (f"its score is {abs(d := a['score_difference']):.1f} "
-         f"{'worse' if d >= 0 else 'better'}. To separate them: {a['experiment']}."))
+        (
+            a["effect"],
+            f"its score is {_differs(a['score_difference'])}. To separate them: {a['experiment']}.",
+        )
         for a in excluded
-    ]  # fmt: skip
+    ]
     if alike := dict.fromkeys(a["effect"] for a in effect.alternatives if a.get("resembles")):
         text.append(
             f"Effects that merely resemble it: {', '.join(alike)}. They do not pass the absolute "
@@ -477,6 +479,11 @@ def _left_px(d: Discovery, fit: Fit) -> float:
     return e.sigma_px * math.sqrt(chi2 / max(2.0 * float(e.n.sum()), 1.0))
 
 
+def _differs(score_difference: float) -> str:
+    """Say by how much a score is worse or better."""
+    return f"{abs(score_difference):,.1f} {'worse' if score_difference >= 0 else 'better'}"
+
+
 def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str:
     x = d.examination
     best = x.best.names[len(x.base.terms) :]
@@ -485,9 +492,8 @@ def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str
             return f"named, together with {enumerated([n for n in best if n != name])}."
         return f"named: its misfit of {left:.3f} px is the noise."
     if rivals := [r.score for r in x.rivals if name.split(" ")[0] in r.names]:
-        beside = min(rivals) - x.best.score
-        than = "worse" if beside >= 0 else "better"
-        return f"cannot be excluded: the best solution with it scores {abs(beside):,.1f} {than}."
+        by = _differs(min(rivals) - x.best.score)
+        return f"cannot be excluded: the best solution with it scores {by}."
     if left > _AT_NOISE * noise:
         text = f"misfit {left:.3f} px, {left / noise:.1f} times the noise"
         if "omega" in s.terms[-1].parameters:

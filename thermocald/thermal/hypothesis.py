@@ -314,11 +314,15 @@ def make_candidate(
 
 def parse_effect(text: str) -> ModelEffect:
     """Parse an effect with its start values; UsageError names the fault and a correction."""
-    name, _, rest = text.partition(":")
+    name, colon, rest = text.partition(":")
     try:
         kind = catalogue.get(name)
     except ConfigurationError as error:
         raise UsageError(f"--effect {text}: {error}") from error
+    if colon and not rest.strip(" ,"):
+        raise UsageError(
+            f"--effect {text}: no parameter after the colon; {_suggest('', kind.units())}"
+        )
     values: dict[str, Any] = {}
     for part in filter(None, rest.split(",")):
         key, equals, value = (w.strip() for w in part.partition("="))

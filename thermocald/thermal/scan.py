@@ -50,22 +50,21 @@ if TYPE_CHECKING:
 class Scan:
     """The result of a scan.
 
-    gains (G,): χ² that each trial value explains in all series together; events [(G,)]: of an
-    event, for each series, at each epoch but the first; coefficients: their number; stacks, parts:
-    of each series the trajectories (G, E, m), and A (G, mk, mk), c (G, mk), B (G, mk, K) beside the
-    whole hypothesis.
+    gains [(G,)]: χ² that each trial value explains, in each series if every series has its own
+    coefficients, else in all together; coefficients: their number; stacks, parts: of each series
+    the trajectories (G, E, m), and A (G, mk, mk), c (G, mk), B (G, mk, K) beside the whole
+    hypothesis. The trial values of an event are the epochs but the first.
     """
 
-    gains: Array
-    events: tuple[Array, ...]
+    gains: tuple[Array, ...]
     coefficients: int
     stacks: tuple[Array, ...]
     parts: tuple[tuple[Array, Array, Array], ...]
 
     @property
     def best(self) -> int:
-        """The index of the best trial value."""
-        return int(np.argmax(self.gains))
+        """The index of the best trial value in all series together."""
+        return int(np.argmax(np.sum(self.gains, axis=0)))
 
 
 class Scanner:
@@ -117,11 +116,8 @@ class Scanner:
         columns = [(A, c[..., None], B) for A, c, B in parts]
         gains = [g[:, 0] for g in gains_beside(candidate, columns, base_A, base_c[:, None])]
         count = 0 if candidate.kind.is_drive else len(candidate.parameters)
-        if candidate.kind.is_event:
-            events = tuple(np.where(np.isfinite(g), g, 0.0) for g in gains)
-            return Scan(np.zeros(0), events, count, stacks, tuple(parts))
         count *= 2 * len(gains) if candidate.kind.is_periodic else 1
-        return Scan(np.sum(gains, axis=0), (), count, stacks, tuple(parts))
+        return Scan(tuple(gains), count, stacks, tuple(parts))
 
     def trials(self, candidate: Candidate) -> float:
         """Return the number of independent trajectories of a grid: its length in angles / 90°."""
@@ -255,7 +251,7 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
     if kind.is_event:
         found = Scanner(fitter).scan(candidate, fit)
         fresh: list[tuple[tuple[str, Any], ...] | None] = []
-        for s, gains in enumerate(found.events):
+        for s, gains in enumerate(found.gains):
             best = int(np.argmax(gains))
             least = event_threshold(fitter.series[s], found.coefficients)
             time = float(fitter.series[s].times[best + 1])

@@ -120,9 +120,6 @@ def choose_exterior(
 def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
     """Estimate the variance components of the mount's movements from an estimate of the series."""
     system, variance = estimate.system, series.variance(estimate)
-    # the mean, as the noise of a camera that warms up and defocuses changes
-    unit = series.noise(estimate)[0] / variance
-    variance *= float(neighbours_variance(unit, estimate.solved)[system.good].mean())
     at, N = system.design.at, system.N
     before = np.concatenate([at.iop, at.eop])
     b = system.gradient(estimate.residuals)

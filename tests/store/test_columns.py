@@ -13,12 +13,14 @@ from thermocald.store.database.store import Store
 from thermocald.store.series import EpochResult
 
 CHUNK = 16
+MERGED = 4
 NAMES = ["epoch", "frame_time", "temperature", "c", "sd_c", "blur", "status"]
 
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     monkeypatch.setattr(columns, "CHUNK", CHUNK)
+    monkeypatch.setattr(columns, "MERGED", MERGED)
 
 
 def result(number: int) -> EpochResult:
@@ -61,12 +63,14 @@ def series(store, head, field):
     return store.create_series(head, field)
 
 
-@pytest.mark.parametrize("size", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 4 * CHUNK + 7])
+@pytest.mark.parametrize(
+    "size", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 3 * CHUNK, 4 * CHUNK, 9 * CHUNK + 7]
+)
 def test_any_length(store, series, size):
     numbers = [3 * i for i in range(size)]  # numbers may have gaps
     for i in numbers:
         store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-    assert chunks(store) == size // CHUNK
+    assert chunks(store) == size // CHUNK // MERGED + size // CHUNK % MERGED
     assert read(store, series) == expected(numbers)
 
 
@@ -112,15 +116,18 @@ def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
     with Store.open(store_path, "append", durable=False) as store:
         for i in range(2 * CHUNK + 5, 4 * CHUNK):
             store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-        assert chunks(store) == 2 + (2 * CHUNK) // 7
+        assert chunks(store) == 2 + (2 * CHUNK) // 7 // MERGED
         assert read(store, series) == expected(range(4 * CHUNK))
 
 
-def test_a_chunk_is_read_with_what_came_late(store, series):
-    for i in range(4 * CHUNK):
+def test_a_merged_chunk_holds_what_came_late(store, series):
+    for i in range(MERGED * CHUNK):
         store.append(series, epoch(i), None if i == 5 else result(i), extra={"blur": 0.5 * i})
         if i == 2 * CHUNK:
             store.amend(series, 5, result(3), extra={"contrast": 1.0})
             store.amend(series, 5, result(5), extra={"contrast": 2.0})
-    assert read(store, series) == expected(range(4 * CHUNK))
-    assert store.series_columns(series, ["contrast"])["contrast"][5] == 2.0
+    assert chunks(store) == 1
+    assert read(store, series) == expected(range(MERGED * CHUNK))
+    assert store.series_columns(series, ["contrast"])["contrast"][[4, 5]].tolist()[1] == 2.0
+    store.amend(series, 6, result(6))
+    assert read(store, series) == expected(range(MERGED * CHUNK))

@@ -5,8 +5,9 @@ a number in its texts: `temperatures.<channel>` as read, `extra.<name>`.
 
 SQLite needs some microseconds per row, which would be seconds for a million epochs. So when CHUNK
 epochs of a series have accumulated, each of their columns is written again as one blob of float64,
-in the transaction of the last epoch. Reading joins the chunks and takes from the rows the epochs
-after the last chunk and those that were calibrated after their chunk was written.
+in the transaction of the last epoch; MERGED such chunks are merged into one, since long blobs are
+read twice as fast. Reading joins the chunks and takes from the rows the epochs after the last chunk
+and those that were calibrated after their chunk was written.
 
 Each row has a checksum, since SQLite's integrity check does not find a bit that changed inside a
 value: a CRC-32 of the row's numbers, as little-endian float64 with one NaN for NULL, and then of
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-CHUNK = 4000
+CHUNK = 1024
+MERGED = 16
 _SEPARATOR = "\x1f"
 KEPT = {
     "epoch": (("id", "series_id", *EPOCH_NUMBERS, "detail_checksum"), EPOCH_TEXTS),
@@ -164,6 +166,13 @@ def _require_chunk(kept: int, series: int, name: str, *row: Any) -> None:
         raise _ChunkError(f"a chunk of column {name} is damaged")
 
 
+def _overwrite(columns: dict[str, Array], numbers: Array, late: dict[str, Array]) -> None:
+    """Overwrite columns of the epochs `numbers` with their later calibrations."""
+    rows = np.searchsorted(numbers, late["number"])
+    for name, column in columns.items():
+        column[rows] = late.get(name, np.nan)
+
+
 class SeriesColumns:
     """The columns of a series.
 
@@ -267,13 +276,10 @@ class SeriesColumns:
         for name, column in columns.items():
             self._fill(name, column[:rows])
             column[rows:] = tail[name]
-        if late := self._late_rows():
+        if late := self._late_rows(0):
             numbers = np.empty(rows)
             self._fill("number", numbers)
-            latest = self._columns(late, ["number", *names])
-            at = np.searchsorted(numbers, latest["number"])
-            for name, column in columns.items():
-                column[at] = latest[name]
+            _overwrite(columns, numbers, self._columns(late, ["number", *names]))
         return columns
 
     def build(self) -> None:
@@ -282,6 +288,7 @@ class SeriesColumns:
         while end := self._number_after(last, CHUNK):
             self.insert(rows, end, self.latest(last, end))
             rows, last = self._find_chunks()
+            self._merge(last)
 
     def insert(self, first_row: int, last: int, columns: dict[str, Array]) -> None:
         """Write columns (n,) of the epochs from row `first_row` to number `last` as one chunk."""
@@ -296,34 +303,53 @@ class SeriesColumns:
             [(*row, _chunk_checksum(*row)) for row in rows],
         )
 
-    def _late_rows(self) -> list[dict[str, Any]]:
-        """Read the calibrations that are later than their chunk."""
+    def _merge(self, last: int) -> None:
+        """Merge the last MERGED small chunks, with later calibrations of their epochs."""
+        chunks = self._chunks[-MERGED:]
+        if len(chunks) < MERGED or any(size != 8 * CHUNK for _, size, *_ in chunks):
+            return
+        late = self._columns(self._late_rows(len(self._chunks) - MERGED))
+        start, which = chunks[0][0], "column_chunk WHERE series_id = ? AND first_row >= ?"
+        found = self._connection.execute(
+            f"SELECT DISTINCT name FROM {which}", (self._series, start)
+        )
+        columns = {name: np.empty(MERGED * CHUNK) for name in {*(n for (n,) in found), *late}}
+        for name, column in columns.items():
+            self._fill(name, column, start)
+        _overwrite(columns, columns["number"].copy(), late)
+        self._connection.execute(f"DELETE FROM {which}", (self._series, start))
+        self.insert(start, last, columns)
+        self._find_chunks()
+
+    def _late_rows(self, start: int) -> list[dict[str, Any]]:
+        """Read the calibrations that are later than their chunk, from chunk `start` on."""
         condition = (
             "INDEXED BY epoch_revised WHERE series_id = ? AND number > ? AND number <= ? "
             "AND revision > 0 AND epoch.id > ? ORDER BY epoch.id"
         )
         rows: list[dict[str, Any]] = []
-        before = -1
-        for *_, last, last_id in self._chunks:
+        before = self._chunks[start - 1][2] if start else -1
+        for *_, last, last_id in self._chunks[start:]:
             values = (self._series, before, last, last_id)
             rows += _intact(examined_rows(self._connection, "epoch", condition, values))
             before = last
         return rows
 
-    def _fill(self, name: str, column: Array) -> None:
-        """Copy a column's chunks into `column`, NaN for chunks without it."""
+    def _fill(self, name: str, column: Array, start: int = 0) -> None:
+        """Copy a column's chunks from a row on into `column`, NaN for chunks without it."""
         target = column.data.cast("B")  # copies faster than NumPy assigns
         sizes = {first: size for first, size, *_ in self._chunks}
         done = 0
         for first, *row, data, kept in self._connection.execute(
             "SELECT first_row, last_number, last_id, data, checksum FROM column_chunk "
-            "WHERE series_id = ? AND name = ? ORDER BY first_row",
-            (self._series, name),
+            "WHERE series_id = ? AND name = ? AND first_row >= ? ORDER BY first_row",
+            (self._series, name, start),
         ):
             if sizes.get(first) != len(data):
                 raise _ChunkError(f"a chunk of column {name} is broken")
             _require_chunk(kept, self._series, name, first, *row, data)
-            column[done:first] = np.nan
-            target[8 * first : 8 * first + len(data)] = data
-            done = first + len(data) // 8
+            at = first - start
+            column[done:at] = np.nan
+            target[8 * at : 8 * at + len(data)] = data
+            done = at + len(data) // 8
         column[done:] = np.nan

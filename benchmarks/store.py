@@ -27,7 +27,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.store.database.columns import CHUNK, SeriesColumns
+from thermocald.store.database.columns import CHUNK, MERGED, SeriesColumns
 from thermocald.store.database.epochs import insert_epoch
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
@@ -97,7 +97,7 @@ def fill_columns(path: Path, epochs: int) -> None:
     are permutations of the first: a million rows would take minutes, and nothing here reads them.
     """
     rng = np.random.default_rng(3)
-    size = CHUNK
+    size = MERGED * CHUNK
     chunks = max(epochs // size, 1)
     with Store.open(path, "append", durable=False) as store:
         series = store.create_series(HEAD, field_of(10))

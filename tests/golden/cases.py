@@ -15,8 +15,7 @@ ARITHMETIC = Bounds(1e-9, 1e-6, 1e-7)
 """Sums, and solutions in closed form or at convergence."""
 ESTIMATE = Bounds(1e-5, 1e-3, 1e-4)
 """Results of a search, whose last step is smaller than this but not zero."""
-# 1e-4 sd: a series' last step is below 0.1 sd and right to 1e-3; rounding decides which is the last
-REAL = Bounds(3e-6, 1e-4, 1e-2)
+REAL = Bounds(3e-6, 1e-5, 1e-2)
 """Weakly determined results: another kind of processor changes an sd by 4e-3, the packages of
 Debian 13 a probability and sigma0 by 4e-7.
 """

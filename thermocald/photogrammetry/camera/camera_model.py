@@ -18,6 +18,7 @@ El-Hakim (1986).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -228,14 +229,22 @@ class CameraSpec:
 def rotation(angles: ArrayLike) -> Array:
     """Return R (..., 3, 3), camera to object, of the angles omega, phi, kappa (..., 3)."""
     a = np.asarray(angles, dtype=float)
-    (so, co), (sp, cp), (sk, ck) = ((np.sin(a[..., i]), np.cos(a[..., i])) for i in range(3))
+    if a.ndim == 1:  # for one camera plain numbers take a quarter of the time
+        omega, phi, kappa = a.tolist()
+        so, sp, sk = math.sin(omega), math.sin(phi), math.sin(kappa)
+        co, cp, ck = math.cos(omega), math.cos(phi), math.cos(kappa)
+    else:
+        so, sp, sk = np.moveaxis(np.sin(a), -1, 0)
+        co, cp, ck = np.moveaxis(np.cos(a), -1, 0)
     rows = [
         cp * ck, -cp * sk, sp,
         co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp,
         so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp,
     ]  # fmt: skip
     r = np.array(rows)
-    return r.transpose(*range(1, r.ndim), 0).reshape(*a.shape[:-1], 3, 3)
+    if a.ndim > 1:
+        r = np.ascontiguousarray(np.moveaxis(r, 0, -1))
+    return r.reshape(*a.shape[:-1], 3, 3)
 
 
 def _turned(R: Array, eop: Array, points: Array) -> Array:
@@ -256,12 +265,31 @@ def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
 def distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Map ideal points (mm, about the principal point) to measured ones (mm, about the centre).
 
-    iop (..., 10), x, y (..., n), which may be complex.
+    iop (..., 10), x, y (..., n), complex if all are. Element by element, so that results are the
+    same to the last bit on every machine.
     """
     _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
-    r2 = x * x + y * y
-    h = ((A3 * r2 + A2) * r2 + A1) * r2 + 1.0 + 2 * B1 * x + 2 * B2 * y
-    return x * h + B1 * r2 + (C1 * x + C2 * y) + x0, y * h + B2 * r2 + y0
+    # x' = x·h + B1·r² + ..., y' = y·h + B2·r² + ...: h is common to both; computed in place
+    r2, other = x * x, y * y
+    r2 += other
+    h = r2 * A3
+    h += A2
+    h *= r2
+    h += A1
+    h *= r2
+    h += 1.0
+    for factor, part in ((2 * B1, x), (2 * B2, y)):
+        h += np.multiply(part, factor, out=other)
+    xd = x * h
+    xd += np.multiply(r2, B1, out=other)
+    if C1.any() or C2.any():
+        xd += C1 * x + C2 * y
+    xd += x0
+    h *= y
+    r2 *= B2
+    h += r2
+    h += y0
+    return xd, h
 
 
 def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -> Array:
@@ -278,7 +306,12 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
         z = np.where(z < 0, z, np.nan)
     scale = -i[..., 0, None] / z
     x, y = distort(i, scale * x, scale * y)
-    return image_to_px(sensor, np.stack([x, y], axis=-1))
+    out, px_per_mm = np.empty((2, *x.shape)), 1.0 / sensor.pixel_pitch
+    np.multiply(x, px_per_mm, out=out[0])
+    np.multiply(y, -px_per_mm, out=out[1])
+    out[0] += (sensor.width - 1) / 2
+    out[1] += (sensor.height - 1) / 2
+    return out.transpose(*range(1, out.ndim), 0)
 
 
 def distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -390,7 +423,11 @@ def turning_axes(eop: Array, R: Array) -> Array:
     """Return the axes of rotation of omega, phi, kappa as rows (..., 3, 3) in the camera frame."""
     axes = np.zeros(R.shape)
     axes[..., 0, :] = R[..., 0, :]
-    axes[..., 1, 0], axes[..., 1, 1] = np.sin(eop[..., 2]), np.cos(eop[..., 2])
+    if eop.ndim == 1:  # one camera: as in `rotation`
+        kappa = float(eop[2])
+        axes[1, 0], axes[1, 1] = math.sin(kappa), math.cos(kappa)
+    else:
+        axes[..., 1, 0], axes[..., 1, 1] = np.sin(eop[..., 2]), np.cos(eop[..., 2])
     axes[..., 2, 2] = 1.0
     return axes
 

@@ -52,7 +52,6 @@ _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 LONG_FROM_BYTES = 100_000_000
 _ROWS = 1 << 18
 _TEXT_BLOCK = 1 << 24  # bytes of text that pyarrow parses at a time
-_CHUNKS_IN_GROUP = 32  # of rows that are written together
 _KEPT_DAYS = 14.0  # since a copy was last read
 
 log = logging.getLogger(__name__)
@@ -402,9 +401,8 @@ def _parsed(table: Table) -> Iterator[Mapping[str, Any]]:
 
     if next(table.chunks(), None) is None:
         raise ValueError("no rows")
-    further = [name for name in table.columns if name not in ("", *REQUIRED)]
     kinds = dict.fromkeys(filter(None, table.columns), pyarrow.string())
-    kinds |= dict.fromkeys(["epoch", *REQUIRED[2:], *table.numeric(further)], pyarrow.float64())
+    kinds |= dict.fromkeys(_number_columns(table), pyarrow.float64())
     reader = csv.open_csv(
         table.path,
         csv.ReadOptions(
@@ -419,6 +417,11 @@ def _parsed(table: Table) -> Iterator[Mapping[str, Any]]:
         for batch in reader:
             part = {name: batch.column(name) for name in kinds}
             yield part | {"epoch": part["epoch"].cast(pyarrow.int64())}
+
+
+def _number_columns(table: Table) -> list[str]:
+    further = [name for name in table.columns if name not in ("", *REQUIRED)]
+    return ["epoch", *REQUIRED[2:], *table.numeric(further)]
 
 
 def _write(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
@@ -442,7 +445,8 @@ def _write(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
     with pyarrow.parquet.ParquetWriter(
         path, first.schema, compression="zstd", use_dictionary=words
     ) as writer:
-        while group := list(islice(tables, _CHUNKS_IN_GROUP)):
+        # the parser's parts are long, those of our tables short
+        while group := list(islice(tables, max(1, _ROWS // max(1, first.num_rows)))):
             writer.write_table(pyarrow.concat_tables(group))
 
 
@@ -457,13 +461,12 @@ def write_parquet(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
 
 def _typed(table: Table, advance: Callable[[int], object]) -> Iterator[Columns]:
     """Yield the columns of a table in parts: epochs, numbers, and text. Raises RecordingError."""
-    further = table.numeric([name for name in table.columns if name not in ("", *REQUIRED)])
-    chunk = None
+    numbers, chunk = _number_columns(table), None
     for chunk in table.chunks():
         yield {
             name: chunk.integers(name) if name == "epoch"
-            else chunk.numbers(name, empty_is_nan=name in further)
-            if name in (*REQUIRED[2:], *further)
+            else chunk.numbers(name, empty_is_nan=name not in REQUIRED)
+            if name in numbers
             else chunk.text(name)
             for name in table.columns
             if name

@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.audit_rows import Row, ratio
 from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.analysis.online.observer import FieldErrors, OnlineFilter, fit_approach
+from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
+from thermocald.analysis.online.observer import fit_approach
 from thermocald.photogrammetry.camera.camera_model import (
     CameraSpec,
     ExteriorOrientation,

@@ -12,7 +12,8 @@ import numpy as np
 
 from benchmarks.audit_rows import Row, share
 from benchmarks.audit_thermal import seen, simulated
-from thermocald.analysis.statistics.significance import drift_test, holm, slope_p_value
+from thermocald.analysis.statistics.dependence import holm, slope_p_value
+from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.discovery.result import discover_series
 from thermocald.physics import catalogue
 from thermocald.thermal.reduce import reduce_series

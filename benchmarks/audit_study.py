@@ -7,12 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.audit_rows import Row, ratio, share
-from thermocald.analysis.statistics.significance import (
-    dependence,
-    drift_test,
-    holm,
-    slope_p_value,
-)
+from thermocald.analysis.statistics.dependence import dependence, holm, slope_p_value
+from thermocald.analysis.statistics.noise_models import drift_test
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

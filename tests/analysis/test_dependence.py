@@ -5,7 +5,7 @@ import pytest
 from scipy.special import betainc, fdtrc
 
 from tests.analysis.test_drift_test import HEATED, TIME_S, WARM_UP, N, noise
-from thermocald.analysis.statistics.significance import (
+from thermocald.analysis.statistics.dependence import (
     correlation_matrix,
     correlations_of,
     dependence,

@@ -5,7 +5,8 @@ import pytest
 from scipy.fft import dct, next_fast_len
 
 from tests.marks import mostly_slow
-from thermocald.analysis.statistics.significance import cosines, drift_test, holm, slope_p_value
+from thermocald.analysis.statistics.dependence import holm, slope_p_value
+from thermocald.analysis.statistics.noise_models import cosines, drift_test
 
 N = 150
 TIME_S = np.arange(N) * 10.0

@@ -8,12 +8,8 @@ import pytest
 from benchmarks.audit_camera import Scene
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.analysis.online.observer import (
-    FieldErrors,
-    OnlineFilter,
-    OnlineObserver,
-    condition_on_exterior,
-)
+from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
+from thermocald.analysis.online.observer import OnlineObserver, condition_on_exterior
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.testfield import TestField

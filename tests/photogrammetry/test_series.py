@@ -8,7 +8,7 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
-from thermocald.analysis.statistics.significance import correlations_of
+from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField

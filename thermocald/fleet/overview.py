@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.analysis.statistics.dependence import dependence
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
-from thermocald.analysis.statistics.significance import dependence
 from thermocald.figures import BAND, PALETTE, Figure, label_axes, new_drawing
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, parameter_label, percent, short_duration, shortened

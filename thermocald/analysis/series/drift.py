@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series.course import LEVEL, Course
-from thermocald.analysis.statistics.significance import dependence, drift_test, holm, slope_noise
+from thermocald.analysis.statistics.dependence import dependence, holm, slope_noise
+from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
 from thermocald.photogrammetry.series.target_noise import slow_errors
 from thermocald.thermal.thermometer import estimate_reading_noise

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.significance import correlations_of
+from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
 from thermocald.names import checked

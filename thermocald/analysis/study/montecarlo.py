@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import ideal_points, image_grid, solve_distortion
-from thermocald.analysis.statistics.significance import correlation_matrix
+from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (

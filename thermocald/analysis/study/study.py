@@ -24,18 +24,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, image_grid
-from thermocald.analysis.statistics.significance import (
+from thermocald.analysis.statistics.dependence import (
     Dependence,
-    DriftTest,
     IopCorrelations,
     correlation_matrix,
     dependence,
-    drift_test,
     holm,
     median_correlations,
     moving_f_test,
     unbroken_windows,
 )
+from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.montecarlo import (
     MonteCarlo,

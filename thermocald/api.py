@@ -392,14 +392,14 @@ def simulate(
 
     preset: a camera of the reference study (`rpi-v2.1-heating`, `nexus5-cold`, …). model, camera,
     programme: YAML files that replace the preset's thermal model; its heat flow, thermometers and
-    noise; and its heating programme. effects: to add, {name: {parameter: value}} or effect files.
-    own_effects: whether the preset's own effects stay. lamp: [(from s, W)], heats the housing in
-    place of the programme's sources. testfield: a file, or markers, circles, plain; by default a
-    corner of 147 circles. epochs: by default the preset's 150. frames: render frames, not points.
-    out: the recording's folder; by default a temporary one, removed when the program ends.
-    model_out: a file for the simulated model. The series has its `truth` and `simulation`. Raises
-    ConfigurationError for an unknown preset or effect, UsageError if neither a preset nor a model
-    with a programme is given.
+    noise; and its heating programme. effects: to add, {name: {parameter: value}},
+    or effect files and texts as for `--effect`. own_effects: whether the preset's own effects stay.
+    lamp: [(from s, W)], heats the housing in place of the programme's sources. testfield: a file,
+    or markers, circles, plain; by default a corner of 147 circles. epochs: by default the preset's
+    150. frames: render frames, not points. out: the recording's folder; by default a temporary one,
+    removed when the program ends. model_out: a file for the simulated model. The series has its
+    `truth` and `simulation`. Raises ConfigurationError for an unknown preset or effect, UsageError
+    if neither a preset nor a model with a programme is given, or an effect has no size.
 
     >>> simulated = tc.simulate("rpi-v2.1-heating", effects={"thermal_lag": {"tau": 75}}, seed=1)
     >>> len(simulated)
@@ -409,6 +409,7 @@ def simulate(
     import shutil
     import tempfile
 
+    from thermocald.physics import catalogue as known
     from thermocald.physics.heat import Course
     from thermocald.physics.model_file import write_model
     from thermocald.physics.presets import given_simulation
@@ -430,6 +431,13 @@ def simulate(
     simulation = given_simulation(preset, thermal, device, testfield, course_file, seed, series)
     simulated = simulation.model if own_effects else replace(simulation.model, effects=())
     for effect in _effects(effects):
+        kind = known.get(effect.name)
+        if kind.linear and not any(effect.values.get(key) for key in kind.linear):
+            key = next(k for k in kind.linear if k in effect.values)
+            raise UsageError(
+                f"effect {effect.name} has no size and would change nothing; give {key} "
+                f"in {kind.linear[key]}: {effect.name}:{key}=…"
+            )
         simulated = simulated.with_effect(effect)
     course = simulation.programme
     if epochs is not None:

@@ -14,6 +14,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import CameraDevice, Measuring, Programme
 from thermocald.physics.heat import Course, SimulatedThermometer
 from thermocald.physics.model import ModelEffect
+from thermocald.physics.model_file import read_model
 from thermocald.physics.presets import preset_simulation
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -133,6 +134,13 @@ def test_preset_to_recording_and_json(tmp_path):
     assert files[0] == files[1]
 
 
+def test_an_effect_has_a_name_and_a_size(tmp_path):
+    given = "--effect", "slip:time=300,x0=0.01", "--model-out", tmp_path / "m.yaml"
+    assert run("--preset", "nexus5-cold", "--out", tmp_path / "r", *given).exit_code == 0
+    slip = read_model(tmp_path / "m.yaml").effects[-1]
+    assert (slip.name, slip.values["x0"]) == ("slip", 0.01)
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
@@ -140,6 +148,7 @@ def test_preset_to_recording_and_json(tmp_path):
         (["--preset", "nexus5-cold"], "--out is missing"),
         (["--out", "r"], "give --preset"),
         (["--model", "none.yaml", "--programme", "p.yaml", "--out", "r"], "cannot be read"),
+        (["--preset", "nexus5-cold", "--effect", "slip", "--out", "r"], "slip:c=…"),
     ],
 )
 def test_wrong_usage(tmp_path, monkeypatch, arguments, reason):

@@ -99,7 +99,9 @@ def simulate(
     frames: bool = typer.Option(
         False, "--frames", help="Render frames instead of simulating measured image points."
     ),
-    effect: list[Path] | None = expert(None, help="Effect file (YAML) to add; repeatable."),
+    effect: list[str] | None = expert(
+        None, help="NAME[:PARAMETER=VALUE,…] or effect file (YAML): an effect to add; repeatable."
+    ),
     seed: SeedOption = 0,
     series: str = typer.Option("M1", help="Name of the series, for a preset."),
     model_out: Path | None = expert(None, help="Also write the simulated thermal model."),

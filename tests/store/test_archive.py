@@ -87,7 +87,7 @@ def test_a_camera_that_was_off_is_no_clock_that_was_set():
     times = 1.75e9 + np.arange(20) * 10.0
     times[9:] += 1.0e7
     assert not clock_corrections(times, 10.0, np.ones(20), []).any()
-    assert not clock_corrections(np.array([0.0, 10, 500]), 10.0).any()
+    assert not clock_corrections(np.array([0.0, 10, 500]), 10.0, np.zeros(3), []).any()
 
 
 def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):

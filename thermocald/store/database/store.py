@@ -175,7 +175,7 @@ class Store(SeriesReader):
         return {name: found[source[name]] for name in names}
 
     def column_pages(
-        self, series: StoredSeries, names: Sequence[str], rows: int = 1000
+        self, series: StoredSeries, names: Sequence[str], rows: int
     ) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the columns of `stamped_columns`, `rows` epochs at a time, in constant memory.
 
@@ -210,12 +210,11 @@ class Store(SeriesReader):
                 return
             after = page[-1]["id"]
 
-    def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
-        """Return the events of one series, or of all, oldest first."""
+    def events(self, since_utc: float = 0.0) -> list[Event]:
+        """Return the events, oldest first."""
         with self._reads("events") as connection:
-            condition = "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id"
-            wanted = (since_utc, None if series is None else series.id)
-            rows = columns.examined_rows(connection, "event", condition, wanted)
+            condition = "WHERE utc >= ? ORDER BY id"
+            rows = columns.examined_rows(connection, "event", condition, (since_utc,))
             return [
                 Event(
                     row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],

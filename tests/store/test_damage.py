@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
-
 import numpy as np
 import pytest
 
+from tests.store.small import change
 from thermocald.errors import StoreError, ThermocaldError
 from thermocald.store.database import columns
 from thermocald.store.database.store import Store
@@ -28,15 +26,6 @@ def whole(store_path, head, field, make_epoch, make_result, monkeypatch) -> byte
         store.amend(series, 7, make_result(70))
         store.add_event(Event(1.6e9, "knock", "somebody came"))
     return store_path.read_bytes()
-
-
-def change(path, *statements: str) -> None:
-    """Change the file without the triggers that forbid it."""
-    with closing(sqlite3.connect(path)) as database, database:
-        for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
-            database.execute(f"DROP TRIGGER {name}")
-        for statement in statements:
-            database.execute(statement)
 
 
 def content(path) -> tuple[dict, list, list]:

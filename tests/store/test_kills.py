@@ -186,20 +186,3 @@ def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_e
     with pytest.raises(RecordingError, match="cannot be written"):
         write_recording(tmp_path / "r", head, field, map(make_epoch, range(10_000)))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_read_only_medium(store_path, head, field, make_epoch, make_result):
-    """Without permission for helper files the store can still be read (as root: by mode)."""
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        store.append(series, make_epoch(1), make_result(1))
-    store_path.chmod(0o444)
-    store_path.parent.chmod(0o555)
-    try:
-        with Store.open(store_path) as store:
-            assert store.last_epoch(series) == 1
-        if os.geteuid() != 0:
-            with pytest.raises(StoreError, match="read-only"):
-                Store.open(store_path, "append")
-    finally:
-        store_path.parent.chmod(0o755)

@@ -31,12 +31,10 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
         assert np.array_equal(epoch.observations.points, made.observations.points)
 
 
-def test_a_series_that_counts_from_0_is_whole(store_path, head, field, make_epoch, tmp_path):
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for number in range(3):
-            store.append(series, make_epoch(number))
-        archive_series(store, series, tmp_path / "M1")
+def test_a_series_that_counts_from_0_is_whole(store, series, make_epoch, tmp_path):
+    for number in range(3):
+        store.append(series, make_epoch(number))
+    archive_series(store, series, tmp_path / "M1")
     assert read_recording(tmp_path / "M1").columns.numbers.tolist() == [0, 1, 2]
 
 

@@ -44,18 +44,16 @@ def test_rounding_is_as_stated_and_five_decimals_are_exact():
 
 
 def test_an_epoch_of_too_many_numbers_is_refused_and_the_next_is_stored(
-    store_path, head, field, make_epoch, make_result
+    store, series, make_epoch, make_result
 ):
     """Its details would take the place of the next epoch's."""
     quality = {f"q{i}": np.zeros(100) for i in range(3000)}
     large = replace(make_epoch(2), observations=replace(observations(100), quality=quality))
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        with pytest.raises(StoreError, match="observations are too many to store"):
-            store.append(series, large, make_result(2))
-        store.append(series, make_epoch(3), make_result(3))
-        assert [one.epoch.number for one in store.epochs(series)] == [3]
-        assert not store.examine().damaged
+    with pytest.raises(StoreError, match="observations are too many to store"):
+        store.append(series, large, make_result(2))
+    store.append(series, make_epoch(3), make_result(3))
+    assert [one.epoch.number for one in store.epochs(series)] == [3]
+    assert not store.examine().damaged
 
 
 def test_what_does_not_fit_is_kept_otherwise():

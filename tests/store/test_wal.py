@@ -79,44 +79,40 @@ def test_a_write_that_a_kill_cut_off_is_no_damage(crashed, capsys):
     assert epochs(crashed) == list(range(1, 9))
 
 
-def test_what_the_index_counts_was_committed(store_path, head, field, make_epoch):
+def test_what_the_index_counts_was_committed(store, series, store_path, make_epoch):
     """The -shm file of a killed writer shows what is damaged or missing at the end."""
     wal = store_path.with_name(f"{store_path.name}-wal")
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for i in range(1, 4):
-            store.append(series, make_epoch(i))
-        data, step = frames(wal)
-        assert read_wal_tail(wal) == SOUND
-        wal.write_bytes(data[: 24 + 2 * step])
-        assert read_wal_tail(wal)[0] == 1
-        data[-5] ^= 1
-        wal.write_bytes(data)
-        assert read_wal_tail(wal) == (1, False)
-        wal.with_name(f"{store_path.name}-shm").unlink()
-        assert read_wal_tail(wal) == (0, True)
+    for i in range(1, 4):
+        store.append(series, make_epoch(i))
+    data, step = frames(wal)
+    assert read_wal_tail(wal) == SOUND
+    wal.write_bytes(data[: 24 + 2 * step])
+    assert read_wal_tail(wal)[0] == 1
+    data[-5] ^= 1
+    wal.write_bytes(data)
+    assert read_wal_tail(wal) == (1, False)
+    wal.with_name(f"{store_path.name}-shm").unlink()
+    assert read_wal_tail(wal) == (0, True)
 
 
 @pytest.mark.slow
-def test_a_store_that_is_being_written_is_not_damaged(store_path, head, field, make_epoch):
+def test_a_store_that_is_being_written_is_not_damaged(store, series, store_path, make_epoch):
     wal = store_path.with_name(f"{store_path.name}-wal")
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        enough = threading.Event()
+    enough = threading.Event()
 
-        def write():
-            for i in itertools.takewhile(lambda _: not enough.is_set(), itertools.count(1)):
-                store.append(series, make_epoch(i))
+    def write():
+        for i in itertools.takewhile(lambda _: not enough.is_set(), itertools.count(1)):
+            store.append(series, make_epoch(i))
 
-        writer = threading.Thread(target=write)
-        writer.start()
-        try:
-            tails = [read_wal_tail(wal) for _ in range(50)]
-        finally:
-            enough.set()
-            writer.join()
-        assert store.last_epoch(series) > 2
-        assert not any(lost for lost, _ in tails)
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        tails = [read_wal_tail(wal) for _ in range(50)]
+    finally:
+        enough.set()
+        writer.join()
+    assert store.last_epoch(series) > 2
+    assert not any(lost for lost, _ in tails)
 
 
 def test_the_daemon_says_so_and_keeps_a_copy(crashed):

@@ -16,16 +16,15 @@ NAMES = ["epoch", "frame_time", "c", "sd_x0", "status", "temperature", "blur"]
 
 
 @pytest.fixture
-def whole(store_path, head, field, make_epoch, make_result, monkeypatch) -> bytes:
+def whole(store, series, make_epoch, make_result, monkeypatch) -> bytes:
     """A store with chunks, a later calibration and events, as bytes."""
     monkeypatch.setattr(columns, "CHUNK", 16)
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field, identity={"serial": "x1"})
-        for i in range(1, EPOCHS + 1):
-            store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
-        store.amend(series, 7, make_result(70))
-        store.add_event(Event(1.6e9, "knock", "somebody came"))
-    return store_path.read_bytes()
+    for i in range(1, EPOCHS + 1):
+        store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
+    store.amend(series, 7, make_result(70))
+    store.add_event(Event(1.6e9, "knock", "somebody came"))
+    store.close()
+    return store.path.read_bytes()
 
 
 def content(path) -> tuple[dict, list, list]:

@@ -154,32 +154,18 @@ def small_disk():
     signal.signal(signal.SIGXFSZ, handler)
 
 
-def fill(store, series, make_epoch, make_result) -> int:
-    """Append until it fails; return the last epoch stored."""
-    number = 0
-
-    def append_for_ever():
-        nonlocal number
-        while number < 10_000:
-            store.append(series, make_epoch(number + 1), make_result(number + 1))
-            number += 1
+def test_a_full_disk(store, series, make_epoch, make_result, small_disk):
+    def append(number):
+        store.append(series, make_epoch(number), make_result(number))
 
     with pytest.raises(StoreFullError, match="was not stored: the disk") as caught:
-        append_for_ever()
-    assert f"epoch {number + 1} " in str(caught.value)
-    return number
-
-
-def test_a_full_disk(store_path, head, field, make_epoch, make_result, request):
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-    request.getfixturevalue("small_disk")
-    with Store.open(store_path, "append", durable=False) as store:
-        last = fill(store, series, make_epoch, make_result)
-        assert store.last_epoch(series) == last > 10
-        with pytest.raises(StoreError, match="disk"):
-            store.append(series, make_epoch(last + 1), make_result(last + 1))
-        assert store.last_epoch(series) == last
+        list(map(append, range(1, 10_000)))
+    last = store.last_epoch(series)
+    assert last > 10
+    assert f"epoch {last + 1} " in str(caught.value)
+    with pytest.raises(StoreError, match="disk"):
+        append(last + 1)
+    assert store.last_epoch(series) == last
 
 
 def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):

@@ -69,8 +69,8 @@ def store(tmp_path_factory, forker):
 def told(store, name: str) -> list[tuple[str, int]]:
     series = store.find_series(name)
     return [
-        (e.kind, e.epoch) for e in store.events(series)
-        if e.kind in ("knock", "slip", "wrong_lens", "change", "target_moved")
+        (e.kind, e.epoch) for e in store.events() if e.series == series.id
+        and e.kind in ("knock", "slip", "wrong_lens", "change", "target_moved")
     ]  # fmt: skip
 
 
@@ -96,9 +96,9 @@ def test_the_second_epoch_in_a_row_tells_what_changed(store, what):
 
 def test_a_moved_target_is_named_once(store):
     assert told(store, "target_moved") == [("target_moved", WHEN + 4)]
-    (event,) = [e for e in store.events(store.find_series("target_moved"))
-                if e.kind == "target_moved"]  # fmt: skip
-    name = store.find_series("target_moved").testfield.names[11]
+    series = store.find_series("target_moved")
+    (event,) = [e for e in store.events() if (e.series, e.kind) == (series.id, "target_moved")]
+    name = series.testfield.names[11]
     assert f"target {name} " in event.text
 
 

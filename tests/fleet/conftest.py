@@ -13,11 +13,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.store.conftest import field, filled, head, make_epoch, make_result, store_path
+from tests.store.conftest import (  # for `filled`
+    field,
+    filled,
+    head,
+    make_epoch,
+    make_result,
+    series,
+    store,
+    store_path,
+)
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.server.connection import ServerAddress
 
-__all__ = ["field", "filled", "head", "make_epoch", "make_result", "store_path"]
+__all__ = ["field", "filled", "head", "make_epoch", "make_result", "series", "store", "store_path"]
 
 
 def address(server: Server, query: str = "", **given: str) -> ServerAddress:

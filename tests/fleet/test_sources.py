@@ -50,6 +50,7 @@ def test_a_server_gives_what_the_file_gives(places):
 def test_discover_and_correct_read_a_server_too(places, tmp_path):
     # discovery depends only on these
     here, there = (tc.open(place).observed() for place in places)
+    assert there.name.startswith("postgresql://")
     assert "secret" not in there.name
     assert np.array_equal(here.frame_times, there.frame_times)
     assert np.array_equal(here.grid.points, there.grid.points, equal_nan=True)

@@ -14,7 +14,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.series import EpochResult
+from thermocald.store.series import EpochResult, StoredSeries
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -81,31 +81,39 @@ def store_path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def filled(store_path: Path, field: TestField, head: Head, make_epoch, make_result):
-    """An open store with epochs 1 to 20 of one series."""
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field, start="cold", identity={"serial": "x1"})
-        for i in range(1, 21):
-            extra = {"blur": 0.5 * i}
-            store.append(series, make_epoch(i), make_result(i), extra=extra)
-        yield store, series
+def store(store_path: Path):
+    """An open, empty store."""
+    with Store.open(store_path, "append", durable=False) as opened:
+        yield opened
 
 
 @pytest.fixture
-def killed(store_path: Path, field: TestField, head: Head, make_epoch, make_result, tmp_path: Path):
+def series(store: Store, field: TestField, head: Head) -> StoredSeries:
+    """The store's first series, without epochs."""
+    return store.create_series(head, field, start="cold", identity={"serial": "x1"})
+
+
+@pytest.fixture
+def filled(store: Store, series: StoredSeries, make_epoch, make_result):
+    """An open store with epochs 1 to 20 of one series."""
+    for i in range(1, 21):
+        store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
+    return store, series
+
+
+@pytest.fixture
+def killed(store: Store, series: StoredSeries, make_epoch, make_result, tmp_path: Path):
     """(n, last) → the files of a killed writer: n epochs in the store, the others in its -wal."""
 
     def make(moved: int, last: int) -> Path:
         folder = tmp_path / "killed"
         folder.mkdir()
-        with Store.open(store_path, "append", durable=False) as store:
-            series = store.create_series(head, field)
-            for i in range(1, last + 1):
-                if i == moved + 1:
-                    store.checkpoint()
-                store.append(series, make_epoch(i), make_result(i))
-            for name in (store_path.name, f"{store_path.name}-wal"):
-                shutil.copy(store_path.with_name(name), folder / name)
-        return folder / store_path.name
+        for i in range(1, last + 1):
+            if i == moved + 1:
+                store.checkpoint()
+            store.append(series, make_epoch(i), make_result(i))
+        for name in (store.path.name, f"{store.path.name}-wal"):
+            shutil.copy(store.path.with_name(name), folder / name)
+        return folder / store.path.name
 
     return make

@@ -31,12 +31,10 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
         assert np.array_equal(epoch.observations.points, made.observations.points)
 
 
-def test_a_series_that_counts_from_0_is_whole(store_path, head, field, make_epoch, tmp_path):
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for number in range(3):
-            store.append(series, make_epoch(number))
-        archive_series(store, series, tmp_path / "M1")
+def test_a_series_that_counts_from_0_is_whole(store, series, make_epoch, tmp_path):
+    for number in range(3):
+        store.append(series, make_epoch(number))
+    archive_series(store, series, tmp_path / "M1")
     assert read_recording(tmp_path / "M1").columns.numbers.tolist() == [0, 1, 2]
 
 
@@ -87,7 +85,7 @@ def test_a_camera_that_was_off_is_no_clock_that_was_set():
     times = 1.75e9 + np.arange(20) * 10.0
     times[9:] += 1.0e7
     assert not clock_corrections(times, 10.0, np.ones(20), []).any()
-    assert not clock_corrections(np.array([0.0, 10, 500]), 10.0).any()
+    assert not clock_corrections(np.array([0.0, 10, 500]), 10.0, np.zeros(3), []).any()
 
 
 def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):

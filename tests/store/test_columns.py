@@ -52,17 +52,6 @@ def chunks(store: Store) -> int:
     return store._db.execute("SELECT count(DISTINCT first_row) FROM column_chunk").fetchone()[0]
 
 
-@pytest.fixture
-def store(store_path):
-    with Store.open(store_path, "append", durable=False) as opened:
-        yield opened
-
-
-@pytest.fixture
-def series(store, head, field):
-    return store.create_series(head, field)
-
-
 @pytest.mark.parametrize(
     "size", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 3 * CHUNK, 4 * CHUNK, 9 * CHUNK + 7]
 )
@@ -106,18 +95,14 @@ def test_of_a_broken_chunk_the_rows_are_read(store, series, data, caplog):
     assert "chunk of column c is" in caplog.text
 
 
-def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
+def test_another_chunk_length_later_on(store, series, monkeypatch):
     """Chunks of another length, as a newer version may write, are read."""
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for i in range(2 * CHUNK + 5):
-            store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-    monkeypatch.setattr(columns, "CHUNK", 7)
-    with Store.open(store_path, "append", durable=False) as store:
-        for i in range(2 * CHUNK + 5, 4 * CHUNK):
-            store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-        assert chunks(store) == 2 + (2 * CHUNK) // 7 // MERGED
-        assert read(store, series) == expected(range(4 * CHUNK))
+    for i in range(4 * CHUNK):
+        if i == 2 * CHUNK + 5:
+            monkeypatch.setattr(columns, "CHUNK", 7)
+        store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
+    assert chunks(store) == 2 + (2 * CHUNK) // 7 // MERGED
+    assert read(store, series) == expected(range(4 * CHUNK))
 
 
 def test_a_merged_chunk_holds_what_came_late(store, series):

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+from contextlib import closing
 
 import pytest
 
+from tests.store.small import change
 from thermocald.errors import RecordingError, StoreError
 from thermocald.store.database.archive import archive_readings, archive_series
 from thermocald.store.database.columns import KEPT, row_checksum
@@ -15,29 +17,25 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.series import LoggedReading
 
+SEALED = {
+    "epoch": KEPT["epoch"],
+    "reading": KEPT["reading"],
+    "series JOIN testfield ON testfield.id = testfield_id": (
+        ["created_utc"], ["camera", "name", "start", "head", "identity", "settings", "digest"],
+    ),
+}  # fmt: skip
 
-def change(path, statement: str, *values) -> None:
+
+def craft(path, statement: str, *values) -> None:
     """Change rows as an attacker would, with matching checksums."""
-    database = sqlite3.connect(path)
-    for table in ("series", "epoch", "reading"):
-        database.execute(f"DROP TRIGGER IF EXISTS {table}_update")
-    database.execute(statement, values)
-    sealed = {
-        "epoch": KEPT["epoch"],
-        "reading": KEPT["reading"],
-        "series": (
-            ["created_utc"], ["camera", "name", "start", "head", "identity", "settings", "digest"],
-        ),
-    }  # fmt: skip
-    for table, (numbers, texts) in sealed.items():
-        join = " JOIN testfield ON testfield.id = testfield_id" if table == "series" else ""
-        listed = ", ".join(f"{name}" for name in [*numbers, *texts])
-        query = f"SELECT {table}.id, {listed} FROM {table}{join}"
-        for id_, *row in database.execute(query).fetchall():
-            found = row_checksum(row[: len(numbers)], row[len(numbers) :])
-            database.execute(f"UPDATE {table} SET checksum = ? WHERE id = ?", (found, id_))
-    database.commit()
-    database.close()
+    change(path, statement, values=values)
+    with closing(sqlite3.connect(path)) as database, database:
+        for tables, (numbers, texts) in SEALED.items():
+            table = tables.partition(" ")[0]
+            listed = ", ".join([f"{table}.id", *numbers, *texts])
+            for id_, *row in database.execute(f"SELECT {listed} FROM {tables}").fetchall():
+                found = row_checksum(row[: len(numbers)], row[len(numbers) :])
+                database.execute(f"UPDATE {table} SET checksum = ? WHERE id = ?", (found, id_))
 
 
 @pytest.fixture
@@ -51,7 +49,7 @@ def crafted(filled):
 @pytest.mark.parametrize("name", ["../../x", "/etc/x", "..", ".hidden", "a/b", "a\x1b[2Jb", " "])
 @pytest.mark.parametrize("column", ["camera", "name"])
 def test_a_name_that_leads_out_is_refused_when_it_is_read(crafted, name, column):
-    change(crafted, f"UPDATE series SET {column} = ?", name)
+    craft(crafted, f"UPDATE series SET {column} = ?", name)
     with Store.open(crafted) as store, pytest.raises(StoreError, match="part of a file's name"):
         store.all_series()
 
@@ -62,13 +60,13 @@ def test_a_head_of_another_name_is_refused(crafted):
     database.close()
     document = json.loads(head)
     document["camera"]["name"] = "../../x"
-    change(crafted, "UPDATE series SET head = ?", json.dumps(document))
+    craft(crafted, "UPDATE series SET head = ?", json.dumps(document))
     with Store.open(crafted) as store, pytest.raises(StoreError, match="its head names"):
         store.all_series()
 
 
 def test_a_thermometers_name_that_leads_out_is_refused(crafted, tmp_path):
-    change(crafted, "UPDATE reading SET thermometer = '../../air'")
+    craft(crafted, "UPDATE reading SET thermometer = '../../air'")
     (tmp_path / "out").mkdir()
     with Store.open(crafted) as store, pytest.raises(StoreError, match="thermometer"):
         archive_readings(store, tmp_path / "out")
@@ -79,7 +77,7 @@ def test_a_thermometers_name_that_leads_out_is_refused(crafted, tmp_path):
 def test_a_frame_that_leads_out_is_refused(crafted, tmp_path, frame):
     (tmp_path / "secret.jpg").write_bytes(b"secret")
     (tmp_path / "frames").mkdir()
-    change(crafted, "UPDATE epoch SET frame = ? WHERE number = 3", frame)
+    craft(crafted, "UPDATE epoch SET frame = ? WHERE number = 3", frame)
     with Store.open(crafted) as store, pytest.raises(StoreError, match="leads out"):
         archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
     assert not (tmp_path / "out").exists()
@@ -93,7 +91,7 @@ def test_a_link_among_the_frames_is_not_followed_out(crafted, tmp_path):
     (tmp_path / "frames/away").symlink_to(tmp_path)
     (tmp_path / "frames/kept.jpg").write_bytes(b"kept")
     for number, frame in ((3, "link.jpg"), (4, "away/secret.jpg"), (5, "kept.jpg")):
-        change(crafted, "UPDATE epoch SET frame = ? WHERE number = ?", frame, number)
+        craft(crafted, "UPDATE epoch SET frame = ? WHERE number = ?", frame, number)
     with Store.open(crafted) as store:
         archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
     kept = {p.name: p.read_bytes() for p in (tmp_path / "out/frames").iterdir()}

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
-
 import numpy as np
 import pytest
 
+from tests.store.small import change
 from thermocald.errors import StoreError, ThermocaldError
 from thermocald.store.database import columns
 from thermocald.store.database.store import Store
@@ -18,25 +16,15 @@ NAMES = ["epoch", "frame_time", "c", "sd_x0", "status", "temperature", "blur"]
 
 
 @pytest.fixture
-def whole(store_path, head, field, make_epoch, make_result, monkeypatch) -> bytes:
+def whole(store, series, make_epoch, make_result, monkeypatch) -> bytes:
     """A store with chunks, a later calibration and events, as bytes."""
     monkeypatch.setattr(columns, "CHUNK", 16)
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field, identity={"serial": "x1"})
-        for i in range(1, EPOCHS + 1):
-            store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
-        store.amend(series, 7, make_result(70))
-        store.add_event(Event(1.6e9, "knock", "somebody came"))
-    return store_path.read_bytes()
-
-
-def change(path, *statements: str) -> None:
-    """Change the file without the triggers that forbid it."""
-    with closing(sqlite3.connect(path)) as database, database:
-        for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
-            database.execute(f"DROP TRIGGER {name}")
-        for statement in statements:
-            database.execute(statement)
+    for i in range(1, EPOCHS + 1):
+        store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
+    store.amend(series, 7, make_result(70))
+    store.add_event(Event(1.6e9, "knock", "somebody came"))
+    store.close()
+    return store.path.read_bytes()
 
 
 def content(path) -> tuple[dict, list, list]:

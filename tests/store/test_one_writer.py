@@ -85,7 +85,6 @@ def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording
 
 
 WRITERS = {
-    "replay": ["replay", "{recording}", "--store", "{store}"],
     "run": ["run", "--recording", "{recording}", "--store", "{store}", "--fast"],
     "run of devices": ["run", "--mock", "--store", "{store}", "--epochs", "2"],
     "retention": ["archive", "--config", "{config}", "--to", "{folder}/a", "--retention"],

@@ -9,7 +9,6 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.database.epochs import (
@@ -19,7 +18,6 @@ from thermocald.store.database.epochs import (
     unpack_observations,
 )
 from thermocald.store.database.store import Store
-from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.series import EpochResult
 from thermocald.store.sources import StoredRecording, open_source
 
@@ -46,18 +44,16 @@ def test_rounding_is_as_stated_and_five_decimals_are_exact():
 
 
 def test_an_epoch_of_too_many_numbers_is_refused_and_the_next_is_stored(
-    store_path, head, field, make_epoch, make_result
+    store, series, make_epoch, make_result
 ):
     """Its details would take the place of the next epoch's."""
     quality = {f"q{i}": np.zeros(100) for i in range(3000)}
     large = replace(make_epoch(2), observations=replace(observations(100), quality=quality))
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        with pytest.raises(StoreError, match="observations are too many to store"):
-            store.append(series, large, make_result(2))
-        store.append(series, make_epoch(3), make_result(3))
-        assert [one.epoch.number for one in store.epochs(series)] == [3]
-        assert not store.examine().damaged
+    with pytest.raises(StoreError, match="observations are too many to store"):
+        store.append(series, large, make_result(2))
+    store.append(series, make_epoch(3), make_result(3))
+    assert [one.epoch.number for one in store.epochs(series)] == [3]
+    assert not store.examine().damaged
 
 
 def test_what_does_not_fit_is_kept_otherwise():
@@ -100,14 +96,11 @@ def seen(rng, number):
 
 
 @pytest.fixture
-def path(tmp_path):
+def path(store_path, head):
     rng = np.random.default_rng(2)
     names = [str(i) for i in range(TARGETS)]
     field = TestField.build(names, rng.uniform(0, 2000, (TARGETS, 3)), 0.02, 20.0)
-    camera = CameraSpec("cam", Sensor(3280, 2464, 0.00112), 3.04)
-    head = Head("r", "M1", 10.0, camera, {"temperature": Channel()})
-    file = tmp_path / "a.db"
-    with Store.open(file, "append", durable=False) as store:
+    with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
         for number in range(1, EPOCHS):
             there = None if number in (4, 5) else seen(rng, number)
@@ -117,7 +110,7 @@ def path(tmp_path):
         # calibrated again: once with the same observations, once with others
         store.amend(series, 20, EpochResult("ok", "again"))
         store.amend(series, 30, EpochResult("ok", "again"), observations=seen(rng, 15))
-    return file
+    return store_path
 
 
 def test_a_block_holds_what_its_epochs_hold(path):

@@ -67,8 +67,8 @@ class FollowedStore:
             os.replace(aside, helper(self.path, "wal"))  # the daemon was killed in `close`
         self._file = StoreFile(self.path)
         self._mount = mount_point(self.path)
-        tail = read_wal_tail(helper(self.path, "wal"))
-        kept = self._keep_damaged_wal() if tail.lost else ""
+        lost, unfinished = read_wal_tail(helper(self.path, "wal"))
+        kept = self._keep_damaged_wal() if lost else ""
         try:
             self.store = Store.open(self.path, "append", durable=self._durable, claimed=True)
         except BaseException:
@@ -80,11 +80,11 @@ class FollowedStore:
         if self._file.names > 1:
             text = f"the file has {self._file.names} names (hard links); write it only under this"
             self._note("store_linked", text)
-        if tail.lost:
-            many = "all transactions" if tail.lost < 0 else f"{tail.lost} transactions"
+        if lost:
+            many = "all transactions" if lost < 0 else f"{lost} transactions"
             text = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
             self._note("wal_damaged", text)
-        elif tail.unfinished:
+        elif unfinished:
             text = "the last write was cut off when its writer ended; it was not committed"
             log.info("%s: %s", self.path, text, extra={"event": "wal_unfinished"})
             self._events.append(Event(time.time(), "wal_unfinished", text))

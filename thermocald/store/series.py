@@ -304,7 +304,7 @@ def series_times(source: SeriesReader, series: StoredSeries) -> SeriesTimes:
 
 
 def clock_corrections(
-    frame_time: Array, interval: float, trusted: Array | None = None, steps: Sequence[float] = ()
+    frame_time: Array, interval: float, trusted: Array, steps: Sequence[float]
 ) -> Array:
     """Return corrections (E,) s that make times (E,) ascend and, where known, right.
 
@@ -317,7 +317,7 @@ def clock_corrections(
     corrections = np.zeros(len(frame_time))
     tolerance = max(_CLOCK_TOLERANCE_S, 3.0 * interval)
     for step in steps:
-        if trusted is None or step < tolerance:
+        if step < tolerance:
             continue
         times = frame_time + corrections
         fits = np.abs(np.diff(times) - interval - step) < tolerance

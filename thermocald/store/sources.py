@@ -93,7 +93,7 @@ class StoredRecording:
     @property
     def title(self) -> str:
         """The series' name in messages."""
-        return f"{self.store.path}: {self.series.name}"
+        return f"{self.store.where}: {self.series.name}"
 
     @cached_property
     def columns(self) -> EpochColumns:

@@ -189,7 +189,18 @@ class SeriesColumns:
         the rows are read instead. Raises StoreError if these are damaged too.
         """
         try:
-            columns = self._join_chunks(names)
+            rows, last = self._find_chunks()
+            tail = self.latest(last, names=["number", *names])
+            # one allocation for all, which the system makes in huge pages: half the time
+            block = np.empty((len(names), rows + tail["number"].size))
+            columns = dict(zip(names, block, strict=True))
+            for name, column in columns.items():
+                self._fill(name, column[:rows])
+                column[rows:] = tail[name]
+            if late := self._late_rows(0):
+                numbers = np.empty(rows)
+                self._fill("number", numbers)
+                _overwrite(columns, numbers, self._columns(late, ["number", *names]))
         except _ChunkError as error:
             log.warning("%s; its epochs are read one by one instead", error)
             columns = self.latest(-1, names=names)
@@ -264,22 +275,6 @@ class SeriesColumns:
                 raise _ChunkError(f"the column chunks of series {self._series} are broken")
             rows += size // 8
         return rows, self._chunks[-1][2] if self._chunks else -1
-
-    def _join_chunks(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return columns over all epochs, `status` as codes."""
-        rows, last = self._find_chunks()
-        tail = self.latest(last, names=["number", *names])
-        # one allocation for all, which the system makes in huge pages: half the time
-        block = np.empty((len(names), rows + tail["number"].size))
-        columns = dict(zip(names, block, strict=True))
-        for name, column in columns.items():
-            self._fill(name, column[:rows])
-            column[rows:] = tail[name]
-        if late := self._late_rows(0):
-            numbers = np.empty(rows)
-            self._fill("number", numbers)
-            _overwrite(columns, numbers, self._columns(late, ["number", *names]))
-        return columns
 
     def build(self) -> None:
         """Write chunks while there are enough rows, in the caller's transaction."""

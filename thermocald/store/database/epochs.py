@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
 import sqlite3
 import struct
@@ -29,7 +28,7 @@ import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.names import UNEVENTFUL, file_name, relative_path
+from thermocald.names import file_name, relative_path
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.store.database.columns import (
@@ -54,14 +53,14 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
-log = logging.getLogger(__name__)
-
 POINT_QUANTUM_PX = 1e-5
 
 _HEADER = struct.Struct("<BBIH")  # layout, flags, number of observations, bytes of the names
 _LAYOUT = 1
 _COVARIANCES, _FLOAT_POINTS = 1, 4
 _UPPER = np.triu_indices(16)
+_FULL = np.zeros((16, 16), dtype=np.intp)  # places in the upper triangle
+_FULL[_UPPER] = _FULL.T[_UPPER] = np.arange(len(_UPPER[0]))
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
 _PART_BYTES = 1100  # seven to a page
 _VALUES = tuple(map(sql_name, PARAMETER_NAMES))
@@ -78,9 +77,7 @@ def unpack_covariance(data: bytes) -> Array:
     """Invert `pack_covariance`. Raises StoreError for another length."""
     if len(data) != 8 * len(_UPPER[0]):
         raise StoreError(f"a covariance of {len(data)} bytes in the store is broken")
-    covariance = np.zeros((16, 16))
-    covariance[_UPPER] = np.frombuffer(data, "<f8")
-    covariance.T[_UPPER] = covariance[_UPPER]
+    covariance: Array = np.frombuffer(data, "<f8").astype(np.float64)[_FULL]
     return covariance
 
 
@@ -178,7 +175,8 @@ def latest_epochs(
 ) -> Iterator[StoredEpoch]:
     """Yield each epoch in its latest revision from rows of a file or a server.
 
-    rows: by number and revision; details: gives a row's packed covariance, observations; or None.
+    rows: by number and revision; details: gives a row's packed covariance and observations, empty
+    or None if it has none; or None.
     Raises DamageError at a damaged epoch, after those before it.
     """
     for _, revisions in groupby(rows, key=itemgetter("number")):
@@ -285,8 +283,19 @@ def insert_series(connection: sqlite3.Connection, series: StoredSeries) -> None:
     )
 
 
-def select_series(connection: sqlite3.Connection, path: Path) -> list[StoredSeries]:
-    """Return all series in the order in which they were begun; `path` is for the messages."""
+def parse_series(
+    path: Path, key: int, head: str, csv: str, start: str, identity: str, settings: str,
+    created: float,
+) -> StoredSeries:  # fmt: skip
+    """Return a series from the row of a file or a server; `path` is for the messages."""
+    return StoredSeries(
+        key, parse_head(json.loads(head), path), parse_testfield(csv, path), start,
+        json.loads(identity), json.loads(settings), created,
+    )  # fmt: skip
+
+
+def select_series(connection: sqlite3.Connection, path: Path) -> Iterator[StoredSeries]:
+    """Yield all series in the order in which they were begun; `path` is for the messages."""
     rows = connection.execute(
         "SELECT s.id, created_utc, s.checksum, csv, camera, name, start, head, identity, settings, "
         "digest FROM series s JOIN testfield t ON t.id = testfield_id ORDER BY s.id"
@@ -295,26 +304,18 @@ def select_series(connection: sqlite3.Connection, path: Path) -> list[StoredSeri
         known = connection.execute("SELECT 1 FROM series JOIN testfield LIMIT 1").fetchone()
         if known is None:
             raise StoreError(f"{path}: is damaged: its series or test fields are missing")
-    return [_read_series(path, *row) for row in rows]
-
-
-def _read_series(
-    path: Path, number: int, created: float, kept: int, csv: str, *texts: str
-) -> StoredSeries:
-    camera, name, start, head, identity, settings, digest = texts
-    what = f"{path}: series {camera}/{name}"
-    require_checksum(kept, what, (created,), texts)
-    if hashlib.sha256(csv.encode(errors="surrogateescape")).hexdigest() != digest:
-        raise StoreError(f"{what}: its test field does not match its digest; restore a backup")
-    file_name(camera, f"{what}: camera", StoreError)
-    file_name(name, f"{what}: series", StoreError)
-    parsed = parse_head(json.loads(head), path)
-    if (parsed.camera.name, parsed.series) != (camera, name):
-        raise StoreError(f"{what}: its head names {parsed.camera.name!r}/{parsed.series!r}")
-    return StoredSeries(
-        number, parsed, parse_testfield(csv, path), start, json.loads(identity),
-        json.loads(settings), created,
-    )  # fmt: skip
+    for id_, created, kept, csv, *texts in rows:
+        camera, name, start, head, identity, settings, digest = texts
+        what = f"{path}: series {camera}/{name}"
+        require_checksum(kept, what, (created,), texts)
+        if hashlib.sha256(csv.encode(errors="surrogateescape")).hexdigest() != digest:
+            raise StoreError(f"{what}: its test field does not match its digest; restore a backup")
+        file_name(camera, f"{what}: camera", StoreError)
+        file_name(name, f"{what}: series", StoreError)
+        found = parse_series(path, id_, head, csv, start, identity, settings, created)
+        if (found.camera, found.name) != (camera, name):
+            raise StoreError(f"{what}: its head names {found.camera!r}/{found.name!r}")
+        yield found
 
 
 def to_json(mapping: Mapping[str, Any]) -> str:
@@ -423,19 +424,3 @@ class KeptFrame:
     frame_time: float
     path: Path | None
     eventful: bool
-
-
-def frames_after(connection: sqlite3.Connection, after: int, limit: int) -> Iterator[KeptFrame]:
-    """Yield up to `limit` epochs with an id above `after`, with or without a frame."""
-    for id_, series, number, time, status, extra, frame in connection.execute(
-        "SELECT id, series_id, number, frame_time, status, extra, frame FROM epoch "
-        "WHERE id > ? ORDER BY id LIMIT ?",
-        (after, limit),
-    ):
-        path, eventful = None, False
-        try:
-            path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
-            eventful = status not in UNEVENTFUL or "event" in json.loads(extra)
-        except (StoreError, ValueError) as error:
-            log.warning("%s; its frame is left out", error)
-        yield KeptFrame(id_, series, number, time, path, eventful)

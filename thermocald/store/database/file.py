@@ -26,7 +26,6 @@ import tempfile
 import time
 import uuid
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -419,42 +418,34 @@ _DAMAGED_SALT_BITS = 3  # salts of another run differ in about half of their 64 
 _TRIES, _PAUSE_S = 3, 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class WalTail:
-    """The transactions of a -wal file that cannot be read.
+def read_wal_tail(path: Path) -> tuple[int, bool]:
+    """Return (lost, unfinished) of a -wal file with the -shm file beside it.
 
-    lost: number of committed ones, -1 for all of them; unfinished: the last one is incomplete and
-    may not have been committed. Its writer was killed, or the file was cut off in copying, and more
-    may have followed.
+    lost: number of committed transactions that cannot be read, -1 for all; unfinished: the last one
+    is incomplete and may not have been committed. Its writer was killed, or the file was cut off in
+    copying, and more may have followed. The files may be written meanwhile.
     """
-
-    lost: int = 0
-    unfinished: bool = False
-
-
-def read_wal_tail(path: Path) -> WalTail:
-    """Read a -wal file, with the -shm file beside it; they may be written meanwhile."""
     for _ in range(_TRIES):
         tail = _read_tail(path)
-        if tail == WalTail():
+        if tail == (0, False):
             break
         time.sleep(_PAUSE_S)  # a frame that is only half written looks like damage
     return tail
 
 
-def _read_tail(path: Path) -> WalTail:
+def _read_tail(path: Path) -> tuple[int, bool]:
     committed = _committed_frames(path)  # first: later commits may be read half-written
     try:
         data = path.read_bytes()
     except OSError:
-        return WalTail()
+        data = b""
     if len(data) < _HEADER.size:
-        return WalTail()
+        return 0, False
     magic, _, page_size, _, *salts, first, second = _HEADER.unpack_from(data)
     order = ">" if magic & 1 else "<"
     sums = _checksum(order, data[:24], (0, 0))
     if magic & ~1 != _MAGIC or sums != (first, second) or page_size % 512:
-        return WalTail(lost=-1)
+        return -1, False
     broken = earlier = False
     whole = ended = 0  # number of frames, and of those up to the last end of a transaction
     commits: list[int] = []  # numbers of frames that end a transaction, from the broken one on
@@ -477,9 +468,9 @@ def _read_tail(path: Path) -> WalTail:
     frames = committed.get(data[16:24], 0)
     if not broken:
         cut = ended < whole or (not earlier and (len(data) - _HEADER.size) % step)
-        return WalTail(int(whole < frames), unfinished=bool(cut) and whole >= frames)
+        return int(whole < frames), bool(cut) and whole >= frames
     lost = len([n for n in commits if n != commits[-1] or n <= frames])
-    return WalTail(lost, unfinished=not lost)
+    return lost, not lost
 
 
 def _committed_frames(wal: Path) -> dict[bytes, int]:

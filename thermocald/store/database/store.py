@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.errors import StoreError, StoreFullError
-from thermocald.names import file_name, require_channels
+from thermocald.names import UNEVENTFUL, file_name, relative_path, require_channels
 from thermocald.numbers import counted
 from thermocald.store.database import columns, epochs
 from thermocald.store.database.file import (
@@ -115,7 +115,7 @@ class Store(SeriesReader):
 
     def all_series(self) -> list[StoredSeries]:
         with self._reads("the series") as connection:
-            return epochs.select_series(connection, self.path)
+            return list(epochs.select_series(connection, self.path))
 
     def last_epoch(self, series: StoredSeries) -> int | None:
         """Return the number of the last epoch, after which to resume; None without epochs."""
@@ -175,7 +175,7 @@ class Store(SeriesReader):
         return {name: found[source[name]] for name in names}
 
     def column_pages(
-        self, series: StoredSeries, names: Sequence[str], rows: int = 1000
+        self, series: StoredSeries, names: Sequence[str], rows: int
     ) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the columns of `stamped_columns`, `rows` epochs at a time, in constant memory.
 
@@ -210,12 +210,11 @@ class Store(SeriesReader):
                 return
             after = page[-1]["id"]
 
-    def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
-        """Return the events of one series, or of all, oldest first."""
+    def events(self, since_utc: float = 0.0) -> list[Event]:
+        """Return the events, oldest first."""
         with self._reads("events") as connection:
-            condition = "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id"
-            wanted = (since_utc, None if series is None else series.id)
-            rows = columns.examined_rows(connection, "event", condition, wanted)
+            condition = "WHERE utc >= ? ORDER BY id"
+            rows = columns.examined_rows(connection, "event", condition, (since_utc,))
             return [
                 Event(
                     row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
@@ -239,9 +238,23 @@ class Store(SeriesReader):
             return list(epochs.whole_rows(connection, table, condition, (after, limit)))
 
     def frames_after(self, after: int, limit: int) -> list[epochs.KeptFrame]:
-        """Return up to `limit` epochs with ids above `after` and their frames, for a forwarder."""
+        """Return up to `limit` epochs with ids above `after`, to forward their frames."""
+        found = []
         with self._reads("frames") as connection:
-            return list(epochs.frames_after(connection, after, limit))
+            for id_, series, number, time, status, extra, frame in connection.execute(
+                "SELECT id, series_id, number, frame_time, status, extra, frame FROM epoch "
+                "WHERE id > ? ORDER BY id LIMIT ?",
+                (after, limit),
+            ):
+                path, eventful = None, False
+                try:
+                    what = f"epoch {number}: frame"
+                    path = relative_path(frame, what, StoreError) if frame else None
+                    eventful = status not in UNEVENTFUL or "event" in json.loads(extra)
+                except (StoreError, ValueError) as error:
+                    log.warning("%s; its frame is left out", error)
+                found.append(epochs.KeptFrame(id_, series, number, time, path, eventful))
+        return found
 
     def rows_waiting(self, after: Mapping[str, int]) -> int:
         """Count the rows of the growing tables with ids above `after`, given by table."""
@@ -257,12 +270,12 @@ class Store(SeriesReader):
         """
         with self._reads("the store") as connection:
             found = epochs.examine(connection)
-        tail = read_wal_tail(helper(self.path, "wal"))
+        lost, unfinished = read_wal_tail(helper(self.path, "wal"))
         damaged = list(found.damaged)
-        if tail.lost:
-            lost = "all transactions" if tail.lost < 0 else counted(tail.lost, "transaction")
-            damaged.insert(0, f"the -wal file: {lost} in it cannot be read")
-        found = replace(found, damaged=tuple(damaged), unfinished=tail.unfinished)
+        if lost:
+            what = "all transactions" if lost < 0 else counted(lost, "transaction")
+            damaged.insert(0, f"the -wal file: {what} in it cannot be read")
+        found = replace(found, damaged=tuple(damaged), unfinished=unfinished)
         if not found.damaged:
             for series in self.all_series():
                 self.series_columns(series, [*COLUMN_NAMES, *series.head.channels])

@@ -293,8 +293,7 @@ def _detect_separator(path: Path, lines: list[str]) -> str:
 
 def _is_data(row: list[str]) -> bool:
     """Return whether a row holds a time and a reading or a word for a missing one."""
-    times = sum(_is_time(field) for field in row)
-    return times > 0 and sum(bool(_READING.fullmatch(field)) for field in row) > 0
+    return any(map(_is_time, row)) and any(map(_READING.fullmatch, row))
 
 
 def _is_time(field: str) -> bool:

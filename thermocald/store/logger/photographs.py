@@ -145,10 +145,12 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
     else:
         moment = datetime.fromtimestamp(path.stat().st_mtime, UTC)
     focal = _positive(details.get(0x920A))
+    make, model, serial = (
+        str(details.get(tag) or "").strip("\0 ") for tag in (0x010F, 0x0110, 0xA431)
+    )
     return Photograph(
-        path, moment, width, height, _camera(details), focal,
-        _pixel_pitch(details, focal, width, height),
-        str(details.get(0xA431) or "").strip("\0 "),
+        path, moment, width, height, model if model.startswith(make) else f"{make} {model}".strip(),
+        focal, _pixel_pitch(details, focal, width, height), serial,
     )  # fmt: skip
 
 
@@ -252,11 +254,6 @@ def _name_moment(path: Path) -> datetime:
     assert isinstance(moment, datetime)
     # names by Google's phones are in UTC
     return moment.replace(tzinfo=UTC) if path.name.startswith("PXL_") else moment
-
-
-def _camera(details: dict[int, Any]) -> str:
-    make, model = (str(details.get(tag) or "").strip("\0 ") for tag in (0x010F, 0x0110))
-    return model if model.startswith(make) else f"{make} {model}".strip()
 
 
 def _pixel_pitch(

@@ -89,23 +89,19 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
     top = _Reader(path, document)
     top.require_format(FORMAT)
     known = {"format", "name", "series", "interval", "camera", "temperatures"}
+    extra = {key: value for key, value in document.items() if key not in known}
+    try:  # as JSON holds them: a YAML date becomes text, as in a store
+        extra = json.loads(json.dumps(extra, default=str))
+    except TypeError as cause:
+        raise top.fail(next(iter(extra)), f"or another unknown key: {cause}") from cause
     return Head(
         name=top.text("name", path.resolve().parent.name),
         series=top.text("series", "M1"),
         interval=top.number("interval", "s", above=0.0, low=1e-4, high=1e8),
         camera=CameraSpec.read(top.inner("camera")),
         channels=_channels(top) if "temperatures" in document else {},
-        extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
+        extra=extra,
     )
-
-
-def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Return unknown keys as JSON holds them: a YAML date becomes text, as in a store."""
-    try:
-        plain: dict[str, Any] = json.loads(json.dumps(extra, default=str))
-    except TypeError as cause:
-        raise top.fail(next(iter(extra)), f"or another unknown key: {cause}") from cause
-    return plain
 
 
 def _channels(top: _Reader) -> dict[str, Channel]:

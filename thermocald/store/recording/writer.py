@@ -73,7 +73,16 @@ class RecordingWriter:
 
         Without `image`, the frame that the epoch names is copied.
         """
-        self._refuse_backwards(epoch)
+        # what `open_recording` would refuse
+        where = f"{self.path}: epoch {epoch.number}"
+        if self._last is not None and epoch.number <= self._last.number:
+            raise RecordingError(f"{where} comes after {self._last.number}; numbers must increase")
+        if not math.isfinite(epoch.frame_time):
+            raise RecordingError(f"{where}: its frame has no time")
+        if self._last is not None and epoch.frame_time < self._last.frame_time:
+            raise RecordingError(f"{where}: the time of its frame runs backwards")
+        if epoch.temperature_time < self._last_reading:
+            raise RecordingError(f"{where}: the time of its temperature runs backwards")
         with self._in_words():
             frame = self._keep_frame(epoch, image)
             times = f"{epoch.frame_time:.6f}", _number(epoch.temperature_time, ".6f")
@@ -101,18 +110,6 @@ class RecordingWriter:
                 os.fsync(file.fileno())
                 file.close()
             self._partial.rename(self.path)
-
-    def _refuse_backwards(self, epoch: Epoch) -> None:
-        """Raise RecordingError for an epoch that `open_recording` would refuse."""
-        where = f"{self.path}: epoch {epoch.number}"
-        if self._last is not None and epoch.number <= self._last.number:
-            raise RecordingError(f"{where} comes after {self._last.number}; numbers must increase")
-        if not math.isfinite(epoch.frame_time):
-            raise RecordingError(f"{where}: its frame has no time")
-        if self._last is not None and epoch.frame_time < self._last.frame_time:
-            raise RecordingError(f"{where}: the time of its frame runs backwards")
-        if epoch.temperature_time < self._last_reading:
-            raise RecordingError(f"{where}: the time of its temperature runs backwards")
 
     def _new(self, name: str, columns: list[str]) -> Any:
         """Return the CSV writer of a new table."""

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from uuid import UUID, uuid5
@@ -19,9 +21,12 @@ from uuid import UUID, uuid5
 import numpy as np
 
 from thermocald import __version__
-from thermocald.store.database.epochs import latest_epochs, series_row, unpack_covariance
-from thermocald.store.recording.head import parse_head
-from thermocald.store.recording.testfield_file import parse_testfield
+from thermocald.store.database.epochs import (
+    latest_epochs,
+    parse_series,
+    series_row,
+    unpack_covariance,
+)
 from thermocald.store.schema import COLUMN_NAMES, EPOCH_NUMBERS, EPOCH_TEXTS, sql_name
 from thermocald.store.series import Event, SeriesReader, StoredEpoch, StoredSeries
 from thermocald.store.server.connection import Connected, ServerAddress
@@ -67,24 +72,14 @@ class ServerStore(Connected, SeriesReader):
         """Return all series that the address selects, in the order in which they were begun."""
         wanted = self.address
         rows = self._query(
-            "SELECT s.key, station, head, csv, start, identity, settings, created_utc "
+            "SELECT station, s.key, head, csv, start, identity, settings, created_utc "
             "FROM series s JOIN testfield USING (digest) "
             "WHERE station = coalesce(%s, station) AND camera = coalesce(%s, camera) "
             "AND name = coalesce(%s, name) ORDER BY created_utc, station, camera, name, s.key",
             (wanted.station, wanted.camera, wanted.series),
         )
-        return [
-            StoredSeries(
-                key.int,
-                parse_head(json.loads(head), self.path),
-                parse_testfield(csv, self.path),
-                start,
-                {"station": station, **json.loads(identity)},
-                json.loads(settings),
-                created,
-            )
-            for key, station, head, csv, start, identity, settings, created in rows
-        ]
+        every = [(station, parse_series(self.path, key.int, *row)) for station, key, *row in rows]
+        return [replace(s, identity={"station": station, **s.identity}) for station, s in every]
 
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
@@ -121,11 +116,16 @@ class ServerStore(Connected, SeriesReader):
             f"SELECT {quoted} FROM epoch WHERE series = %s AND number >= %s "
             "AND number <= coalesce(%s, number) ORDER BY number, revision"
         )
-        rows = self._stream(statement, (_key(series), first, last))
-        return latest_epochs(
-            (dict(zip(names, values, strict=True)) for values in rows),
-            _details if details else None,
-        )
+        with (  # a server-side cursor: constant memory
+            self._transaction("it cannot be read") as connection,
+            connection.cursor(name="thermocald") as cursor,
+        ):
+            cursor.itersize = _EPOCHS
+            cursor.execute(statement, (_key(series), first, last))
+            rows = (dict(zip(names, values, strict=True)) for values in cursor)
+            yield from latest_epochs(
+                rows, itemgetter("covariance", "observations") if details else None
+            )
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """Return the clock steps of the series' station, oldest first."""
@@ -138,20 +138,6 @@ class ServerStore(Connected, SeriesReader):
 
     def _label(self, series: StoredSeries) -> str:
         return f"{series.identity['station']}: {series.camera}/{series.name}"
-
-    def _stream(self, statement: str, values: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
-        """Yield rows through a server-side cursor, in constant memory."""
-        with (
-            self._transaction("it cannot be read") as connection,
-            connection.cursor(name="thermocald") as cursor,
-        ):
-            cursor.itersize = _EPOCHS
-            cursor.execute(statement, values)
-            yield from cursor
-
-
-def _details(row: Mapping[str, Any]) -> tuple[bytes, bytes]:
-    return bytes(row["covariance"] or b""), bytes(row["observations"] or b"")
 
 
 def _key(series: StoredSeries) -> UUID:

@@ -96,7 +96,8 @@ GONE = {"faults": [{"kind": "unplugged", "at_s": 0, "for_s": 1e9}]}
         ([AIR, {**CASE, **GONE}], [CASE, AIR], None),
         ([AIR], [CASE], None),  # of one thermometer, the column is `temperature`
         ([UNNAMED, AIR], [UNNAMED, AIR], None),  # regression: refused at each start but the first
-        ([AIR], [AIR, CASE], r"thermometers \(temperature\), not air, case; configure those"),
+        ([AIR], [AIR, CASE], (r"^camera 'r': choose a new name for its `series`, or configure the "
+         r"thermometers \(temperature, not air, case\) with which 'watch' was begun$")),
     ],
 )  # fmt: skip
 def test_a_start_is_refused_only_for_other_thermometers(tmp_path, before, after, why):

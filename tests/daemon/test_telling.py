@@ -46,8 +46,9 @@ def journal(tmp_path):
 
 
 @pytest.fixture
-def log(journal):
-    handler = JournalHandler(journal.path)
+def log(journal, monkeypatch):
+    monkeypatch.setattr("thermocald.daemon.systemd._SOCKET", journal.path)
+    handler = JournalHandler()
     log = logging.Logger("thermocald.acquisition.device_loop")  # noqa: LOG001 - apart from pytest's
     log.addHandler(handler)
     yield log
@@ -101,7 +102,7 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
     daemon.configure(**sections)
     script = (
         "import sys, thermocald.daemon.systemd as j; "
-        f"j._SOCKET = {journal.path!r}; j.JournalHandler.__init__.__defaults__ = (j._SOCKET,); "
+        f"j._SOCKET = {journal.path!r}; "
         f"sys.argv = ['thermocald', 'run', '--config', {str(daemon.config)!r}]; "
         "from thermocald.cli import main; main()"
     )

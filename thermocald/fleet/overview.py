@@ -52,21 +52,6 @@ _RESOLUTION = 0.02  # K, assumed for a thermometer that does not state it
 _LEAST_RANGE_K = 2.0
 
 
-def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[FleetCamera]]:
-    """Read the server's time (s UTC) and the cameras that an address selects; path: for messages.
-
-    Raises ServerGone, ServerError, StoreVersionError.
-    """
-    with FleetReader(address) as reader:
-        now = reader.now()
-        stations = reader.stations()
-        cameras = reader.cameras(now, path)
-    for camera in cameras:
-        camera.state = stations.get(camera.station, camera.state)
-        _complete(camera, now)
-    return now, cameras
-
-
 def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
     """Return the documents of the types with enough specimens, and set their cameras' `odd`.
 
@@ -350,7 +335,12 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
     for address, source in zip(addresses, sources, strict=True):
-        now, selected = read_overview(address, source)
+        with FleetReader(address) as reader:
+            now, stations = reader.now(), reader.stations()
+            selected = reader.cameras(now, source)
+        for camera in selected:
+            camera.state = stations.get(camera.station, camera.state)
+            _complete(camera, now)
         cameras += selected
     types = camera_types(cameras)
     add_findings(cameras, types, now)
@@ -487,7 +477,11 @@ def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
         "Every camera",
         cameras,
         {
-            "station/camera": lambda c: f"{'● ' if c['findings'] else ''}{_name(c)}",
+            "station": lambda c: c["station"],
+            "camera": lambda c: c["camera"],
+            "findings": lambda c: ", ".join(
+                dict.fromkeys(_FINDINGS[f["kind"]][0] for f in c["findings"])
+            ),
             "last epoch": lambda c: short_duration(c["lag_s"]),
             "on its way": lambda c: short_duration(c["on_the_way_s"]),
             "waiting": lambda c: _known(c["waiting"], "d"),
@@ -499,7 +493,6 @@ def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
             "y₀ µm/K": lambda c: _rate(c, "y0"),
             "type": lambda c: str(c["type"]),
         },
-        "●: has findings.",
     )
 
 

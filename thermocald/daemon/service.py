@@ -325,7 +325,7 @@ class Service:
         try:
             text = self._apply_configuration()
         except ThermocaldError as error:
-            if self._station.stopped:
+            if self._station.stopping.is_set():
                 raise  # a daemon that takes nothing would look healthy: a restart may help
             text = f"the configuration cannot be reloaded, the old one stays in force: {error}"
             log.error("%s", text, extra={"event": "reload_failed"})

@@ -206,7 +206,7 @@ class Station:
         self.config, self.runtime = config, runtime
         clock = runtime.clock
         self.frames = FrameFolder(config.frames)
-        self._stop = threading.Event()
+        self.stopping = threading.Event()  # once set, it cannot be started again
         self._started = False
         begin = clock.monotonic() + _LEAD_S
         self.thermometers = Thermometers(config, clock, runtime.guard.event, fast=runtime.fast)
@@ -234,7 +234,7 @@ class Station:
     def stop(self, grace_s: float) -> bool:
         """Finish the current epochs and stop; return False if a device or output hangs."""
         deadline = time.monotonic() + grace_s
-        self._stop.set()
+        self.stopping.set()
         for loop in self._loops:
             loop.stop()
         done = True
@@ -249,11 +249,6 @@ class Station:
             self.thermometers.links[name].close()
         self._retention.join(1.0)
         return done
-
-    @property
-    def stopped(self) -> bool:
-        """Whether it was told to stop; it cannot be started again."""
-        return self._stop.is_set()
 
     def stalled(self) -> list[str]:
         """Return a sentence for each device and pipeline that hangs."""
@@ -362,5 +357,5 @@ class Station:
         while True:
             self.retain()
             pause = _RETENTION_WHEN_FULL_S if self.frames.paused else _RETENTION_EVERY_S
-            if self._stop.wait(pause):
+            if self.stopping.wait(pause):
                 return

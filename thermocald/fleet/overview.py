@@ -375,7 +375,12 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
     heads = f"{'last':>7} {'waiting':>7} {'ok':>6} {'°C':>6} {'c µm/K':>16}"
     lines += ["", f"{'station/camera':<{name}} {heads}"]
     for camera in shown:
-        lines.append(_row(camera, name))
+        ok = "–" if camera["ok"] is None else percent(camera["ok"])
+        lines.append(
+            f"{shortened(_name(camera), name):<{name}} {short_duration(camera['lag_s']):>7} "
+            f"{_known(camera['waiting'], 'd'):>7} {ok:>6} "
+            f"{_known(camera['temperature'], '.1f'):>6} {_rate(camera, 'c'):>16}"
+        )
         for finding in camera["findings"]:
             lines += textwrap.wrap(
                 finding["text"],
@@ -413,15 +418,6 @@ def _rate(camera: Mapping[str, Any], name: str) -> str:
 
 def _known(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
-
-
-def _row(camera: dict[str, Any], width: int) -> str:
-    ok = "–" if camera["ok"] is None else percent(camera["ok"])
-    return (
-        f"{shortened(_name(camera), width):<{width}} {short_duration(camera['lag_s']):>7} "
-        f"{_known(camera['waiting'], 'd'):>7} {ok:>6} {_known(camera['temperature'], '.1f'):>6} "
-        f"{_rate(camera, 'c'):>16}"
-    )
 
 
 def render_fleet(document: Mapping[str, Any]) -> str:

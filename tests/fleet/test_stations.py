@@ -17,14 +17,6 @@ from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.fleet_reader import FleetReader
 
 
-def filled_store(path, head, field, make_epoch, make_result, epochs=5) -> Path:
-    with Store.open(path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for i in range(1, epochs + 1):
-            store.append(series, make_epoch(i), make_result(i))
-    return path
-
-
 def findings(server) -> set[str]:
     """Return the kinds of an overview's findings."""
     cameras = fleet_document([Path(server.address(name="thermocald"))])["cameras"]
@@ -33,8 +25,14 @@ def findings(server) -> set[str]:
 
 @pytest.fixture
 def two(tmp_path, head, field, make_epoch, make_result):
-    made = (head, field, make_epoch, make_result)
-    return [filled_store(tmp_path / f"{name}.db", *made) for name in ("one", "two")]
+    """Two stores of five epochs each."""
+    paths = [tmp_path / f"{name}.db" for name in ("one", "two")]
+    for path in paths:
+        with Store.open(path, "append", durable=False) as store:
+            series = store.create_series(head, field)
+            for i in range(1, 6):
+                store.append(series, make_epoch(i), make_result(i))
+    return paths
 
 
 def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):

@@ -68,7 +68,7 @@ class FollowedStore:
         self._file = StoreFile(self.path)
         self._mount = mount_point(self.path)
         tail = read_wal_tail(helper(self.path, "wal"))
-        if tail.lost:  # a copy, for examination: opening the store empties the file
+        if tail.lost:  # a copy is kept for examination
             kept = str(self.path.with_name(f"{self.path.stem}-wal-damaged-{utc_stamp()}"))
             try:
                 shutil.copyfile(helper(self.path, "wal"), kept)

@@ -306,11 +306,16 @@ class Station:
     def status(self) -> dict[str, Any]:
         """Return the devices' part of the status document."""
         hang_after_s = self.runtime.hang_after_s
+        thermometers = {}
+        for name, link in self.thermometers.links.items():
+            busy_s = self._readers[name].busy_s() if name in self._readers else 0.0
+            status = link.status(busy_s, hang_after_s)
+            values, missing = self.thermometers.last(name)
+            status["warnings"] += missing
+            thermometers[name] = {**status, "last": dict(values)}
         return {
             "cameras": {camera.plan.name: camera.status() for camera in self.cameras},
-            "thermometers": {
-                name: self._thermometer_status(name) for name in self.thermometers.links
-            },
+            "thermometers": thermometers,
             "outputs": {
                 output.link.name: {
                     **output.link.status(0.0, hang_after_s),
@@ -325,12 +330,6 @@ class Station:
                 "ages_known": self.runtime.clock.settled(),
             },
         }
-
-    def _thermometer_status(self, name: str) -> dict[str, Any]:
-        busy_s = self._readers[name].busy_s() if name in self._readers else 0.0
-        link = self.thermometers.links[name].status(busy_s, self.runtime.hang_after_s)
-        values, missing = self.thermometers.last(name)
-        return {**link, "warnings": link["warnings"] + missing, "last": dict(values)}
 
     def _read(self, name: str) -> None:
         """Read a thermometer; store the reading if no epoch will contain it."""

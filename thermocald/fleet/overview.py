@@ -167,22 +167,6 @@ _OUTSIDE_K = 2.0
 _SHIFT_PX, _SHIFT_SDS = 0.3, 6.0
 
 
-def add_findings(
-    cameras: Sequence[FleetCamera], types: Sequence[dict[str, Any]], now: float
-) -> None:
-    """Fill `findings` of all cameras; now: s UTC, by the server's clock."""
-    of_name = {name: kind for kind in types for name in kind["cameras"]}
-    for camera in cameras:
-        findings = chain(
-            _late(camera, now),
-            _sensors(camera),
-            _calibration(camera, now),
-            _odd(camera, of_name.get(camera.name)),
-            _clock(camera),
-        )
-        camera.findings = [{"kind": kind, "text": text} for kind, text in findings]
-
-
 def _late(camera: FleetCamera, now: float) -> Findings:
     limit = max(_LATE_INTERVALS * camera.head.interval, _LATE_S)
     if camera.lag_s > limit:
@@ -343,7 +327,13 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
             _complete(camera, now)
         cameras += selected
     types = camera_types(cameras)
-    add_findings(cameras, types, now)
+    type_of = {name: kind for kind in types for name in kind["cameras"]}
+    for camera in cameras:
+        findings = chain(
+            _late(camera, now), _sensors(camera), _calibration(camera, now),
+            _odd(camera, type_of.get(camera.name)), _clock(camera),
+        )  # fmt: skip
+        camera.findings = [{"kind": kind, "text": text} for kind, text in findings]
     counts = Counter(kind for c in cameras for kind in {f["kind"] for f in c.findings})
     return {
         "format": "thermocald-fleet/1",

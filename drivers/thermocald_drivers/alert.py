@@ -221,14 +221,6 @@ _KINDS: dict[str, type[Condition]] = {
 }  # fmt: skip
 
 
-def condition_of(stanza: Mapping[str, Any]) -> Condition:
-    """Read an entry of `when`; raises ConfigurationError."""
-    kind = next((kind for key, kind in _KINDS.items() if key in stanza), None)
-    if kind is None:
-        raise ConfigurationError(f"when: {dict(stanza)} has none of {', '.join(_KINDS)}")
-    return kind.read(stanza, "when")
-
-
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
@@ -251,7 +243,12 @@ class AlertOutput(Output):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._conditions = [condition_of(stanza) for stanza in self.options.when]
+        self._conditions: list[Condition] = []
+        for stanza in self.options.when:
+            kind = next((kind for key, kind in _KINDS.items() if key in stanza), None)
+            if kind is None:
+                raise ConfigurationError(f"when: {stanza} has none of {', '.join(_KINDS)}")
+            self._conditions.append(kind.read(stanza, "when"))
         names = [condition.name for condition in self._conditions]
         if twice := {name for name in names if names.count(name) > 1}:
             raise ConfigurationError(f"when: {min(twice)} is given twice")

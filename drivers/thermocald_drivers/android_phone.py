@@ -331,7 +331,14 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         found: dict[str, float | str] = {
             f"thermal:{name}": value for name, value in service.items()
         }
-        found |= self._battery(texts) | self._zones(texts)
+        if "battery" in texts:
+            number = battery(texts["battery"], self._scales.get("battery"))
+            if number is None:
+                found["battery"] = NO_BATTERY
+            else:
+                self._scales["battery"] = number[1]
+                found["battery"] = self._in_unit("battery", *number)
+        found |= self._zones(texts)
         measures = {
             channel: (source, partial(self._judge, channel, source, found.get(source)))
             for channel, source in self.sensors.items()
@@ -360,15 +367,6 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         if self.switched(source, number, scale):
             return f"{number:g} agrees with the last reading only in another unit: it has switched"
         return round(number * scale, 6)
-
-    def _battery(self, texts: Mapping[str, str]) -> dict[str, float | str]:
-        if "battery" not in texts:
-            return {}
-        found = battery(texts["battery"], self._scales.get("battery"))
-        if found is None:
-            return {"battery": NO_BATTERY}
-        self._scales["battery"] = found[1]
-        return {"battery": self._in_unit("battery", *found)}
 
     def _zones(self, texts: Mapping[str, str]) -> dict[str, float | str]:
         raw = kernel.raw_zones(texts.get("zone", ""))

@@ -167,35 +167,30 @@ class Picamera2Camera(Camera):
         self.handle = camera
 
     def _configure(self, camera: Any) -> None:
-        focuses = "LensPosition" in camera.camera_controls
-        if tuple(camera.sensor_resolution) != (self.options.width, self.options.height):
+        o, focuses = self.options, "LensPosition" in camera.camera_controls
+        if tuple(camera.sensor_resolution) != (o.width, o.height):
             have = "×".join(str(n) for n in camera.sensor_resolution)
             raise WrongDevice(
-                f"{self.where}: the sensor has {have} px, not "
-                f"{self.options.width}×{self.options.height}; "
-                "a scaled image has another interior orientation"
+                f"{self.where}: the sensor has {have} px, not {o.width}×{o.height}; a scaled image "
+                "has another interior orientation"
             )
-        if self.options.focus_dioptres is not None and not focuses:
+        if o.focus_dioptres is not None and not focuses:
             raise WrongDevice(f"{self.where}: this lens cannot be focused; omit focus_dioptres")
         controls: dict[str, Any] = {
-            "AeEnable": AUTO in (self.options.exposure_s, self.options.gain),
-            "AwbEnable": self.options.colour_gains == AUTO,
+            "AeEnable": AUTO in (o.exposure_s, o.gain),
+            "AwbEnable": o.colour_gains == AUTO,
             **self._stated,
         }
         if exposure := controls.get("ExposureTime"):
             controls["FrameDurationLimits"] = (max(exposure, 100_000),) * 2
         if focuses:
-            automatic = self.options.focus_dioptres == AUTO
+            automatic = o.focus_dioptres == AUTO
             controls["AfMode"] = CONTINUOUS_FOCUS if automatic else MANUAL_FOCUS
-        main = {"size": (self.options.width, self.options.height), "format": "YUV420"}
+        main = {"size": (o.width, o.height), "format": "YUV420"}
         still = camera.create_still_configuration(main=main, controls=controls, buffer_count=2)
         camera.configure(still)
         camera.start()
-        self._lock(camera)
-
-    def _lock(self, camera: Any) -> None:
-        """Lock the lens position and colour gains that the stanza omits."""
-        o = self.options
+        # what the stanza omits is locked as it is
         wanted = {"LensPosition": o.focus_dioptres, "ColourGains": o.colour_gains}
         open_ones = [name for name, value in wanted.items() if value is None]
         if any(name not in self._held for name in open_ones):
@@ -238,17 +233,19 @@ class Picamera2Camera(Camera):
         sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # suspended, s
         middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
         monotonic, utc = support.on_clock(self.clock, middle)
-        return Frame(
-            image=plane,
-            monotonic=monotonic,
-            utc=utc,
-            exposure=exposure,
-            settings=frame_settings(metadata) | self._modes(metadata),
-        )
+        o = self.options
+        settings = frame_settings(metadata) | {
+            "exposure_auto": float(AUTO in (o.exposure_s, o.gain)),
+            "white_balance_auto": float(o.colour_gains == AUTO),
+        }
+        if "LensPosition" in metadata:
+            settings["focus_auto"] = float(o.focus_dioptres == AUTO)
+        return Frame(plane, monotonic, utc, exposure=exposure, settings=settings)
 
     def _fresh(self, camera: Any, called_ns: int) -> tuple[Any, Mapping[str, Any]]:
         """Return (grey plane, metadata) of the first frame that began after the call."""
-        deadline = time.monotonic() + self.options.timeout_s
+        o = self.options
+        deadline = time.monotonic() + o.timeout_s
         while time.monotonic() < deadline and self.handle is camera:
             request = camera.capture_request()
             try:
@@ -257,27 +254,15 @@ class Picamera2Camera(Camera):
                     raise BadReading(f"{self.where}: a frame without time stamp or exposure")
                 if metadata["SensorTimestamp"] - metadata["ExposureTime"] * 1000 < called_ns:
                     continue
-                return self._plane(request.make_array("main")), metadata
+                array = request.make_array("main")
+                rows, stride = array.shape
+                if rows < o.height * 3 // 2 or stride < o.width:
+                    raise BadReading(f"{self.where}: partial frame, {stride}×{rows} bytes")
+                # the luminance of YUV420 is its top rows
+                return np.array(array[: o.height, : o.width], np.uint8), metadata
             finally:
                 request.release()
         raise BadReading(f"{self.where}: no frame that began after the call")
-
-    def _plane(self, array: Any) -> Any:
-        """Return the luminance of a YUV420 array: its top H rows; their stride may exceed W."""
-        rows, stride = array.shape
-        if rows < self.options.height * 3 // 2 or stride < self.options.width:
-            raise BadReading(f"{self.where}: partial frame, {stride}×{rows} bytes")
-        return np.array(array[: self.options.height, : self.options.width], np.uint8)
-
-    def _modes(self, metadata: Mapping[str, Any]) -> dict[str, float]:
-        """Return 1.0 for each setting that is left to the camera, 0.0 for the others."""
-        found = {
-            "exposure_auto": float(AUTO in (self.options.exposure_s, self.options.gain)),
-            "white_balance_auto": float(self.options.colour_gains == AUTO),
-        }
-        if "LensPosition" in metadata:
-            found["focus_auto"] = float(self.options.focus_dioptres == AUTO)
-        return found
 
     def _in_time(self, work: Any, what: str, timeout_s: float | None = None) -> Any:
         """Run work in a new thread, which is abandoned if it hangs; raises DeviceTimeout."""

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import time
 from pathlib import Path
@@ -87,8 +86,8 @@ class Daemon:
         """Return the daemon's status document, {} without one."""
         return read_json(self.store.with_name(f"{self.store.name}.live") / "status.json")
 
-    def results(self, name: str = "results.jsonl") -> list[dict]:
-        path = self.folder / name
+    def results(self) -> list[dict]:
+        path = self.folder / "results.jsonl"
         if not path.exists():
             return []
         lines = path.read_text().split("\n")[:-1]  # an incomplete line may follow the last line end
@@ -306,40 +305,3 @@ def small_disk(tmp_path: Path):
     yield mount
     for folder in mounted:
         tool("umount", "-l", folder)
-
-
-class Supervisor:
-    """The notification socket, in place of systemd's."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(str(path))
-        self._socket.settimeout(0.1)
-        self.heard: list[str] = []
-
-    def listen(self, seconds: float) -> list[str]:
-        """Return the messages of the next seconds."""
-        end, begin = time.monotonic() + seconds, len(self.heard)
-        while time.monotonic() < end:
-            try:
-                self.heard += self._socket.recv(4096).decode().split("\n")
-            except TimeoutError:
-                continue
-        return self.heard[begin:]
-
-    def until(self, word: str, timeout_s: float = 60.0) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not any(line.startswith(word) for line in self.heard):
-            assert time.monotonic() < deadline, f"{word} was not said: {self.heard}"
-            self.listen(0.1)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-@pytest.fixture
-def supervisor(tmp_path: Path):
-    supervisor = Supervisor(tmp_path / "notify.sock")
-    yield supervisor
-    supervisor.close()

@@ -96,10 +96,12 @@ GONE = {"faults": [{"kind": "unplugged", "at_s": 0, "for_s": 1e9}]}
         ([AIR, {**CASE, **GONE}], [CASE, AIR], None),
         ([AIR], [CASE], None),  # of one thermometer, the column is `temperature`
         ([UNNAMED, AIR], [UNNAMED, AIR], None),  # regression: refused at each start but the first
-        ([AIR], [AIR, CASE], r"thermometers \(temperature\), not air, case; configure those"),
+        ([AIR], [AIR, CASE], (r"^camera 'r': choose a new name for its `series`, or configure the "
+         r"thermometers \(temperature, not air, case\) with which 'watch' was begun$")),
+        ([AIR], [AIR], r"or configure the test field with which 'watch' was begun$"),
     ],
 )  # fmt: skip
-def test_a_start_is_refused_only_for_other_thermometers(tmp_path, before, after, why):
+def test_a_start_is_refused_only_for_other_thermometers_or_targets(tmp_path, before, after, why):
     recording = make_recording(tmp_path / "R", 2)
     for name in ("recording.yaml", "epochs.csv"):
         text = (recording / name).read_text()
@@ -118,9 +120,12 @@ def test_a_start_is_refused_only_for_other_thermometers(tmp_path, before, after,
     start(before)
     if why is None:
         start(after)
-    else:
-        with pytest.raises(ConfigurationError, match=why):
-            start(after)
+        return
+    if before == after:
+        field = recording / "testfield.csv"
+        field.write_text("".join(field.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(ConfigurationError, match=why):
+        start(after)
 
 
 def test_a_long_series_does_not_keep_its_next_epochs_waiting(run, tmp_path, monkeypatch):

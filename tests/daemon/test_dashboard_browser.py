@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 from pathlib import Path
 
 import pytest
 
-from tests.daemon.test_page_attacks import free_port
+from tests.daemon.test_page_attacks import free_port, serves
 
 pytestmark = pytest.mark.slow
 
@@ -30,16 +29,11 @@ def shown(daemon, devices):
     # slow enough for a busy machine: a deferred epoch is calibrated later and not drawn
     daemon.run(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
     daemon.more(3)
-    daemon.until(lambda: _listens(port))
+    daemon.until(lambda: serves(port))
     yield f"http://127.0.0.1:{port}/"
     if daemon.process.poll() is None:
         daemon.stop()
     assert "Traceback" not in daemon.log()  # a page was open when the daemon stopped
-
-
-def _listens(port: int) -> bool:
-    with socket.socket() as attempt:
-        return attempt.connect_ex(("127.0.0.1", port)) == 0
 
 
 def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
@@ -84,7 +78,7 @@ def test_a_page_that_dies_is_started_again_and_says_when_acquisition_ended(daemo
     os.kill(int(children.read_text()), signal.SIGKILL)
     daemon.until(lambda: "it is started again" in daemon.log())
     daemon.more(2)
-    daemon.until(lambda: _listens(int(shown.split(":")[2][:-1])))
+    daemon.until(lambda: serves(int(shown.split(":")[2][:-1])))
     page = page_of(shown)
     page.wait_for_function("() => document.querySelector('#figures dd') !== null")
     daemon.stop()

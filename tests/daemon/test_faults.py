@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -60,20 +62,41 @@ def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, dev
     assert sum(begin < t < begin + 1.5 for t in times["two"]) >= 0.3 * usual - 1
 
 
+@pytest.fixture
+def heard(tmp_path):
+    """s → the messages to the notification socket, in place of systemd's, in this time."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+        channel.bind(str(tmp_path / "notify.sock"))
+        channel.settimeout(0.1)
+
+        def listen(seconds: float) -> list[str]:
+            messages: list[str] = []
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                with suppress(TimeoutError):
+                    messages += channel.recv(4096).decode().split("\n")
+            return messages
+
+        yield listen
+
+
 @pytest.mark.slow  # waits for the watchdog, and at the end for the hung thread
-def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, devices, supervisor):
+def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(
+    daemon, devices, heard, tmp_path
+):
     hangs = [{"kind": "timeout", "at": 8}]
     sections = devices(camera=hangs, timeout_s=3600.0)
     sections["cameras"].append({**sections["cameras"][0], "name": "two", "faults": []})
     daemon.configure(**sections)
-    daemon.start("--hang-after", "3", NOTIFY_SOCKET=str(supervisor.path), WATCHDOG_USEC="2000000")
-    supervisor.until("READY=1")
-    assert "WATCHDOG=1" in supervisor.listen(1.2)
+    place = str(tmp_path / "notify.sock")
+    daemon.start("--hang-after", "3", NOTIFY_SOCKET=place, WATCHDOG_USEC="2000000")
+    daemon.until(lambda: "READY=1" in heard(0.1))
+    assert "WATCHDOG=1" in heard(1.2)
     # on a busy machine, opening and calculating may take long
     daemon.until(lambda: sum(r["device"] == "one" for r in daemon.results()) == 7)
     daemon.until(lambda: daemon.status()["stalled"] == ["camera one hangs"])
-    supervisor.listen(0.5)
-    assert "WATCHDOG=1" not in supervisor.listen(2.5)
+    heard(0.5)
+    assert "WATCHDOG=1" not in heard(2.5)
     count = len([r for r in daemon.results() if r["device"] == "two"])
     daemon.until(lambda: len([r for r in daemon.results() if r["device"] == "two"]) > count + 5)
     assert len([r for r in daemon.results() if r["device"] == "one"]) == 7

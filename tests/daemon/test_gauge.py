@@ -47,14 +47,10 @@ def control_points(tmp_path, small_field):
     return path
 
 
-def at_work(devices, thermal_model, **options):
-    return devices(thermal_model=str(thermal_model), series="gauge", **options)
-
-
 def test_predicted_epochs_through_a_restart_are_not_taken_for_calibrations(
     daemon, devices, thermal_model
 ):
-    daemon.run(**at_work(devices, thermal_model))
+    daemon.run(**devices(thermal_model=str(thermal_model), series="gauge"))
     daemon.until(lambda: len(daemon.results()) >= 5)
     daemon.kill()
     daemon.start()
@@ -91,7 +87,8 @@ def test_posed_epochs_are_those_of_the_rendered_camera_and_kept_frames_stand_the
     daemon, devices, thermal_model, control_points
 ):
     """Every second frame, and beside it the same frame at T₀ with the row's pose."""
-    document = at_work(devices, thermal_model, control_points=str(control_points))
+    model = {"thermal_model": str(thermal_model), "control_points": str(control_points)}
+    document = devices(series="gauge", **model)
     folder = daemon.folder / "frames"
     frames = {"keep": "every_n", "every_n": 2, "corrected": True, "folder": str(folder)}
     daemon.run("--epochs", "6", **document | {"frames": frames | {"min_free_gb": 0}})

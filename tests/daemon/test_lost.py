@@ -23,7 +23,7 @@ from thermocald.daemon.live_state import LiveState, status_warnings
 from thermocald.daemon.plan import recording_config
 from thermocald.daemon.service import Service
 from thermocald.errors import DataError, StoreError
-from thermocald.hal import Frame, SystemClock, open_device
+from thermocald.hal import Frame, SystemClock
 from thermocald.output.dashboard.view import View
 from thermocald.store.database.store import Store
 
@@ -163,18 +163,6 @@ def test_an_epoch_that_is_not_handed_over_is_lost(how):
     assert pipeline.stop(20.0) or how == "the end"
     assert pipeline.lost == len(told) > 0
     assert all(text.startswith("camera cam: ") for text in told)
-
-
-def test_an_alert_says_so_and_takes_it_back():
-    options = {"command": ["true"], "when": [{"lost": 1}]}
-    output = open_device("output", "alert_exec", options, SystemClock())
-    rows = [
-        {"epoch": n, "series": "M1", "status": "ok", "frame_time": float(n), "lost": lost}
-        for n, lost in enumerate([0, 0, 1, 1, 4, 4])
-    ]
-    alerts = [(r["epoch"], a.state, a.text) for r in rows for a in output.changes(r, "cam")]
-    assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
-    assert alerts[2][2] == "cam: 3 epochs were taken but not stored (limit 1)"
 
 
 def test_a_recording_whose_channels_no_epoch_can_have_is_refused_before_it_is_played(tmp_path):

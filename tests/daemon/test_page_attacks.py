@@ -25,6 +25,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def serves(port: int) -> bool:
+    with socket.socket() as channel:
+        return channel.connect_ex(("127.0.0.1", port)) == 0
+
+
 def resident_mb(pid: int) -> float:
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) / 1024
@@ -36,15 +41,6 @@ def make_store(path: Path, epochs: int) -> None:
         for k in range(1, epochs + 1):
             epoch = replace(small_epoch(k, interval_s=10.0), temperatures={"t": k / 9})
             store.append(series, epoch, small_result(k / 7))
-
-
-def slow_reader(port: int, path: str) -> socket.socket:
-    """Open a connection that sends a request and reads nothing."""
-    channel = socket.socket()
-    channel.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    channel.connect(("127.0.0.1", port))
-    channel.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
-    return channel
 
 
 class Page:
@@ -72,8 +68,12 @@ class Page:
             return answer.read()
 
     def slow(self, path: str) -> socket.socket:
-        """Send a request and read nothing."""
-        return slow_reader(self.port, path)
+        """Open a connection that sends a request and reads nothing."""
+        channel = socket.socket()
+        channel.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        channel.connect(("127.0.0.1", self.port))
+        channel.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        return channel
 
     def close(self) -> None:
         self.process.kill()
@@ -155,11 +155,6 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, measured):
 def test_the_page_follows_the_configuration_and_ends_with_a_killed_daemon(daemon, measured):
     """A port changed by SIGHUP was ignored; a killed daemon's page kept the port for itself."""
     ports = free_port(), free_port()
-
-    def serves(port: int) -> bool:
-        with socket.socket() as channel:
-            return channel.connect_ex(("127.0.0.1", port)) == 0
-
     # what the command line demands stays demanded
     daemon.configure(**measured, dashboard={"port": ports[0]}, store={"path": "other.db"})
     daemon.start("--dashboard", "--store", str(daemon.store), INVOCATION_ID="")

@@ -2,49 +2,40 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
-import yaml
 
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
 
 @pytest.fixture
-def session(tmp_path, devices, spawn):
+def session(daemon, devices, spawn):
     """options → a running `thermocald session start` in a folder with a configuration."""
 
     def start(*options: str, **configured):
-        sections = {**devices(period_s=0.3, name="phone-1", **configured), "outputs": []}
-        document = {"store": {"path": "t.db"}, "frames": {"keep": "none"}, **sections}
-        (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
-        return spawn(tmp_path, "session", "start", *options)
+        sections = devices(period_s=0.3, name="phone-1", **configured)
+        daemon.configure(**{**sections, "outputs": []})
+        return spawn(daemon.folder, "session", "start", *options)
 
     return start
 
 
-def test_it_is_checked_taken_interrupted_resumed_and_archived(session, tmp_path):
+def test_it_is_checked_taken_interrupted_resumed_and_archived(session, daemon):
     command = ["--camera", "phone-1", "--series", "M7", "--start", "cold", "--epochs", "5",
                "--no-report"]  # fmt: skip
     first = session(*command)
-    deadline = time.monotonic() + 90
-    path = tmp_path / "t.db"
-    while _epochs(path) < 2:
-        assert time.monotonic() < deadline
-        assert first.poll() is None, first.said()
-        time.sleep(0.1)
-    first.kill()
-    first.wait()
-    had = _epochs(path)
+    daemon.process = first
+    daemon.until(lambda: _epochs(daemon.store) >= 2)
+    daemon.kill()
+    had = _epochs(daemon.store)
     second = session(*command)
     told = second.said()
     assert second.returncode == 0, told
     assert f"has {had} epochs; {5 - had} are still to be taken" in told
     assert "48 targets" in told
-    recording = read_recording(tmp_path / "phone-1-M7")
+    recording = read_recording(daemon.folder / "phone-1-M7")
     assert [epoch.number for epoch in recording.epochs] == list(range(1, 6))
-    with Store.open(path) as store:
+    with Store.open(daemon.store) as store:
         series = store.find_series()
         assert (series.start, series.identity["serial"]) == ("cold", "mock-1")
 
@@ -73,7 +64,7 @@ def test_a_camera_that_sees_nothing_is_told_before_it_begins(session, tmp_path):
     told = process.said()
     assert process.returncode == 3
     assert "no answer" in told
-    assert not (tmp_path / "t.db").exists()
+    assert not (tmp_path / "thermocald.db").exists()
 
 
 def test_wrong_usage_is_one_line(session):

@@ -15,9 +15,10 @@ import pytest
 from tests.daemon.conftest import tool
 from tests.store.small import create_small_series, small_epoch, small_result
 from tests.store.small import stored_numbers as numbers
-from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
+from thermocald.daemon.store_guard import Row, StoreGuard
 from thermocald.errors import StoreError
 from thermocald.output.dashboard.view import View
+from thermocald.store.database.store import Store
 
 
 @pytest.fixture
@@ -93,16 +94,16 @@ def test_a_reader_in_the_middle_of_it_costs_nothing(guard, path, what):
 def test_a_row_that_was_committed_before_its_file_could_be_followed_is_kept_once(
     guard, path, monkeypatch
 ):
-    rescue = FollowedStore._rescued
+    rescue = Store.copy_to
 
-    def full_disk(store):
+    def full_disk(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(FollowedStore, "_rescued", full_disk)
+    monkeypatch.setattr(Store, "copy_to", full_disk)
     path.unlink()
     guard.keep(4)
     assert (guard.status()["state"], guard.told[4], guard.waiting) == ("out", False, 1)
-    monkeypatch.setattr(FollowedStore, "_rescued", rescue)
+    monkeypatch.setattr(Store, "copy_to", rescue)
     guard.flush()
     assert (guard.status()["state"], guard.waiting, guard.lost) == ("ok", 0, 0)
     assert numbers(path) == [1, 2, 3, 4]

@@ -21,17 +21,27 @@ from thermocald.errors import (
 )
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
+WHEN = [{"drift": "c", "px": 0.5}]
+
 
 def result(epoch, **values):
     return {"device": "cam", "series": "watch", "epoch": epoch, "status": "ok",
             "frame_time": 1.6e9 + 10 * epoch, **values}  # fmt: skip
 
 
+def output(driver, **options):
+    return open_device("output", f"alert_{driver}", {"when": WHEN, **options}, VirtualClock())
+
+
+def alerts(when, results):
+    """Return all changes of results by one condition."""
+    device = output("exec", command=["true"], when=[when])
+    return [alert for one in results for alert in device.changes(one, "cam")]
+
+
 def told(when, results):
     """Return (epoch, state) of all changes."""
-    options = {"command": ["true"], "when": [when]}
-    output = open_device("output", "alert_exec", options, VirtualClock())
-    return [(r["epoch"], a.state) for r in results for a in output.changes(r, "cam")]
+    return [(alert.epoch, alert.state) for alert in alerts(when, results)]
 
 
 def test_a_drift_is_out_once_and_in_once():
@@ -48,7 +58,7 @@ def test_a_drift_in_standard_deviations_and_from_a_reference():
     assert told({"drift": "c", "px": 0.1, "from_mm": 3.04}, results) == [(1, "out")]
 
 
-def test_temperature_disk_and_epochs_without_result(tmp_path):
+def test_temperature_disk_and_epochs_without_result_or_lost(tmp_path):
     results = [result(i, temperature=t) for i, t in enumerate([20, 61, 59.5, 58, -11, -9.5, -8])]
     when = {"temperature": "temperature", "above_c": 60, "below_c": -10}
     assert told(when, results) == [(1, "out"), (3, "in"), (4, "out"), (6, "in")]
@@ -57,9 +67,12 @@ def test_temperature_disk_and_epochs_without_result(tmp_path):
     assert told({"no_result": 3}, results) == [(3, "out"), (5, "in")]
     assert told({"free_disk_gb": 1e6, "path": str(tmp_path)}, results) == [(0, "out")]
     assert told({"free_disk_gb": 1e-6, "path": str(tmp_path)}, results) == []
+    results = [result(i, lost=lost) for i, lost in enumerate([0, 0, 1, 1, 4, 4])]
+    assert told({"lost": 1}, results) == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
+    words = "cam: 3 epochs were taken but not stored (limit 1)"
+    assert alerts({"lost": 1}, results)[2].text == words
 
 
-WHEN = [{"drift": "c", "px": 0.5}]
 OUT, IN = result(1, drift_c_px=0.8), result(2, drift_c_px=0.1)
 
 
@@ -67,8 +80,7 @@ def test_a_program_that_hangs_is_killed(tmp_path):
     script = tmp_path / "hook"
     script.write_text("#!/bin/sh\nsleep 60\n")
     script.chmod(0o755)
-    options = {"command": [str(script)], "when": WHEN, "timeout_s": 0.3}
-    with open_device("output", "alert_exec", options, VirtualClock()) as device:
+    with output("exec", command=[str(script)], timeout_s=0.3) as device:
         begin = time.monotonic()
         with pytest.raises(DeviceTimeout):
             device.emit(OUT)
@@ -101,9 +113,8 @@ def start():
 def test_a_webhook_and_an_outage(start, tmp_path):
     server = start(WebServer)
     (tmp_path / "token").write_text("swordfish\n")
-    options = {"url": f"http://127.0.0.1:{server.port}/hook?a=1", "when": WHEN,
-               "token_file": str(tmp_path / "token")}  # fmt: skip
-    device = open_device("output", "alert_webhook", options, VirtualClock())
+    url = f"http://127.0.0.1:{server.port}/hook?a=1"
+    device = output("webhook", url=url, token_file=str(tmp_path / "token"))
     device.open()
     server.answer = 503
     with pytest.raises(DeviceError, match="503"):
@@ -133,8 +144,8 @@ def test_a_letter_by_starttls(start, tmp_path):
     (tmp_path / "password").write_text("swordfish\n")
     options = {"host": "127.0.0.1", "port": server.port, "sender": "pi@example.org",
                "recipients": ["me@example.org"], "username": "pi", "ca": str(ca),
-               "password_file": str(tmp_path / "password"), "when": WHEN}  # fmt: skip
-    with open_device("output", "alert_mail", options, VirtualClock()) as device:
+               "password_file": str(tmp_path / "password")}  # fmt: skip
+    with output("mail", **options) as device:
         device.emit(OUT)
     (letter,) = server.letters
     assert "Subject: [thermocald] alert: cam: c is 0.8 px from the start" in letter
@@ -146,9 +157,7 @@ def test_a_letter_by_starttls(start, tmp_path):
             device.open()
     del options["ca"]
     for security, message in (("starttls", "certificate|CERTIFICATE"), ("tls", "mail server")):
-        device = open_device(
-            "output", "alert_mail", options | {"security": security}, VirtualClock()
-        )
+        device = output("mail", **options, security=security)
         with pytest.raises(DeviceError, match=message) as failed:
             device.open()
         assert "swordfish" not in str(failed.value)
@@ -181,7 +190,7 @@ def test_mqtt_retains_what_is_out(start):
 )  # fmt: skip
 def test_an_address_with_a_secret_is_refused_and_not_quoted(url):
     with pytest.raises(ConfigurationError, match="url") as error:
-        open_device("output", "alert_webhook", {"url": url, "when": WHEN}, VirtualClock())
+        output("webhook", url=url)
     assert "SECRET" not in f"{error.value} {error.value!r}"
 
 
@@ -190,9 +199,8 @@ def test_a_secret_is_never_quoted(answer, start, tmp_path, caplog):
     """Neither of the address nor of the token, whatever the server or library answers."""
     server = start(WebServer)
     (tmp_path / "token").write_text("SECRET\n")
-    options = {"url": f"http://127.0.0.1:{server.port}/SECRET?key=SECRET", "when": WHEN,
-               "token_file": str(tmp_path / "token"), "timeout_s": 1.0}  # fmt: skip
-    device = open_device("output", "alert_webhook", options, VirtualClock())
+    url = f"http://127.0.0.1:{server.port}/SECRET?key=SECRET"
+    device = output("webhook", url=url, token_file=str(tmp_path / "token"), timeout_s=1.0)
     device.open()
     server.answer = answer or 204
     if answer is None:
@@ -207,9 +215,9 @@ def test_a_secret_is_never_quoted(answer, start, tmp_path, caplog):
 @pytest.mark.parametrize("token", ["two\nlines", "naïve", "a\x00b"])
 def test_a_token_that_no_header_can_hold(token, tmp_path):
     (tmp_path / "token").write_text(token)
-    options = {"url": "http://127.0.0.1:9/", "when": WHEN, "token_file": str(tmp_path / "token")}
+    device = output("webhook", url="http://127.0.0.1:9/", token_file=str(tmp_path / "token"))
     with pytest.raises(ConfigurationError, match="is not one line") as error:
-        open_device("output", "alert_webhook", options, VirtualClock()).open()
+        device.open()
     assert token not in str(error.value)
 
 
@@ -221,8 +229,7 @@ def test_a_program_gets_it_without_a_shell_and_a_few_variables_only(tmp_path, mo
         f'#!/bin/sh\nenv > {log}\necho "$1 $THERMOCALD_STATE" >> {told}\ncat >> {told}'
     )
     script.chmod(0o755)
-    options = {"command": [str(script), "$HOME;ls"], "when": WHEN}
-    with open_device("output", "alert_exec", options, VirtualClock()) as device:
+    with output("exec", command=[str(script), "$HOME;ls"]) as device:
         for one in (OUT, OUT, IN):
             device.emit({**one, "device": "cam\x00era"})
     assert told.read_text().count("$HOME;ls out") == told.read_text().count("$HOME;ls in") == 1
@@ -237,14 +244,13 @@ def test_a_program_gets_it_without_a_shell_and_a_few_variables_only(tmp_path, mo
 def test_a_webhook_with_tls_and_a_redirection_into_this_network(start, tmp_path, monkeypatch):
     ca, context = own_context(tmp_path)
     server, inner = start(WebServer, context=context), start(WebServer)
-    url = f"https://127.0.0.1:{server.port}/SECRET"
-    options = {"url": url, "when": WHEN, "timeout_s": 5.0}
-    with open_device("output", "alert_webhook", options, VirtualClock()) as device:
+    device = output("webhook", url=f"https://127.0.0.1:{server.port}/SECRET", timeout_s=5.0)
+    with device:
         with pytest.raises(DeviceError, match="not trusted") as error:
             device.emit(OUT)
         assert "SECRET" not in str(error.value)
     monkeypatch.setenv("SSL_CERT_FILE", str(ca))
-    with open_device("output", "alert_webhook", options, VirtualClock()) as device:
+    with device:
         device.emit(OUT)
         assert [post[2]["state"] for post in server.posts] == ["out"]
         server.answer, server.location = 302, f"http://127.0.0.1:{inner.port}/meta-data"

@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 from thermocald_drivers.mock import Kind
 
-from thermocald import hal
+from tests.drivers.test_contract import use
 from thermocald.errors import BadReading, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, open_device
 
@@ -17,20 +17,12 @@ def clock() -> VirtualClock:
     return VirtualClock()
 
 
-def use(device) -> None:
-    """Take one reading, or emit one result."""
-    if isinstance(device, hal.Thermometer):
-        device.read()
-    else:
-        device.emit({"epoch": 1})
-
-
-def outcomes(device, calls: int) -> list[str]:
+def outcomes(kind, device, calls: int) -> list[str]:
     """Return the outcome of each use."""
     found = []
     for _ in range(calls):
         try:
-            use(device)
+            use(kind, device)
         except (DeviceTimeout, DeviceGone, BadReading) as error:
             found.append(type(error).__name__)
         else:
@@ -56,7 +48,7 @@ def test_every_kind_is_tested():
 def test_by_call(clock, device, kind, error):
     options = {"faults": [{"kind": kind, "at": 2, "count": 3}]}
     with open_device(device, "mock", options, clock) as mock:
-        assert outcomes(mock, 6) == ["ok", error, error, error, "ok", "ok"]
+        assert outcomes(device, mock, 6) == ["ok", error, error, error, "ok", "ok"]
 
 
 def test_stuck_repeats_the_value_with_new_instants(clock):

@@ -24,6 +24,7 @@ from tests.store.conftest import (  # for `filled`
     store_path,
 )
 from thermocald.physics.presets import preset_simulation
+from thermocald.store.database.store import Store
 from thermocald.store.server.connection import ServerAddress
 
 __all__ = ["field", "filled", "head", "make_epoch", "make_result", "series", "store", "store_path"]
@@ -155,6 +156,21 @@ def role(server):
     with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
         connection.execute("DROP OWNED BY pi")
         connection.execute("DROP ROLE pi")
+
+
+@pytest.fixture
+def station(tmp_path, store_path, head, field, make_epoch, make_result):
+    """A store of 20 epochs with frames of 1000 bytes; 7 and 13 have no result."""
+    folder = tmp_path / "frames"
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for n in range(1, 21):
+            frame = Path("rpi", "M1", f"{n:07d}.jpg")
+            (folder / frame).parent.mkdir(parents=True, exist_ok=True)
+            (folder / frame).write_bytes(bytes([n]) * 1000)
+            result = make_result(n, "no_targets" if n in (7, 13) else "ok")
+            store.append(series, replace(make_epoch(n), frame=frame), result)
+    return store_path, folder
 
 
 @pytest.fixture(scope="session")

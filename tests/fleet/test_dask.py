@@ -31,18 +31,14 @@ def dask(tmp_path):
         yield found
 
 
-def start_client(archive, out, dask):
-    command = [sys.executable, "-c", RUN_BLOCKS, archive, out, dask.address]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-
-
 def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archive, tmp_path, dask):
     """One of two is killed, then the other after every few blocks and replaced, as on machines
     that are lent.
     """
     list(run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10)))
     out = tmp_path / "many"
-    client = start_client(archive, out, dask)
+    command = [sys.executable, "-c", RUN_BLOCKS, archive, out, dask.address]
+    client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     killed = done = 0
     deadline = time.monotonic() + 400
     while client.poll() is None:

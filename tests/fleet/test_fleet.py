@@ -120,3 +120,13 @@ def test_a_clock_that_was_years_ahead_hides_nothing(server):
         connection.execute("INSERT INTO epoch SELECT * FROM copied")
     document = json.loads(run("fleet", server.address(name="thermocald"), "--json", "-"))
     assert 0 < document["cameras"][0]["lag_s"] < 600
+
+
+def test_a_name_from_right_to_left_has_a_cell_of_its_own(server, tmp_path):
+    """In one cell, the browser put the camera before its station, and the mark behind both."""
+    with psycopg.connect(server.address(name="thermocald")) as connection:
+        add_camera(connection, replace(BASE, station="محطة-2", epochs=300, end=time.time()))
+    run("fleet", server.address(name="thermocald"), "--report", tmp_path / "fleet.html")
+    row = re.search(r"<tbody><tr>(.*?)</tr>", (tmp_path / "fleet.html").read_text())[1]
+    cells = re.findall('<td dir="auto"[^>]*>([^<]*)</td>', row)
+    assert cells[:2] == ["\u2068محطة\u2069-2", "cam"]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
 
 from tests.commands import answer as run
@@ -12,10 +9,9 @@ from tests.commands import succeed
 from tests.fleet.conftest import count
 from thermocald.config import load_config
 from thermocald.errors import ConfigurationError
-from thermocald.store.database.store import Store
 
 CONFIG = """
-store: {path: k.db}
+store: {path: small.db}
 frames: {folder: frames}
 thermometers: [{name: air, driver: mock}]
 forward:
@@ -26,19 +22,11 @@ forward:
 
 
 @pytest.fixture
-def configured(tmp_path, head, field, make_epoch, make_result):
-    """A folder with a store of three epochs; the second has no result and a frame."""
-    with Store.open(tmp_path / "k.db", "append") as store:
-        series = store.create_series(head, field)
-        for number in (1, 2, 3):
-            frame = Path(f"rpi/{number}.jpg")
-            (tmp_path / "frames/rpi").mkdir(parents=True, exist_ok=True)
-            (tmp_path / "frames" / frame).write_bytes(b"\xff\xd8" * 50)
-            result = make_result(number, "no_targets" if number == 2 else "ok")
-            store.append(series, replace(make_epoch(number), frame=frame), result)
+def configured(station):
+    """address → the configuration of a station that sends its store there."""
 
     def write(to):
-        path = tmp_path / "config.yaml"
+        path = station[0].with_name("config.yaml")
         path.write_text(CONFIG % to)
         return path
 
@@ -52,7 +40,7 @@ def test_everything_comes_from_the_configuration(configured, server, tmp_path, m
     monkeypatch.setenv("PGPASSFILE", str(passwords))
     config = configured(server.address(user="owner", name="thermocald"))
     result = succeed("forward", "--config", config, "--once", "--json", "-")
-    assert [count(server, t) for t in ("epoch", "frame", "station")] == [3, 1, 1]
+    assert [count(server, t) for t in ("epoch", "frame", "station")] == [20, 2, 1]
     assert "secret" not in result.output
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,22 +12,6 @@ pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 from tests.fleet.conftest import address, count, execute
 from thermocald.config import ForwardConfig
 from thermocald.fleet.forward import Forwarder
-from thermocald.store.database.store import Store
-
-
-@pytest.fixture
-def station(tmp_path, store_path, head, field, make_epoch, make_result):
-    """A store of 20 epochs with frames of 1000 bytes; 7 and 13 have no result."""
-    folder = tmp_path / "frames"
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for n in range(1, 21):
-            frame = Path("rpi", "M1", f"{n:07d}.jpg")
-            (folder / frame).parent.mkdir(parents=True, exist_ok=True)
-            (folder / frame).write_bytes(bytes([n]) * 1000)
-            result = make_result(n, "no_targets" if n in (7, 13) else "ok")
-            store.append(series, replace(make_epoch(n), frame=frame), result)
-    return store_path, folder
 
 
 def forwarder(server, station, choose, user="owner:secret", **rule):

@@ -10,32 +10,29 @@ import pytest
 
 from tests.fleet.conftest import address, count, execute
 from thermocald.fleet.forward import Cursor, Forwarder
-from thermocald.fleet.overview import add_findings, read_overview
+from thermocald.fleet.overview import fleet_document
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event, LoggedReading
 from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.fleet_reader import FleetReader
 
 
-def filled_store(path, head, field, make_epoch, make_result, epochs=5) -> Path:
-    with Store.open(path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for i in range(1, epochs + 1):
-            store.append(series, make_epoch(i), make_result(i))
-    return path
-
-
-def findings(place) -> set[str]:
+def findings(server) -> set[str]:
     """Return the kinds of an overview's findings."""
-    now, cameras = read_overview(place, Path("x"))
-    add_findings(cameras, [], now)
-    return {finding["kind"] for camera in cameras for finding in camera.findings}
+    cameras = fleet_document([Path(server.address(name="thermocald"))])["cameras"]
+    return {finding["kind"] for camera in cameras for finding in camera["findings"]}
 
 
 @pytest.fixture
 def two(tmp_path, head, field, make_epoch, make_result):
-    made = (head, field, make_epoch, make_result)
-    return [filled_store(tmp_path / f"{name}.db", *made) for name in ("one", "two")]
+    """Two stores of five epochs each."""
+    paths = [tmp_path / f"{name}.db" for name in ("one", "two")]
+    for path in paths:
+        with Store.open(path, "append", durable=False) as store:
+            series = store.create_series(head, field)
+            for i in range(1, 6):
+                store.append(series, make_epoch(i), make_result(i))
+    return paths
 
 
 def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
@@ -53,18 +50,16 @@ def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
     assert [count(server, table) for table in tables] == [2, 10, 2, 2, 2]
     with FleetReader(place) as fleet:
         assert fleet.stations()["gauge-7"].stores == 2
-    assert "twins" in findings(place)
+    assert "twins" in findings(server)
 
 
 def test_epochs_calibrated_again_are_no_twins(server, two, make_result):
-    place = address(server)
     with Store.open(two[0], "append", durable=False) as store:
         (series,) = store.all_series()
         for i in (4, 5):
             store.amend(series, i, make_result(200 + i))
-    Forwarder(two[0], place, "gauge-7").send_waiting()
-    _, cameras = read_overview(place, Path("x"))
-    assert not cameras[0].copied
+    Forwarder(two[0], address(server), "gauge-7").send_waiting()
+    assert "twins" not in findings(server)
 
 
 def test_one_station_that_got_a_new_store_is_no_twin(server, two):
@@ -174,7 +169,7 @@ def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, ma
     names = {one: "gauge-7", clone: "gauge-8" if apart else "gauge-7"}
     if how != "before the first report":
         Forwarder(one, place, "gauge-7", cursors[one]).send_waiting()
-        assert "twins" not in findings(place)
+        assert "twins" not in findings(server)
     if how == "by backup":
         with Store.open(one) as store:
             store.copy_to(clone)
@@ -195,4 +190,4 @@ def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, ma
         Forwarder(path, place, names[path], cursors[path]).send_waiting()
     assert count(server, "series") == 1 + apart
     assert count(server, "epoch") == (16 if apart else 11 + ahead)  # all are there
-    assert ("twins" in findings(place)) is not apart
+    assert ("twins" in findings(server)) is not apart

@@ -334,7 +334,12 @@ class OutputLoop:
 
     def _run(self) -> None:
         self.link.do(lambda: None)
-        while (result := self._oldest()) is not None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._queue or self._stopping.is_set())
+                if not self._queue:
+                    break
+                result = self._queue[0]
             done = self.link.do(partial(self.link.device.emit, result))
             if not (done or self.link.ended or self._stopping.wait(_RETRY_S)):
                 continue  # it waits until the output is back, unless newer ones displace it
@@ -345,9 +350,3 @@ class OutputLoop:
                 self.emitted += done
                 self.lost += waited - done  # a displaced one was counted as lost
         self.link.close()
-
-    def _oldest(self) -> Mapping[str, Any] | None:
-        """Wait for a result; return it without removing it, None when the loop is stopped."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._stopping.is_set())
-            return self._queue[0] if self._queue else None

@@ -129,20 +129,18 @@ class Pipeline:
     def submit(self, frame: Frame, clock_trusted: bool = True) -> None:
         """Queue a frame; returns at once."""
         with self._changed:
-            if len(self._items) > 2 * _DEPTH and self._is_full():
-                self._lose("frames cannot be stored fast enough")
-                return
+            if len(self._items) > 2 * _DEPTH:  # a machine may stall for seconds without a loss
+                frames = [item.frame for item in self._items]
+                held = sum(
+                    len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes)
+                    for f in frames
+                )
+                if len(frames) > _MOST_WAITING or held > _MOST_BYTES:
+                    self._lose("frames cannot be stored fast enough")
+                    return
             self._items.append(AcquiredEpoch(self.next_number, frame, clock_trusted))
             self.next_number += 1
             self._changed.notify_all()
-
-    def _is_full(self) -> bool:
-        """Return whether no further frame may wait; a machine may stall for seconds before that."""
-        frames = [item.frame for item in self._items]
-        held = sum(
-            len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
-        )
-        return len(frames) > _MOST_WAITING or held > _MOST_BYTES
 
     def _lose(self, why: str) -> None:
         self.lost += 1

@@ -61,16 +61,39 @@ class LiveState:
         self, camera: str, row: Mapping[str, Any], calibrated: CalibratedEpoch | None,
         field: TestField | None,
     ) -> None:  # fmt: skip
-        """Replace a camera's last epoch: row, targets and residuals."""
+        """Replace a camera's last epoch: its row, and its measured targets with residuals, px."""
         document: dict[str, Any] = {"row": row}
         if calibrated is not None and field is not None:
-            document["targets"] = _targets(calibrated, field)
+            seen, result = calibrated.epoch.observations, calibrated.adjustment
+            document["targets"] = {}
+            if seen is not None and len(seen) == len(result.targets):
+                rejected = set(result.rejected)
+                document["targets"] = {
+                    "name": [field.names[t] for t in seen.targets.tolist()],
+                    "x": seen.points[:, 0].round(3).tolist(),
+                    "y": seen.points[:, 1].round(3).tolist(),
+                    "vx": result.residuals[:, 0].round(4).tolist(),
+                    "vy": result.residuals[:, 1].round(4).tolist(),
+                    "rejected": [t in rejected for t in seen.targets.tolist()],
+                }
         self._write(f"{camera}.json", json.dumps(jsonable(document)).encode())
 
     def write_frame(self, camera: str, frame: Frame) -> None:
         """Replace a camera's last frame, at most 1280 px wide."""
-        if (data := _preview(frame)) is not None:
-            self._write(f"{camera}.jpg", data)
+        import cv2
+
+        from thermocald.photogrammetry.targets.image_file import decode_grey
+
+        try:
+            image = frame.image if frame.image is not None else decode_grey(frame.encoded or b"")
+        except DataError:
+            return
+        scale = min(1.0, _PREVIEW_PX / image.shape[1])
+        size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+        small = cv2.resize(eight_bit(image), size, interpolation=cv2.INTER_AREA)
+        done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _PREVIEW_QUALITY])
+        if done:
+            self._write(f"{camera}.jpg", data.tobytes())
 
     def remove(self) -> None:
         """Delete status.json, when the daemon stops."""
@@ -98,38 +121,6 @@ class LiveState:
 
 def _beside(store: Path) -> Path:
     return store.with_name(store.name + ".live")
-
-
-def _preview(frame: Frame) -> bytes | None:
-    import cv2
-
-    from thermocald.photogrammetry.targets.image_file import decode_grey
-
-    try:
-        image = frame.image if frame.image is not None else decode_grey(frame.encoded or b"")
-    except DataError:
-        return None
-    scale = min(1.0, _PREVIEW_PX / image.shape[1])
-    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-    small = cv2.resize(eight_bit(image), size, interpolation=cv2.INTER_AREA)
-    done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _PREVIEW_QUALITY])
-    return data.tobytes() if done else None
-
-
-def _targets(calibrated: CalibratedEpoch, field: TestField) -> dict[str, Any]:
-    """Return lists over the measured targets: name, x, y px, residuals px, whether rejected."""
-    seen, result = calibrated.epoch.observations, calibrated.adjustment
-    if seen is None or len(seen) != len(result.targets):
-        return {}
-    rejected = set(result.rejected)
-    return {
-        "name": [field.names[t] for t in seen.targets.tolist()],
-        "x": seen.points[:, 0].round(3).tolist(),
-        "y": seen.points[:, 1].round(3).tolist(),
-        "vx": result.residuals[:, 0].round(4).tolist(),
-        "vy": result.residuals[:, 1].round(4).tolist(),
-        "rejected": [t in rejected for t in seen.targets.tolist()],
-    }
 
 
 def _without_secrets(value: Any) -> Any:

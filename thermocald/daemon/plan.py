@@ -100,7 +100,12 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
         calibrator = Calibrator(
             sensor,
             targets,
-            _adjustment_settings(calibration),
+            AdjustmentSettings(
+                free=tuple(calibration.free),
+                priors={name: (p.value, p.sd) for name, p in calibration.priors.items()},
+                snooping_alpha=calibration.snooping_alpha,
+                bounds=GeometryBounds(correlation=calibration.correlation_bound),
+            ),
             nominal_c=one.principal_distance_mm,
             interior=_held(one, calibration),
             sigma_floor_px=calibration.sigma_floor_px,
@@ -148,15 +153,6 @@ def _sensor(one: CameraConfig) -> Sensor | None:
     if one.sensor is None:
         return None
     return Sensor(one.sensor.width_px, one.sensor.height_px, one.sensor.pixel_pitch_mm)
-
-
-def _adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
-    return AdjustmentSettings(
-        free=tuple(calibration.free),
-        priors={name: (prior.value, prior.sd) for name, prior in calibration.priors.items()},
-        snooping_alpha=calibration.snooping_alpha,
-        bounds=GeometryBounds(correlation=calibration.correlation_bound),
-    )
 
 
 def running_series(plan: CameraPlan) -> RunningSeries | None:
@@ -225,14 +221,13 @@ def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]
     if mine is not None and not (
         mine.names == field.names and np.array_equal(mine.points, field.points)
     ):
-        what = "another test field; configure that one"
+        what = "test field"
     elif new := [name for name in channels if name not in had]:
-        there = ", ".join(had) or "none"
-        what = f"other thermometers ({there}), not {', '.join(new)}; configure those"
+        what = f"thermometers ({', '.join(had) or 'none'}, not {', '.join(new)})"
     if what:
         raise ConfigurationError(
-            f"camera {plan.name!r}: series {plan.series!r} was begun with {what}, or choose "
-            "another series"
+            f"camera {plan.name!r}: choose a new name for its `series`, or configure the {what} "
+            f"with which {plan.series!r} was begun"
         )
 
 

@@ -277,7 +277,13 @@ class Service:
         if not self._turn.acquire(timeout=_ANSWER_S):
             raise DataError("the daemon is busy; look at its status and try again")
         try:
-            return self._answer(request)
+            if request.session is not None:
+                return {"session": self._sessions.start(request.session)}
+            if request.camera is not None:
+                return {"session": self._sessions.stop(request.camera)}
+            if request.do == "retention":
+                return {"deleted": self._station.retain()}
+            return {"sessions": self._sessions.status()}
         except ThermocaldError:
             raise
         except Exception as error:
@@ -286,15 +292,6 @@ class Service:
             raise DataError(f"the daemon could not answer: {error}") from error
         finally:
             self._turn.release()
-
-    def _answer(self, request: Request) -> dict[str, Any]:
-        if request.session is not None:
-            return {"session": self._sessions.start(request.session)}
-        if request.camera is not None:
-            return {"session": self._sessions.stop(request.camera)}
-        if request.do == "retention":
-            return {"deleted": self._station.retain()}
-        return {"sessions": self._sessions.status()}
 
     def _line(self) -> str:
         """Return the status line for `systemctl status`."""
@@ -328,7 +325,7 @@ class Service:
         try:
             text = self._apply_configuration()
         except ThermocaldError as error:
-            if self._station.stopped:
+            if self._station.stopping.is_set():
                 raise  # a daemon that takes nothing would look healthy: a restart may help
             text = f"the configuration cannot be reloaded, the old one stays in force: {error}"
             log.error("%s", text, extra={"event": "reload_failed"})

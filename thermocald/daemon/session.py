@@ -21,7 +21,6 @@ from thermocald.hal import HeatingStep  # noqa: TC001
 
 if TYPE_CHECKING:
     from thermocald.daemon.station import CameraLine, Station
-    from thermocald.store.series import Event
 
 
 log = logging.getLogger(__name__)
@@ -84,22 +83,19 @@ class Sessions:
         self._active: dict[str, _Progress] = {}
         self._ended: dict[str, _Progress] = {}
         for event in self._guard.store.events():
-            self._remember(event)
-
-    def _remember(self, event: Event) -> None:
-        if event.kind not in ("session_begun", "session_ended"):
-            return
-        try:
-            session = Session.model_validate(event.data["session"])
-            if event.kind == "session_begun":
-                self._active[session.camera] = _Progress(session, "running")
-            elif self._active.pop(session.camera, None) is not None:
+            if event.kind not in ("session_begun", "session_ended"):
+                continue
+            try:
                 data = event.data
-                self._ended[session.camera] = _Progress(
-                    session, data["state"], data["why"], taken=int(data["taken"])
-                )
-        except (ValidationError, KeyError, TypeError) as error:
-            log.warning("an event of a session cannot be read: %s", error)
+                session = Session.model_validate(data["session"])
+                if event.kind == "session_begun":
+                    self._active[session.camera] = _Progress(session, "running")
+                elif self._active.pop(session.camera, None) is not None:
+                    self._ended[session.camera] = _Progress(
+                        session, data["state"], data["why"], taken=int(data["taken"])
+                    )
+            except (ValidationError, KeyError, TypeError) as error:
+                log.warning("an event of a session cannot be read: %s", error)
 
     def resume(self, station: Station) -> None:
         """Continue the sessions with a station that was just built."""

@@ -206,7 +206,7 @@ class Station:
         self.config, self.runtime = config, runtime
         clock = runtime.clock
         self.frames = FrameFolder(config.frames)
-        self._stop = threading.Event()
+        self.stopping = threading.Event()  # once set, it cannot be started again
         self._started = False
         begin = clock.monotonic() + _LEAD_S
         self.thermometers = Thermometers(config, clock, runtime.guard.event, fast=runtime.fast)
@@ -234,7 +234,7 @@ class Station:
     def stop(self, grace_s: float) -> bool:
         """Finish the current epochs and stop; return False if a device or output hangs."""
         deadline = time.monotonic() + grace_s
-        self._stop.set()
+        self.stopping.set()
         for loop in self._loops:
             loop.stop()
         done = True
@@ -249,11 +249,6 @@ class Station:
             self.thermometers.links[name].close()
         self._retention.join(1.0)
         return done
-
-    @property
-    def stopped(self) -> bool:
-        """Whether it was told to stop; it cannot be started again."""
-        return self._stop.is_set()
 
     def stalled(self) -> list[str]:
         """Return a sentence for each device and pipeline that hangs."""
@@ -311,11 +306,16 @@ class Station:
     def status(self) -> dict[str, Any]:
         """Return the devices' part of the status document."""
         hang_after_s = self.runtime.hang_after_s
+        thermometers = {}
+        for name, link in self.thermometers.links.items():
+            busy_s = self._readers[name].busy_s() if name in self._readers else 0.0
+            status = link.status(busy_s, hang_after_s)
+            values, missing = self.thermometers.last(name)
+            status["warnings"] += missing
+            thermometers[name] = {**status, "last": dict(values)}
         return {
             "cameras": {camera.plan.name: camera.status() for camera in self.cameras},
-            "thermometers": {
-                name: self._thermometer_status(name) for name in self.thermometers.links
-            },
+            "thermometers": thermometers,
             "outputs": {
                 output.link.name: {
                     **output.link.status(0.0, hang_after_s),
@@ -330,12 +330,6 @@ class Station:
                 "ages_known": self.runtime.clock.settled(),
             },
         }
-
-    def _thermometer_status(self, name: str) -> dict[str, Any]:
-        busy_s = self._readers[name].busy_s() if name in self._readers else 0.0
-        link = self.thermometers.links[name].status(busy_s, self.runtime.hang_after_s)
-        values, missing = self.thermometers.last(name)
-        return {**link, "warnings": link["warnings"] + missing, "last": dict(values)}
 
     def _read(self, name: str) -> None:
         """Read a thermometer; store the reading if no epoch will contain it."""
@@ -362,5 +356,5 @@ class Station:
         while True:
             self.retain()
             pause = _RETENTION_WHEN_FULL_S if self.frames.paused else _RETENTION_EVERY_S
-            if self._stop.wait(pause):
+            if self.stopping.wait(pause):
                 return

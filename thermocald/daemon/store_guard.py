@@ -68,7 +68,12 @@ class FollowedStore:
         self._file = StoreFile(self.path)
         self._mount = mount_point(self.path)
         lost, unfinished = read_wal_tail(helper(self.path, "wal"))
-        kept = self._keep_damaged_wal() if lost else ""
+        if lost:  # a copy is kept for examination
+            kept = str(self.path.with_name(f"{self.path.stem}-wal-damaged-{utc_stamp()}"))
+            try:
+                shutil.copyfile(helper(self.path, "wal"), kept)
+            except OSError as error:
+                kept = f"nowhere: {error.strerror}"
         try:
             self.store = Store.open(self.path, "append", durable=self._durable, claimed=True)
         except BaseException:
@@ -93,15 +98,6 @@ class FollowedStore:
         self.notice = text
         log.error("%s: %s", self.path, text, extra={"event": kind})
         self._events.append(Event(time.time(), kind, f"{self.path.name}: {text}"))
-
-    def _keep_damaged_wal(self) -> str:
-        """Copy the damaged -wal file for examination; return the copy's path."""
-        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{utc_stamp()}")
-        try:
-            shutil.copyfile(helper(self.path, "wal"), copy)
-        except OSError as error:
-            return f"nowhere: {error.strerror}"
-        return str(copy)
 
     @property
     def in_place(self) -> bool:
@@ -146,7 +142,10 @@ class FollowedStore:
             except StoreError as error:
                 log.debug("%s", error)
         if not swapped and not emptied:
-            copy = self._rescued()
+            target = self.path.resolve()
+            copy = target.with_name(f"{target.stem}-rescued-{utc_stamp()}.db")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            self.store.copy_to(copy)
         there, other = file.there, self.path.exists()
         if there:
             text = "its -wal or -shm file was deleted; its content was moved into the store"
@@ -167,14 +166,6 @@ class FollowedStore:
         self._open()
         self._note("store_followed", text)
         return carried
-
-    def _rescued(self) -> Path:
-        """Copy the open store's content to a file beside it; return the copy's path."""
-        target = self.path.resolve()
-        copy = target.with_name(f"{target.stem}-rescued-{utc_stamp()}.db")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        self.store.copy_to(copy)
-        return copy
 
     def close(self) -> None:
         """Close the store and release its lock; may be called twice.

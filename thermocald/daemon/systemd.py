@@ -23,9 +23,8 @@ _FIELDS = {"device": "THERMOCALD_DEVICE", "event": "THERMOCALD_EVENT"}
 class JournalHandler(logging.Handler):
     """A handler that sends records to the journal's native socket (systemd.journal-fields(7))."""
 
-    def __init__(self, path: str = _SOCKET) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._path = path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -48,7 +47,7 @@ class JournalHandler(logging.Handler):
             size = b"\n" + struct.pack("<Q", len(data)) if b"\n" in data else b"="
             message += name.encode() + size + data + b"\n"
         try:
-            self._socket.sendto(message, self._path)
+            self._socket.sendto(message, _SOCKET)
         except OSError:
             # no journal, or a message too long for a datagram; systemd also reads stderr
             print(self.format(record), file=sys.stderr)  # noqa: T201

@@ -52,21 +52,6 @@ _RESOLUTION = 0.02  # K, assumed for a thermometer that does not state it
 _LEAST_RANGE_K = 2.0
 
 
-def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[FleetCamera]]:
-    """Read the server's time (s UTC) and the cameras that an address selects; path: for messages.
-
-    Raises ServerGone, ServerError, StoreVersionError.
-    """
-    with FleetReader(address) as reader:
-        now = reader.now()
-        stations = reader.stations()
-        cameras = reader.cameras(now, path)
-    for camera in cameras:
-        camera.state = stations.get(camera.station, camera.state)
-        _complete(camera, now)
-    return now, cameras
-
-
 def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
     """Return the documents of the types with enough specimens, and set their cameras' `odd`.
 
@@ -180,22 +165,6 @@ _LEAST_OK = 0.5
 _OLD_S = 30 * 86400.0
 _OUTSIDE_K = 2.0
 _SHIFT_PX, _SHIFT_SDS = 0.3, 6.0
-
-
-def add_findings(
-    cameras: Sequence[FleetCamera], types: Sequence[dict[str, Any]], now: float
-) -> None:
-    """Fill `findings` of all cameras; now: s UTC, by the server's clock."""
-    of_name = {name: kind for kind in types for name in kind["cameras"]}
-    for camera in cameras:
-        findings = chain(
-            _late(camera, now),
-            _sensors(camera),
-            _calibration(camera, now),
-            _odd(camera, of_name.get(camera.name)),
-            _clock(camera),
-        )
-        camera.findings = [{"kind": kind, "text": text} for kind, text in findings]
 
 
 def _late(camera: FleetCamera, now: float) -> Findings:
@@ -350,10 +319,21 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
     for address, source in zip(addresses, sources, strict=True):
-        now, selected = read_overview(address, source)
+        with FleetReader(address) as reader:
+            now, stations = reader.now(), reader.stations()
+            selected = reader.cameras(now, source)
+        for camera in selected:
+            camera.state = stations.get(camera.station, camera.state)
+            _complete(camera, now)
         cameras += selected
     types = camera_types(cameras)
-    add_findings(cameras, types, now)
+    type_of = {name: kind for kind in types for name in kind["cameras"]}
+    for camera in cameras:
+        findings = chain(
+            _late(camera, now), _sensors(camera), _calibration(camera, now),
+            _odd(camera, type_of.get(camera.name)), _clock(camera),
+        )  # fmt: skip
+        camera.findings = [{"kind": kind, "text": text} for kind, text in findings]
     counts = Counter(kind for c in cameras for kind in {f["kind"] for f in c.findings})
     return {
         "format": "thermocald-fleet/1",
@@ -385,7 +365,12 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
     heads = f"{'last':>7} {'waiting':>7} {'ok':>6} {'°C':>6} {'c µm/K':>16}"
     lines += ["", f"{'station/camera':<{name}} {heads}"]
     for camera in shown:
-        lines.append(_row(camera, name))
+        ok = "–" if camera["ok"] is None else percent(camera["ok"])
+        lines.append(
+            f"{shortened(_name(camera), name):<{name}} {short_duration(camera['lag_s']):>7} "
+            f"{_known(camera['waiting'], 'd'):>7} {ok:>6} "
+            f"{_known(camera['temperature'], '.1f'):>6} {_rate(camera, 'c'):>16}"
+        )
         for finding in camera["findings"]:
             lines += textwrap.wrap(
                 finding["text"],
@@ -423,15 +408,6 @@ def _rate(camera: Mapping[str, Any], name: str) -> str:
 
 def _known(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
-
-
-def _row(camera: dict[str, Any], width: int) -> str:
-    ok = "–" if camera["ok"] is None else percent(camera["ok"])
-    return (
-        f"{shortened(_name(camera), width):<{width}} {short_duration(camera['lag_s']):>7} "
-        f"{_known(camera['waiting'], 'd'):>7} {ok:>6} {_known(camera['temperature'], '.1f'):>6} "
-        f"{_rate(camera, 'c'):>16}"
-    )
 
 
 def render_fleet(document: Mapping[str, Any]) -> str:
@@ -487,7 +463,11 @@ def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
         "Every camera",
         cameras,
         {
-            "station/camera": lambda c: f"{'● ' if c['findings'] else ''}{_name(c)}",
+            "station": lambda c: c["station"],
+            "camera": lambda c: c["camera"],
+            "findings": lambda c: ", ".join(
+                dict.fromkeys(_FINDINGS[f["kind"]][0] for f in c["findings"])
+            ),
             "last epoch": lambda c: short_duration(c["lag_s"]),
             "on its way": lambda c: short_duration(c["on_the_way_s"]),
             "waiting": lambda c: _known(c["waiting"], "d"),
@@ -499,7 +479,6 @@ def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
             "y₀ µm/K": lambda c: _rate(c, "y0"),
             "type": lambda c: str(c["type"]),
         },
-        "●: has findings.",
     )
 
 

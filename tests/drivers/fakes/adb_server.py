@@ -25,8 +25,6 @@ from tests.drivers.fakes.line_server import LineServer
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-OFFLINE = "device offline"
-
 
 def wait_little(monkeypatch) -> None:
     """Poll for photographs more often, and remove adbutils' pauses at each connection."""
@@ -38,20 +36,13 @@ def wait_little(monkeypatch) -> None:
 
 
 def photograph(
-    when: float,
-    *,
-    exposure=(1, 60),
-    iso=100,
-    distance=None,
-    subsecond="250",
-    size=(96, 64),
-    zone=None,
+    when: float, *, iso=100, distance=None, subsecond="250", size=(96, 64), zone=None
 ) -> bytes:
     """Return a JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
     image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
     tags = Image.Exif()
     sub = tags.get_ifd(0x8769)
-    sub[0x829A], sub[0x8827] = exposure[0] / exposure[1], iso
+    sub[0x829A], sub[0x8827] = 1 / 60, iso
     sub[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(when))
     if subsecond is not None:
         sub[0x9291] = subsecond
@@ -69,7 +60,6 @@ def photograph(
 class FakePhone:
     """A phone's files, shell answers and camera behaviour; tests set its fields."""
 
-    state: str = "device"
     folder: str = "/sdcard/DCIM/Camera"
     clock_offset: float = 0.0
     files: dict[str, bytes] = field(default_factory=dict)
@@ -158,7 +148,7 @@ class AdbServer(LineServer):
         if request == "host:version":
             _block(line, "0029")
         elif request == "host:devices":
-            mine = "".join(f"{s}\t{p.state}\n" for s, p in self.phones.items())
+            mine = "".join(f"{serial}\tdevice\n" for serial in self.phones)
             _block(line, mine if self.listing is None else self.listing)
         elif match := re.fullmatch(r"host-serial:(.*):features", request):
             if self._phone(line, match[1]):
@@ -172,9 +162,8 @@ class AdbServer(LineServer):
     def _phone(self, line: socket.socket, serial: str) -> FakePhone | None:
         phone = self.phones.get(serial)
         if phone is None:
-            _fail(line, f"device '{serial}' not found")
-        elif phone.state != "device":
-            _fail(line, OFFLINE if phone.state == "offline" else f"device {phone.state}.")
+            text = f"device '{serial}' not found"
+            line.sendall(b"FAIL" + f"{len(text):04x}{text}".encode())
         elif phone.hang is not None:
             phone.hang.wait()
         else:
@@ -206,12 +195,7 @@ class AdbServer(LineServer):
                 line.sendall(head + name.encode())
             line.sendall(b"DONE" + bytes(16))
         elif command == b"RECV":
-            name = path.rsplit("/", 1)[1]
-            if name not in phone.files:
-                message = b"open failed: No such file or directory"
-                line.sendall(b"FAIL" + struct.pack("<I", len(message)) + message)
-                return
-            data = phone.content(name)
+            data = phone.content(path.rsplit("/", 1)[1])
             for at in range(0, len(data), 1024):
                 chunk = data[at : at + 1024]
                 if phone.cut_transfer and at:
@@ -237,7 +221,3 @@ def _request(line: socket.socket) -> str:
 
 def _block(line: socket.socket, text: str) -> None:
     line.sendall(b"OKAY" + f"{len(text):04x}{text}".encode())
-
-
-def _fail(line: socket.socket, text: str) -> None:
-    line.sendall(b"FAIL" + f"{len(text):04x}{text}".encode())

@@ -35,7 +35,7 @@ def lm75(raw=0x1900, configuration=0x00):
     return chip
 
 
-def sht3x(temperature=0x6666, humidity=0x8000, damage=0):
+def sht3x(temperature=0x6666, damage=0):
     chip = Chip()
 
     def words(*values):
@@ -47,7 +47,7 @@ def sht3x(temperature=0x6666, humidity=0x8000, damage=0):
         if command == 0x3780:
             self.reply = words(0x0BAD, 0xCAFE)
         elif command == 0x2400:
-            self.reply = words(temperature, humidity)
+            self.reply = words(temperature, 0x8000)
 
     chip.on_write = answer
     return chip
@@ -67,7 +67,7 @@ CALIBRATION = (
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 
-def bme280(adc_t=ADC_T, identity=0x60, status=0, humidity=ADC_H):
+def bme280(adc_t=ADC_T, identity=0x60, status=0):
     def block(first, data):
         chip.registers.update({first + k: bytes([byte]) for k, byte in enumerate(data)})
 
@@ -78,7 +78,7 @@ def bme280(adc_t=ADC_T, identity=0x60, status=0, humidity=ADC_H):
     def measure(self, register, data):
         if register == 0xF4 and data[0] & 3:
             raw = (ADC_P << 4).to_bytes(3, "big") + (adc_t << 4).to_bytes(3, "big")
-            block(0xF7, raw + humidity.to_bytes(2, "big"))
+            block(0xF7, raw + ADC_H.to_bytes(2, "big"))
 
     chip.on_write = measure
     return chip

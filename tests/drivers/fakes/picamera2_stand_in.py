@@ -49,7 +49,7 @@ class StandIn:
     def __init__(self, number: int) -> None:
         if type(self).busy:
             raise RuntimeError("Camera __init__ sequence did not complete.")
-        self.requests_out, self.closed, self.started = 0, False, False
+        self.requests_out, self.closed = 0, False
         self._stale = type(self).stale
         type(self).instances.append(self)
 
@@ -61,7 +61,7 @@ class StandIn:
         self.configuration = camera_config
 
     def start(self) -> None:
-        self.started = True
+        pass
 
     def capture_metadata(self) -> dict:
         """Return the next frame's metadata by libcamera's current state."""

@@ -50,10 +50,10 @@ class Sysfs:
         return self.write(f"bus/w1/devices/{rom}/w1_slave", content.rstrip("\n"))
 
 
-def w1_slave(celsius: float, limits: str = "4b46") -> str:
+def w1_slave(celsius: float) -> str:
     """Return w1_therm's text for a DS18B20 at 12 bits; the CRC is not by the driver's code."""
     raw = round(celsius * 16)
-    pad = raw.to_bytes(2, "little", signed=True) + bytes.fromhex(limits + "7fff")
+    pad = raw.to_bytes(2, "little", signed=True) + bytes.fromhex("4b467fff")
     pad += bytes([(0x10 - (raw & 0x0F)), 0x10])
     crc = w1_crc(pad)
     text = " ".join(f"{b:02x}" for b in [*pad, crc])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import mmap
-import os
 import time
 from collections import deque
 from typing import TYPE_CHECKING
@@ -16,16 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from linuxpy.video import raw
 
+from tests.drivers.fakes.smbus import os_error
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
 PAGE = mmap.PAGESIZE
-INTEGER, BOOLEAN, MENU = 1, 2, 3
-
-
-def fail(number: int) -> OSError:
-    return OSError(number, os.strerror(number))
+INTEGER = 1
 
 
 class FakeCamera:
@@ -49,8 +46,6 @@ class FakeCamera:
         self.errors: dict[str, int] = {}
         self.broken: set[int] = set()
         self.stalled = False
-        self.streaming = False
-        self.opened = 0
         self._format = ("GREY", 64, 48)
         self._size = 8 * PAGE
         path.write_bytes(bytes(4 * self._size))
@@ -62,7 +57,7 @@ class FakeCamera:
     def ioctl(self, device, request, argument=None) -> None:
         name = request.name
         if name in self.errors:
-            raise fail(self.errors[name])
+            raise os_error(self.errors[name])
         getattr(self, f"_{name.lower()}")(argument)
 
     def _querycap(self, a) -> None:
@@ -85,7 +80,7 @@ class FakeCamera:
         after = a.id & 0x0FFFFFFF
         later = sorted(number for number in self.controls if number > after)
         if not later:
-            raise fail(errno.EINVAL)
+            raise os_error(errno.EINVAL)
         a.id, a.type = later[0], INTEGER
         name, a.minimum, a.maximum, a.step, _ = self.controls[later[0]]
         a.name = name.encode()
@@ -96,7 +91,7 @@ class FakeCamera:
     def _s_ctrl(self, a) -> None:
         _, low, high, _, _ = self.controls[a.id]
         if not low <= a.value <= high:
-            raise fail(errno.ERANGE)
+            raise os_error(errno.ERANGE)
         self.controls[a.id][4] = self.obeys(a.id, a.value)
 
     def _reqbufs(self, a) -> None:
@@ -110,10 +105,10 @@ class FakeCamera:
         self._queued.append(a.index)
 
     def _streamon(self, _a) -> None:
-        self.streaming, self._next_at = True, time.monotonic() + self.period_s
+        self._next_at = time.monotonic() + self.period_s
 
     def _streamoff(self, _a) -> None:
-        self.streaming = False
+        pass
 
     def made_by(self, now: float) -> int:
         """Return the number of the first frame after a time."""

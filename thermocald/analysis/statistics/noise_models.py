@@ -267,8 +267,16 @@ def drift_test(
         return None
     # one sd for all: those of single epochs fluctuate, and so would a large drift over them
     standardised = (values - values.mean()) / np.sqrt(np.mean(sds**2))
-    standardised = _without_spikes(standardised)
-    calm = _without_jumps(standardised)
+    # single epochs that contradict both neighbours are no drift
+    between = np.median([standardised[:-2], standardised[1:-1], standardised[2:]], axis=0)
+    spike = _few_far(standardised[1:-1] - between, np.diff(standardised))
+    standardised[1:-1][spike] = between[spike]
+    # sudden steps would count as noise with a memory; many of them are noise itself, of few
+    # distinct values: rounded, or alternating
+    steps = np.diff(standardised)
+    middle = np.median(steps)
+    calm = np.where(_few_far(steps - middle, steps), middle, steps)
+    calm = np.concatenate([[0.0], np.cumsum(calm)])
     at = Frequencies.of(n, times)
     whole, fast = at.coefficients(standardised), at.coefficients(calm)
     power = at.sums(whole**2)
@@ -307,26 +315,6 @@ def _few_far(distance: Array, steps: Array) -> Mask:
     """
     far: Mask = np.abs(distance) > _JUMP * mad_sd(steps - np.median(steps))
     return far if far.sum() <= _MOST_JUMPS * (len(steps) + 1) else np.zeros_like(far)
-
-
-def _without_spikes(y: Array) -> Array:
-    """Return the series with single epochs that contradict both neighbours replaced: no drift."""
-    out = y.copy()
-    between, inner = np.median([y[:-2], y[1:-1], y[2:]], axis=0), out[1:-1]
-    spike = _few_far(inner - between, np.diff(y))
-    inner[spike] = between[spike]
-    return out
-
-
-def _without_jumps(y: Array) -> Array:
-    """Return the series without its sudden steps, which would count as noise with a memory.
-
-    Many steps are noise themselves, of few distinct values: rounded, or alternating.
-    """
-    steps = np.diff(y)
-    middle = np.median(steps)
-    calm = np.where(_few_far(steps - middle, steps), middle, steps)
-    return np.concatenate([[0.0], np.cumsum(calm)])
 
 
 def _bands(n: int, window: int, at: Frequencies) -> list[int]:

@@ -172,17 +172,16 @@ def render_certificate(
                 "Errors of the camera model itself, which no standard deviation here includes.",
             ),
         ),
-        (
-            _section("The model", _values(document), _effects(document)),
-            _section("Evidence", *_evidence(document)),
+        tuple(
+            Section(heading, tables=tuple(table for table in tables if table.rows))
+            for heading, tables in (
+                ("The model", [_values(document), _effects(document)]),
+                ("Evidence", _evidence(document)),
+            )
         ),
         about=(f"{sensor}{f'; fitted to {series}' if series else ''}.",),
         notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
     ).page()  # fmt: skip
-
-
-def _section(title: str, *tables: Table) -> Section:
-    return Section(title, tables=tuple(table for table in tables if table.rows))
 
 
 def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:

@@ -289,7 +289,7 @@ def measure_places(
     sensor = camera.model.sensor
     pose = control.pose(then[0])
     image, sigmas = observed[:, :2], observed[:, 2:]
-    without, _ = place_on(sensor, pose.values, pose.covariance, image, sigmas, surface)
+    without, _ = then[0].on_plane(image, pose, surface, sigmas)
     states = pose.values + np.pad(now.values - then.values, ((0, 0), (0, 6)))
     points, covariance = place_on(
         sensor, states[member], pose.covariance, image, sigmas, surface, now.covariance, member

@@ -289,9 +289,7 @@ def drift_test(
     spectra = at.spectra(MODELS)
     fast_power = at.sums(fast**2)
     results = [
-        _slow_against_fast(
-            power, _without_trend(fast_power, fast[:single], trend, band), at, spectra, band
-        )
+        _slow_against_fast(power, fast_power, (fast[:single], trend), at, spectra, band)
         for band in bands
     ]
     # the median of third differences, which a drift of a thousand sds does not change
@@ -328,34 +326,29 @@ def _bands(n: int, window: int, at: Frequencies) -> list[int]:
 
 
 def _slow_against_fast(
-    power: Array, high: Array, at: Frequencies, models: Array, band: int
-) -> float:
+    power: Array, fast: Array, single: tuple[Array, Array], at: Frequencies, models: Array,
+    band: int,
+) -> float:  # fmt: skip
     """Return the p-value of the slow band, predicted from the fast one under models (g, m).
 
-    power (m,): of the series; high: that beyond the band, of the series without jumps.
+    power, fast (m,): of the series, and of the series without jumps; single (k,), (k, 2): the
+    coefficients of the latter and of a line and a parabola at the frequencies that are not pooled.
     """
     from scipy.special import fdtrc
 
     degrees = float(at.count[band:].sum()) - 2.0
     if degrees < _LEAST_FAST:
         return 1.0
+    # cosines end flat, but a drift need not: what leaks of a line and a parabola is removed
+    high, (own, trend) = fast[band:].copy(), (part[band:] for part in single)
+    if len(own) > 2:
+        basis, _ = np.linalg.qr(trend)
+        high[: len(own)] = (own - basis @ (basis.T @ own)) ** 2
     size = np.maximum((high / models[:, band:]).sum(axis=1) / degrees, _NOTHING)
     deviance = degrees * np.log(size) + np.log(models[:, band:]) @ at.count[band:]
     slow = float(at.count[:band].sum())
     ratio = (power[:band] / models[:, :band]).sum(axis=1) / slow / size
     return largest_p_value(np.asarray(fdtrc(slow, degrees, ratio)), deviance)
-
-
-def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array:
-    """Return the power beyond a band without a trend's leakage; first (k,): single frequencies.
-
-    Cosines end flat, but a drift need not: a line and a parabola are removed.
-    """
-    power, high = power[band:].copy(), first[band:]
-    if len(high) > 2:
-        basis, _ = np.linalg.qr(trend[band:])
-        power[: len(high)] = (high - basis @ (basis.T @ high)) ** 2
-    return power
 
 
 def _excess(

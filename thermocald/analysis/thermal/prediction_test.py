@@ -291,7 +291,16 @@ def predicted_error(
             f"px), {source.name} of {source.camera} ({source.sensor.width}×"
             f"{source.sensor.height} px): a thermal model belongs to one camera"
         )
-    series = _as_fitted(model, series)
+    # the model's T₀ and reference, whichever column comes first
+    history = series.history
+    reference = next(iter(model.validity), history.reference)
+    if reference not in history.readings:
+        raise DataError(
+            f"{source.name}: has no temperature column {reference!r}, which the model was fitted "
+            f"on; there are: {', '.join(history.readings)}"
+        )
+    series = series.in_basis(model.distortion)
+    series = replace(series, history=replace(history, T0=model.T0, reference=reference))
     index = source.field.index
     rows = np.array([index[t] for t in targets_of(model.effects) if t in index], dtype=np.int64)
     model = _of_series(model, series, rows)
@@ -318,19 +327,6 @@ def predicted_error(
     scale = source.sensor.pixel_pitch / model.interior.c * 10_000.0
     floor_px = float(np.sqrt(np.mean(floor[used])))
     return PredictedError(source.series or source.name, rms, floor_px, coverage, rms * scale)
-
-
-def _as_fitted(model: ThermalModel, series: ReducedSeries) -> ReducedSeries:
-    """Return the series with the model's T₀ and reference, whichever column comes first."""
-    history = series.history
-    reference = next(iter(model.validity), history.reference)
-    if reference not in history.readings:
-        raise DataError(
-            f"{series.source.name}: has no temperature column {reference!r}, which the model was "
-            f"fitted on; there are: {', '.join(history.readings)}"
-        )
-    series = series.in_basis(model.distortion)
-    return replace(series, history=replace(history, T0=model.T0, reference=reference))
 
 
 def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int64]) -> ThermalModel:

@@ -250,7 +250,7 @@ def build_camera(
     listed: Sequence[ModelEffect],
     growth: NoiseGrowth | None,
     moved: Sequence[Moved],
-    distortion_sigmas: float | None = None,
+    distortion_sigmas: float | None,
 ) -> ThermalCamera:
     """Build the thermal camera of a fit; its events and phases are those of the first series.
 

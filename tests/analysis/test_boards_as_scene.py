@@ -82,10 +82,11 @@ def test_the_turn_of_the_scene_is_that_of_control_points(shared, number):
         moved = room.turned(now, turn) - then
         scene = estimate_movement(room.camera, room.camera, then[~control], moved[~control], k)
         assert scene is not None
+        values, covariance, *_ = scene
         x, C = room.control_turn(then[control], moved[control])
-        spread = np.sqrt(np.diag(C) + np.diag(scene.covariance)[:3])
-        ratio.append((scene.values[:3] - x) / spread)
-        known.append((scene.values[:3] - turn) / turn.std())
+        spread = np.sqrt(np.diag(C) + np.diag(covariance)[:3])
+        ratio.append((values[:3] - x) / spread)
+        known.append((values[:3] - turn) / turn.std())
     assert len(ratio) >= 15
     assert 0.3 < np.sqrt(np.mean(np.square(ratio))) < 1.0
     assert np.abs(ratio).max() < 3.5
@@ -104,11 +105,11 @@ def course(room: Room, more_c: float) -> SceneCourse:
         now = room.turned(now, more_c=more_c * (T[k] - T[0]) / 25)
         found = estimate_movement(room.camera, room.camera, then[scene], (now - then)[scene], k)
         assert found is not None
-        values[k], covariance[k] = found.values, found.covariance
+        values[k], covariance[k], locked, _ = found
     n = len(rows)
     return SceneCourse(
         "room", ("",) * n, 3600.0 * np.arange(n), T, values, covariance, np.zeros((n, 4)),
-        np.zeros(n, dtype=np.int64), ("",) * n, found.locked, 1e-3,
+        np.zeros(n, dtype=np.int64), ("",) * n, locked, 1e-3,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, S
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.store.recording.reader import read_recording
+from thermocald.store.series import EpochResult
 
 POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 NAMES = ("c", "x0", "y0")
@@ -193,14 +195,10 @@ def test_remembered_epochs_restore_the_state():
     epochs = [world.epoch(k, 20.0 + 0.06 * k) for k in range(1, 100)]
     results, *_ = followed(whole, epochs)
     second = GaugeCalibrator(camera, world.field)
-
-    class Stored:
-        def __init__(self, done):
-            from thermocald.store.series import EpochResult
-
-            self.epoch, self.result = done.epoch, EpochResult.from_adjustment(done.adjustment)
-
-    second.remember(Stored(done) for done in results[:-1])
+    second.remember(
+        SimpleNamespace(epoch=done.epoch, result=EpochResult.from_adjustment(done.adjustment))
+        for done in results[:-1]
+    )
     again = second.calibrate(epochs[-1]).adjustment
     assert again.status == "resected"
     assert again.values == pytest.approx(results[-1].adjustment.values, rel=1e-9)

@@ -83,7 +83,8 @@ def test_turn_and_principal_distance_have_true_sds():
         frame = bank.frame(now, turn, bank.rng.uniform(0.8, 1.1))
         rows, moved = track_features(reference, points, frame)
         found = estimate_movement(bank.cold, now, points[rows], moved)
-        ratio.append((found.values - [*turn, 0.0]) / np.sqrt(np.diag(found.covariance)))
+        values, covariance, *_ = found
+        ratio.append((values - [*turn, 0.0]) / np.sqrt(np.diag(covariance)))
     rms = np.sqrt(np.mean(np.square(ratio), axis=0))
     assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.15), rms
 

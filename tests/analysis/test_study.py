@@ -12,7 +12,6 @@ from thermocald.analysis.study.montecarlo import correlations_over_time, traject
 from thermocald.analysis.study.study import (
     depth_of_field,
     deviation,
-    displacement_covariance,
     image_displacement,
     study,
     study_camera,
@@ -198,27 +197,30 @@ def test_last_minus_first_ignores_missing_epochs():
     assert deviation(np.array([np.nan, 1.0]), np.ones(2)) is None
 
 
-def test_displacements_by_principal_point_and_principal_distance():
-    points = image_grid(NEXUS)
+def displacement(series, first, later):
+    """Return the displacement of the image grid between two interior orientations."""
+    return image_displacement(replace(series, values=np.array([first, later])), image_grid(NEXUS))
+
+
+def test_displacements_by_principal_point_and_principal_distance(warm_up):
     first = np.array([3.97, 0.01, -0.02, 5e-3, -4e-4, 0, 1e-4, -1e-4, 0, 0])
     later = first + np.array([0, 10.0, 5.0, *[0] * 7]) * 0.0014
-    moved = image_displacement(NEXUS, first, later, points)
+    moved, _ = displacement(warm_up()(), first, later)
     np.testing.assert_allclose(moved, np.tile([10.0, -5.0], (9, 1)), atol=1e-6)
     first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
-    moved = image_displacement(NEXUS, first, 1.002 * first, points)
-    np.testing.assert_allclose(moved, 0.002 * (points - NEXUS.centre), atol=1e-9)
+    moved, _ = displacement(warm_up()(), first, 1.002 * first)
+    np.testing.assert_allclose(moved, 0.002 * (image_grid(NEXUS) - NEXUS.centre), atol=1e-9)
 
 
 def test_the_covariance_of_displacements_is_their_scatter(warm_up):
     series = warm_up(drift={}, epochs=2)()
-    points = image_grid(NEXUS)
-    covariance = displacement_covariance(series, points)
+    _, covariance = image_displacement(series, image_grid(NEXUS))
 
     rng = np.random.default_rng(9)
     sds = np.nan_to_num(series.sds[0])
     of_epoch = series.correlations[0] * np.outer(sds, sds)
     later = rng.multivariate_normal(INTERIOR, 2 * of_epoch, 2000)  # of two independent epochs
-    moved = image_displacement(NEXUS, INTERIOR, later, points)
+    moved = np.array([displacement(series, INTERIOR, one)[0] for one in later])
 
     found = np.einsum("nki,nkj->kij", moved, moved) / len(moved)
     # 2000 draws give a variance to 3 %

@@ -46,10 +46,6 @@ def test_the_steady_state_is_the_end_of_a_long_history(T):
     np.testing.assert_allclose(along.covariance[-1], now.covariance, rtol=1e-6, atol=1e-22)
 
 
-def _moved(effect, change):
-    return {k: v + change.get(f"{effect.name}.{k}", 0.0) for k, v in effect.values.items()}
-
-
 def test_covariance_against_draws():
     """400 models are drawn with the file's standard deviations."""
     model = thermal_model(*LISTED)
@@ -65,7 +61,12 @@ def test_covariance_against_draws():
             **{n: getattr(model.interior, n) + change[f"interior.{n}"] for n in ("c", "x0", "y0")}
         )
         rates = {n: model.rates[n] + change[f"rates.{n}"] for n in ("c", "x0", "y0")}
-        listed = tuple(replace(e, values=_moved(e, change)) for e in model.effects)
+        listed = tuple(
+            replace(
+                e, values={k: v + change.get(f"{e.name}.{k}", 0.0) for k, v in e.values.items()}
+            )
+            for e in model.effects
+        )
         moved = replace(model, interior=interior, rates=rates, effects=listed)
         values.append(ThermalCamera(moved).at(43.0).values)
     scatter = np.std(values, axis=0, ddof=1)

@@ -41,13 +41,8 @@ def specimen(rng, sensor, name):
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def world():
-    """Return the type of ten cameras, and the simulated full cycle of an eleventh."""
-    return new_world(11)
-
-
 def new_world(seed):
+    """Return the type of ten cameras, and the simulated full cycle of an eleventh."""
     rng = np.random.default_rng(seed)
     cycle = preset_simulation("rpi-v2.1-heating", 3)
     sensor = cycle.model.sensor
@@ -66,18 +61,13 @@ def at_three_temperatures(cycle, interval, epochs):
     return replace(cycle, programme=programme, seed=5)
 
 
-def reduced_frames(cycle, simulation, *starts):
-    """Reduce four frames from each of these rows on; the thermometer is read in all epochs."""
-    rows = {row + k for row in starts for k in range(4)}
+def at_rest_only(cycle, seed):
+    """Reduce four frames at rest at each temperature; the thermometer is read in all epochs."""
+    simulation = replace(at_three_temperatures(cycle, 50.0, 120), seed=seed)
+    rows = {row + k for row in (26, 56, 116) for k in range(4)}
     epochs = [e if i in rows else replace(e, observations=None)
               for i, e in enumerate(simulation.epochs())]  # fmt: skip
     return for_fit(epochs_input(cycle.head, cycle.field, epochs, "M1"))
-
-
-def at_rest_only(cycle, seed=5):
-    """Return four frames at rest at each of three temperatures."""
-    simulation = replace(at_three_temperatures(cycle, 50.0, 120), seed=seed)
-    return reduced_frames(cycle, simulation, 26, 56, 116)
 
 
 @pytest.mark.slow
@@ -121,8 +111,8 @@ def test_three_temperatures_predict_nearly_as_well_as_the_full_cycle():
 
 
 @pytest.mark.slow
-def test_the_command_uses_the_type(world, tmp_path):
-    kind, cycle = world
+def test_the_command_uses_the_type(tmp_path):
+    kind, cycle = new_world(11)
     write_model(tmp_path / "type.yaml", kind)
     at_three_temperatures(cycle, 100.0, 45).write(tmp_path / "M1")
     arguments = ["fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--type",

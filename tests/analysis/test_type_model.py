@@ -41,25 +41,16 @@ def values_of(model):
     return np.array([model.interior.c, model.rates["c"], model.rates["x0"], tau])
 
 
-def of_its_type(rng):
-    """Draw a new camera, its true values, and its model combined with the type of ten others."""
-    _, fleet = cameras(rng, 10, 0.1)
-    true, (new,) = cameras(rng, 1, 1.0)
-    return new, true[0], shrink_to_type(new, type_model(fleet, "rpi-v2.1"))
-
-
-def pull(true, found):
-    sd = np.sqrt(np.diag(np.array(found.covariance)))
-    rows = [found.covariance_names.index(n) for n in NAMES]
-    return (values_of(found) - true) / sd[rows]
-
-
 def test_a_camera_measured_at_few_temperatures_is_better_than_alone_and_than_its_type():
     rng = np.random.default_rng(8)
     pulls, own, shrunk, kind = [], [], [], []
     for _ in range(60):
-        new, true, found = of_its_type(rng)
-        pulls.append(pull(true, found))
+        _, fleet = cameras(rng, 10, 0.1)
+        (true,), (new,) = cameras(rng, 1, 1.0)
+        found = shrink_to_type(new, type_model(fleet, "rpi-v2.1"))
+        rows = [found.covariance_names.index(n) for n in NAMES]
+        sd = np.sqrt(np.diag(np.array(found.covariance)))[rows]
+        pulls.append((values_of(found) - true) / sd)
         own.append((values_of(new) - true) / SCATTER)
         shrunk.append((values_of(found) - true) / SCATTER)
         kind.append((TYPE - true) / SCATTER)

@@ -256,11 +256,6 @@ def degrees(_, row):
 UNSEEN = {"x": "", "y": ""}
 
 
-def beyond_the_camera(_, row):
-    """Points behind the camera, whose centre is at Y = 312999 m."""
-    return {"Y": 2 * 312_999.0 - float(row["Y"])}
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [(degrees, "do X and Y hold degrees?"),
@@ -268,7 +263,8 @@ def beyond_the_camera(_, row):
      (lambda _, r: {n: 1000 * float(r[n]) for n in "XYZ"}, "are they in mm?"),
      (lambda i, r: {"x": 4 * float(r["x"])} if i < 6 else UNSEEN, "px, outside the camera's 3280"),
      (lambda _, r: {"x": r["y"], "y": r["x"]}, "X and Y, or x and y, are exchanged"),
-     (beyond_the_camera, "or a sign is wrong"),
+     # behind the camera, whose centre is at Y = 312999 m
+     (lambda _, r: {"Y": 2 * 312_999.0 - float(r["Y"])}, "or a sign is wrong"),
      (lambda i, _: {"X": 192_000 + i, "Y": 313_020, "Z": 138}, "lie on one line"),
      (lambda i, r: {} if i < 3 else UNSEEN, "3 control points; a pose needs at least"),
      (lambda i, r: {"Z": 100 * float(r["Z"])} if i == 3 else {}, "g3: is 13"),

@@ -18,7 +18,9 @@ from thermocald.errors import GeometryError
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import (
     DEFAULT_FREE,
+    EOP,
     EOP_NAMES,
+    IOP,
     PARAMETER_NAMES,
     CameraModel,
     ExteriorOrientation,
@@ -270,13 +272,13 @@ def check_field(
     points, sigmas = field.points[rows], field.sigmas[rows]
     image = camera.project(station, points)
     # the reasons for which `adjust` would give an image of these points no result
-    A, _ = _partials(camera, station, points)
+    values = np.concatenate([camera.interior.as_array(), station.as_array()])
+    A = partials(camera.sensor, values[IOP], values[EOP], points)[1][:, :, _USED]
     covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
     # undetermined parameters get large variances, and correlations of 1
     covariance[np.ix_(_USED, _USED)] = scaled_inverse(
         _normal_matrix(A, np.eye(2) * sigma_px**2), 1e-13
     )
-    values = np.concatenate([camera.interior.as_array(), station.as_array()])
     weak = weaknesses(
         camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
     )
@@ -347,7 +349,9 @@ def precision(
     the others in a long series of a fixed camera; level: one image, including the test field's
     uncertainty, which is common to all epochs. c, x0, y0 in mm; inf for an undetermined parameter.
     """
-    A, by_point = _partials(camera, station, points)
+    interior, exterior = camera.interior.as_array(), station.as_array()
+    _, by_parameter, by_point = partials(camera.sensor, interior, exterior, points)
+    A = by_parameter[:, :, _USED]
     k, noise = len(DEFAULT_FREE), np.eye(2) * sigma_px**2
     of_field = (by_point * sigmas[:, None, :] ** 2) @ np.swapaxes(by_point, 1, 2)
     N = _normal_matrix(A, noise)
@@ -356,15 +360,6 @@ def precision(
         "series": _sds(N[:k, :k]),
         "level": _sds(_normal_matrix(A, noise + of_field))[:k],
     }
-
-
-def _partials(
-    camera: CameraModel, station: ExteriorOrientation, points: Array
-) -> tuple[Array, Array]:
-    """Return partials (n, 2, …) of the image points by the estimated parameters and the targets."""
-    interior, exterior = camera.interior.as_array(), station.as_array()
-    _, by_parameter, by_point = partials(camera.sensor, interior, exterior, points)
-    return by_parameter[:, :, _USED], by_point
 
 
 def _normal_matrix(A: Array, covariance: Array) -> Array:
@@ -386,15 +381,15 @@ def _sds(N: Array) -> Array:
 def assess_field(
     field: TestField,
     camera: CameraModel,
-    place: tuple[float, float, float] | None = None,
-    look_at: tuple[float, float, float] | None = None,
-    roll: float = 0.0,
-    sigma_px: float = 0.03,
+    place: tuple[float, float, float] | None,
+    look_at: tuple[float, float, float] | None,
+    roll: float,
+    sigma_px: float,
 ) -> FieldCheck:
     """Assess a test field for a camera at a place X, Y, Z mm; roll: degrees about its axis.
 
-    By default the camera is placed where the field just fills its image, and looks at the field's
-    centre. Raises GeometryError if fewer than four targets are visible.
+    Without a place the camera is where the field just fills its image; it looks at the field's
+    centre unless at another point. Raises GeometryError if fewer than four targets are visible.
     """
     middle = (field.points.min(axis=0) + field.points.max(axis=0)) / 2
     target = middle if look_at is None else np.array(look_at)

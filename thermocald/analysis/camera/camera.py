@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
-    from thermocald.photogrammetry.epoch.measuring import Line, Plane
+    from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
@@ -144,28 +144,32 @@ class Camera(Result):
         return result
 
     def resect(
-        self, control: TestField, seen: Observations, snooping_alpha: float = 0.001
+        self,
+        control: TestField,
+        seen: Observations,
+        snooping_alpha: float = 0.001,
+        start: ExteriorOrientation | None = None,
     ) -> Adjustment:
         """Return the pose of this camera from control points, with its covariance as prior.
 
-        snooping_alpha: error probability of a single test for gross errors, 0 for none. The
-        covariance (16, 16) of the result is joint; its status and reason explain a missing pose.
+        snooping_alpha: error probability of a single test for gross errors, 0 for none; start: an
+        earlier pose, with which three points suffice. The covariance (16, 16) of the result is
+        joint; its status and reason explain a missing pose.
         """
         from thermocald.photogrammetry.epoch.measuring import resect
 
         return resect(
-            self.sensor, self.interior, self.covariance, control, seen,
-            snooping_alpha=snooping_alpha,
-        )  # fmt: skip
+            self.sensor, self.interior, self.covariance, control, seen, start, snooping_alpha
+        )
 
     def on_plane(
         self,
         image_points: ArrayLike,
         pose: Adjustment,
-        plane: Plane | Line,
+        plane: Plane | Line | Profile,
         sigma: ArrayLike = 0.0,
     ) -> tuple[Array, Array]:
-        """Return the places (n, 3) mm of image points (n, 2) px on a plane or a line.
+        """Return the places (n, 3) mm of image points (n, 2) px on a plane, a line or a profile.
 
         pose: from `resect`; sigma: of the image points, px. Also returns their joint covariance
         (3n, 3n), from image points, camera, pose and plane. Raises GeometryError for rays that miss
@@ -216,10 +220,20 @@ class Camera(Result):
         from thermocald.photogrammetry import camera_files
 
         target = Path(path)
+        known, chosen = camera_files.FORMATS, format
+        if not chosen:  # the one that the file's name tells
+            suffix = target.suffix.lower()
+            fitting = [name for name, one in known.items() if one.suffix == suffix]
+            fitting = [target.stem] if target.stem in known else fitting
+            if len(fitting) != 1:
+                there = ", ".join(fitting or known)
+                raise UsageError(
+                    f"{path}: the name does not tell the format; give format=…: {there}"
+                )
+            chosen = fitting[0]
         if not comment and not np.isnan(self.temperature):
             comment = f"at {self.temperature:g} degC"
         covariance = self.covariance if self.covariance.any() else None
-        chosen = format or _format_of(target)
         return camera_files.write(self.model, target, chosen, covariance, comment, self.name)
 
     def as_dict(self) -> dict[str, Any]:
@@ -272,20 +286,6 @@ def _draw(sensor: Sensor, points: Array, vectors: Array, title: str) -> Figure:
     axis.set(xlabel="x in px", ylabel="y in px, down")
     axis.set_title(title, loc="left", pad=20, wrap=True)  # above the scale arrow
     return figure
-
-
-def _format_of(path: Path) -> str:
-    """Return the format that a file's name tells. Raises UsageError for none, or several."""
-    from thermocald.photogrammetry import camera_files
-
-    if path.stem in camera_files.FORMATS:
-        return path.stem
-    suffix = path.suffix.lower()
-    fitting = [name for name, known in camera_files.FORMATS.items() if known.suffix == suffix]
-    if len(fitting) != 1:
-        there = ", ".join(fitting or camera_files.FORMATS)
-        raise UsageError(f"{path}: the name does not tell the format; give format=…: {there}")
-    return fitting[0]
 
 
 _GRID, _DRAWN = 25, 13  # points per side, and those that a drawing shows

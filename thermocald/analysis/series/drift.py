@@ -70,7 +70,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         t, y, sd = _thin(time, values, sds)
         x = t - t.mean()
         slope = float(x @ y / (x @ x))
-        noise = slope_noise(y, x, slope, times=t)
+        sd_slope, *_ = slope_noise(y, x, slope, times=t)
         test = drift_test(y, sd, np.ones(len(y)), times=t)
         p = 1.0 if test is None else test.p_value
         span, tilt_sd = float(np.ptp(time)), float(table.trend_sd[column])
@@ -79,7 +79,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         line = Course(
             name, float(values.mean()), float(values.std(ddof=1)),
             float(np.sqrt(np.mean(sds**2))), slope * span,
-            float(np.hypot(noise.sd * span, tilt_sd)), min(1.0, p), drifts=False,
+            float(np.hypot(sd_slope * span, tilt_sd)), min(1.0, p), drifts=False,
             last_minus_first=float(values[-1] - values[0]),
             sd_last_minus_first=float(np.sqrt(sds[-1] ** 2 + sds[0] ** 2 + slow[column])),
             sd_by_perspective=float(np.sqrt(2.0) * table.perspective_sd[column]),

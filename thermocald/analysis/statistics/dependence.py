@@ -75,21 +75,6 @@ _ABOVE_NOISE = 6.0  # mean power of so many frequencies of x over the variance o
 _LONG_MEMORY = 0.15  # fraction of the series
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SlopeNoise:
-    """The noise of a series and its effect on the slope on `x`.
-
-    sd: of the slope; n_effective: equivalent number of independent values; lag_one: correlation of
-    the noise of neighbouring epochs; too_short: the memory is so long compared to the series that
-    the sd is only an order of magnitude.
-    """
-
-    sd: float
-    n_effective: float
-    lag_one: float
-    too_short: bool
-
-
 @lru_cache(maxsize=8)
 def _models(longest: float) -> tuple[Array, Array, Array, Array]:
     """Return φ, coloured part, memory and prior weight (g,) of the models."""
@@ -107,11 +92,13 @@ def _models(longest: float) -> tuple[Array, Array, Array, Array]:
 
 def slope_noise(
     y: Array, x: Array, slope: float, sd_x: float = 0.0, times: Array | None = None
-) -> SlopeNoise:
-    """Estimate the noise about a straight line through x, y (n,), and the sd of its `slope`.
+) -> tuple[float, float, float, bool]:
+    """Return the sd of the `slope` of a straight line through x, y (n,), from the noise about it.
 
     Values are finite, n ≥ 4; sd_x: noise of x; times (n,): evenly spaced by default; the noise
-    decorrelates in a gap as between epochs.
+    decorrelates in a gap as between epochs. Also returns the equivalent number of independent
+    values, the correlation of the noise of neighbouring epochs, and whether its memory is so long
+    compared to the series that the sd is only an order of magnitude.
     """
     n = len(y)
     at = Frequencies.of(n, times)
@@ -137,7 +124,7 @@ def slope_noise(
     variance = float(plausible @ (left / freedom / information + off**2))
     # geometric: models that a short series cannot exclude would dominate an arithmetic mean
     inflation = np.exp(plausible @ np.log(spectrum @ whole / whole.sum()))
-    return SlopeNoise(
+    return (
         float(np.sqrt(variance)),
         n / max(1.0, float(inflation)),
         float(plausible @ (phi * coloured)),
@@ -286,7 +273,7 @@ def dependence(
     # an epoch with few targets does not show the noise of the others
     usual: Mask = sds <= _UNUSUAL * float(np.median(sds))
     those = usual if np.ptp(temperature[usual]) > 0 else np.ones(n, dtype=bool)
-    noise = slope_noise(
+    sd_noise, n_effective, lag_one, too_short = slope_noise(
         values[those], temperature[those], slope, temperature_sd,
         None if times is None else times[those],
     )  # fmt: skip
@@ -294,13 +281,13 @@ def dependence(
         n,
         r,
         float(2 * stdtr(n - 2, -size)),
-        noise.n_effective,
-        noise.lag_one,
+        n_effective,
+        lag_one,
         slope_p_value(values, temperature, times),
         slope,
-        noise.sd if n >= _FEW else max(noise.sd, sd_slope),
+        sd_noise if n >= _FEW else max(sd_noise, sd_slope),
         misfit,
-        noise.too_short,
+        too_short,
     )
 
 

@@ -267,8 +267,16 @@ def drift_test(
         return None
     # one sd for all: those of single epochs fluctuate, and so would a large drift over them
     standardised = (values - values.mean()) / np.sqrt(np.mean(sds**2))
-    standardised = _without_spikes(standardised)
-    calm = _without_jumps(standardised)
+    # single epochs that contradict both neighbours are no drift
+    between = np.median([standardised[:-2], standardised[1:-1], standardised[2:]], axis=0)
+    spike = _few_far(standardised[1:-1] - between, np.diff(standardised))
+    standardised[1:-1][spike] = between[spike]
+    # sudden steps would count as noise with a memory; many of them are noise itself, of few
+    # distinct values: rounded, or alternating
+    steps = np.diff(standardised)
+    middle = np.median(steps)
+    calm = np.where(_few_far(steps - middle, steps), middle, steps)
+    calm = np.concatenate([[0.0], np.cumsum(calm)])
     at = Frequencies.of(n, times)
     whole, fast = at.coefficients(standardised), at.coefficients(calm)
     power = at.sums(whole**2)
@@ -281,9 +289,7 @@ def drift_test(
     spectra = at.spectra(MODELS)
     fast_power = at.sums(fast**2)
     results = [
-        _slow_against_fast(
-            power, _without_trend(fast_power, fast[:single], trend, band), at, spectra, band
-        )
+        _slow_against_fast(power, fast_power, (fast[:single], trend), at, spectra, band)
         for band in bands
     ]
     # the median of third differences, which a drift of a thousand sds does not change
@@ -309,26 +315,6 @@ def _few_far(distance: Array, steps: Array) -> Mask:
     return far if far.sum() <= _MOST_JUMPS * (len(steps) + 1) else np.zeros_like(far)
 
 
-def _without_spikes(y: Array) -> Array:
-    """Return the series with single epochs that contradict both neighbours replaced: no drift."""
-    out = y.copy()
-    between, inner = np.median([y[:-2], y[1:-1], y[2:]], axis=0), out[1:-1]
-    spike = _few_far(inner - between, np.diff(y))
-    inner[spike] = between[spike]
-    return out
-
-
-def _without_jumps(y: Array) -> Array:
-    """Return the series without its sudden steps, which would count as noise with a memory.
-
-    Many steps are noise themselves, of few distinct values: rounded, or alternating.
-    """
-    steps = np.diff(y)
-    middle = np.median(steps)
-    calm = np.where(_few_far(steps - middle, steps), middle, steps)
-    return np.concatenate([[0.0], np.cumsum(calm)])
-
-
 def _bands(n: int, window: int, at: Frequencies) -> list[int]:
     """Return the ends of the slow bands, as positions in the pooled spectrum; at least one."""
     most = max(2, n // window)
@@ -340,34 +326,29 @@ def _bands(n: int, window: int, at: Frequencies) -> list[int]:
 
 
 def _slow_against_fast(
-    power: Array, high: Array, at: Frequencies, models: Array, band: int
-) -> float:
+    power: Array, fast: Array, single: tuple[Array, Array], at: Frequencies, models: Array,
+    band: int,
+) -> float:  # fmt: skip
     """Return the p-value of the slow band, predicted from the fast one under models (g, m).
 
-    power (m,): of the series; high: that beyond the band, of the series without jumps.
+    power, fast (m,): of the series, and of the series without jumps; single (k,), (k, 2): the
+    coefficients of the latter and of a line and a parabola at the frequencies that are not pooled.
     """
     from scipy.special import fdtrc
 
     degrees = float(at.count[band:].sum()) - 2.0
     if degrees < _LEAST_FAST:
         return 1.0
+    # cosines end flat, but a drift need not: what leaks of a line and a parabola is removed
+    high, (own, trend) = fast[band:].copy(), (part[band:] for part in single)
+    if len(own) > 2:
+        basis, _ = np.linalg.qr(trend)
+        high[: len(own)] = (own - basis @ (basis.T @ own)) ** 2
     size = np.maximum((high / models[:, band:]).sum(axis=1) / degrees, _NOTHING)
     deviance = degrees * np.log(size) + np.log(models[:, band:]) @ at.count[band:]
     slow = float(at.count[:band].sum())
     ratio = (power[:band] / models[:, :band]).sum(axis=1) / slow / size
     return largest_p_value(np.asarray(fdtrc(slow, degrees, ratio)), deviance)
-
-
-def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array:
-    """Return the power beyond a band without a trend's leakage; first (k,): single frequencies.
-
-    Cosines end flat, but a drift need not: a line and a parabola are removed.
-    """
-    power, high = power[band:].copy(), first[band:]
-    if len(high) > 2:
-        basis, _ = np.linalg.qr(trend[band:])
-        power[: len(high)] = (high - basis @ (basis.T @ high)) ** 2
-    return power
 
 
 def _excess(

@@ -27,6 +27,7 @@ _FEWEST = 2
 _FEWEST_FOR_CORRELATIONS = 4
 _STEP = 0.05
 _NODES = 49  # of the mixture over Σ
+_LEVEL = 0.95  # of intervals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +46,8 @@ class Shrunk:
     push: Array
     correlations: Array
 
-    def interval(self, direction: Array, level: float = 0.95) -> tuple[float, float, float]:
-        """Return value, low and high of direction·θ at a confidence level; direction (k,).
+    def interval(self, direction: Array) -> tuple[float, float, float]:
+        """Return value, low and high of direction·θ with 95 % confidence; direction (k,).
 
         The interval is that of a mixture over factors of Σ, distributed as freedom / χ². A factor
         changes the value, not only its variance: a Σ too small by chance shrinks too much.
@@ -66,7 +67,7 @@ class Shrunk:
 
         def excess(half: float) -> float:
             low, high = ((value + end - middles) / sds for end in (-half, half))
-            return float(np.mean(ndtr(high) - ndtr(low))) - level
+            return float(np.mean(ndtr(high) - ndtr(low))) - _LEVEL
 
         furthest = float(np.max(np.abs(value - middles) + 40 * sds))
         half = float(brentq(excess, 0.0, furthest, xtol=1e-9 * furthest))

@@ -168,10 +168,18 @@ def measured_series(
     thermometer_sd K: by default estimated from the readings. Raises DataError if no epoch has a
     result.
     """
-    ok, without_result = _find_results(table)
+    lost = sorted((word, n) for word, n in Counter(table.status).items() if word != "ok")
+    without_result = {word.replace("_", " "): n for word, n in lost}
+    # only complete results: a nearly singular covariance matrix can have negative variances, which
+    # have no square root
+    ok = table.ok & np.isfinite(table.values[:, :10]).all(axis=1)
+    known = np.isfinite(table.sd[:, :10])
+    ok &= known[:, known[table.ok].any(axis=0)].all(axis=1)
+    if missing := int(np.count_nonzero(table.ok & ~ok)):
+        without_result["no standard deviation"] = missing
     if not ok.any():
-        lost = ", ".join(f"{n} × {reason}" for reason, n in without_result.items())
-        raise DataError(f"{source.title}: no epoch has a result ({lost or 'it has no epochs'})")
+        why = ", ".join(f"{n} × {reason}" for reason, n in without_result.items())
+        raise DataError(f"{source.title}: no epoch has a result ({why or 'it has no epochs'})")
     adjustment = table.adjustment
     if isinstance(source, StoredRecording) and adjustment is None:
         redundancy = source.store.series_columns(source.series, ["redundancy"])["redundancy"]
@@ -204,19 +212,3 @@ def measured_series(
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
         slow=table.slow_between_ends[:10],
     )  # fmt: skip
-
-
-def _find_results(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Return which epochs have a complete result, and {reason: epochs without one}.
-
-    A nearly singular covariance matrix can have negative variances, which have no square root.
-    """
-    ok = table.ok
-    lost = sorted((word, n) for word, n in Counter(table.status).items() if word != "ok")
-    counted = {word.replace("_", " "): n for word, n in lost}
-    whole = ok & np.isfinite(table.values[:, :10]).all(axis=1)
-    known = np.isfinite(table.sd[:, :10])
-    whole &= known[:, known[ok].any(axis=0)].all(axis=1)
-    if missing := int(np.count_nonzero(ok & ~whole)):
-        counted["no standard deviation"] = missing
-    return whole, counted

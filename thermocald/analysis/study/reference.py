@@ -117,9 +117,7 @@ class Comparison:
         return self.low <= self.ours <= self.high
 
 
-def reference_studies(
-    settings: StudySettings, advance: Callable[[int], None] = lambda _: None
-) -> list[CameraStudy]:
+def reference_studies(settings: StudySettings, advance: Callable[[int], None]) -> list[CameraStudy]:
     """Study every preset with its own f-number, from two series simulated, read and adjusted."""
     studies = []
     for preset in QUOTED:

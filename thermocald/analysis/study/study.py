@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
     _Test = TypeVar("_Test", Dependence, DriftTest)
 
@@ -105,34 +104,21 @@ def deviation(values: Array, sds: Array, slow: float = 0.0) -> Deviation | None:
     )
 
 
-def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array) -> Array:
-    """Return the displacement of a static scene's image points (k, 2) px by a change of the IOP.
+def image_displacement(series: MeasuredSeries, points: Array) -> tuple[Array, Array | None]:
+    """Return the displacement (k, 2) px of a static scene's image points, from first to last epoch.
 
-    first (10,), later (10,) or (n, 10); returns px (k, 2) or (n, k, 2), y down. Raises
-    GeometryError if the first IOP have no ray for a point.
+    points (k, 2) px, y down. Also returns its covariance (k, 2, 2) px², None, unknown, if the
+    series has no correlations. Raises GeometryError if the first IOP have no ray for a point.
     """
-    scene = directions(sensor, first, points)
-    seen = project(sensor, later, np.zeros((*later.shape[:-1], 6)), scene)
-    return np.asarray(seen - points)
-
-
-def displacement_covariance(series: MeasuredSeries, points: Array) -> Array | None:
-    """Return the covariance (k, 2, 2) px² of `image_displacement` from the first to the last epoch.
-
-    It is None, unknown, if the series has no correlations.
-    """
+    sensor, last = series.sensor, series.values[-1]
+    scene = directions(sensor, series.values[0], points)
+    moved = project(sensor, last, np.zeros(6), scene) - points
     if not len(series.correlations):
-        return None
-    scene = directions(series.sensor, series.values[0], points)
-    J = partials(series.sensor, series.values[-1], np.zeros(6), scene)[1][..., :10]
+        return moved, None
+    J = partials(sensor, last, np.zeros(6), scene)[1][..., :10]
     sds = np.nan_to_num(series.sds[[0, -1]])
     covariance = series.correlations[[0, -1]] * sds[:, :, None] * sds[:, None, :]
-    return np.asarray(J @ covariance.sum(axis=0) @ np.swapaxes(J, 1, 2))
-
-
-def circle_of_confusion(sensor: Sensor) -> float:
-    """Return the largest blur that counts as sharp, mm: 1/2000 of the image diagonal, 2 to 3 px."""
-    return float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch / 2000
+    return moved, np.asarray(J @ covariance.sum(axis=0) @ np.swapaxes(J, 1, 2))
 
 
 def depth_of_field(
@@ -259,10 +245,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     displacement = covariance = None
     if len(series) > 1:
         try:
-            displacement = image_displacement(
-                series.sensor, series.values[0], series.values[-1], grid
-            )
-            covariance = displacement_covariance(series, grid)
+            displacement, covariance = image_displacement(series, grid)
         except GeometryError as error:
             notes.append(f"The displacement of the image cannot be computed: {error}.")
     focus = _focus(series, settings, deviations, notes)
@@ -393,7 +376,10 @@ def _focus(
     if "c" not in deviations:
         notes.append("The principal distance was held or has one value only: no change of focus.")
         return None
-    confusion = settings.confusion_mm or circle_of_confusion(series.sensor)
+    sensor = series.sensor
+    # the largest blur that counts as sharp: 2 to 3 px
+    diagonal = float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch
+    confusion = settings.confusion_mm or diagonal / 2000
     c = deviations["c"]
     try:
         ends = [

@@ -76,7 +76,7 @@ def is_calibration(path: Path) -> bool:
         return False
 
 
-def read_calibration(path: Path, temperature: float | None = None) -> Calibration:
+def read_calibration(path: Path, temperature: float | None) -> Calibration:
     """Read what `calibrate` wrote (`--json`, `--camera-out`). ConfigurationError names the file."""
     T = math.nan if temperature is None else temperature
     try:

@@ -148,12 +148,12 @@ _DISTANCE_MM = 10_000.0
 
 def render_certificate(
     document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float], drift: Figure,
-    title: str = "",
+    title: str,
 ) -> str:  # fmt: skip
     """Return the page as HTML text.
 
     document: of the thermal camera; limits: the range of its temperatures, °C; drift: over it;
-    title: by default the camera's name.
+    title: "" for the camera's name.
     """
     low, high = limits
     missing = bool(document.get("effect_missing"))
@@ -172,17 +172,16 @@ def render_certificate(
                 "Errors of the camera model itself, which no standard deviation here includes.",
             ),
         ),
-        (
-            _section("The model", _values(document), _effects(document)),
-            _section("Evidence", *_evidence(document)),
+        tuple(
+            Section(heading, tables=tuple(table for table in tables if table.rows))
+            for heading, tables in (
+                ("The model", _model_tables(document)),
+                ("Evidence", _evidence_tables(document)),
+            )
         ),
         about=(f"{sensor}{f'; fitted to {series}' if series else ''}.",),
         notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
     ).page()  # fmt: skip
-
-
-def _section(title: str, *tables: Table) -> Section:
-    return Section(title, tables=tuple(table for table in tables if table.rows))
 
 
 def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:
@@ -242,40 +241,39 @@ def _shown(entry: Mapping[str, Any], unit: str, scale: float = 1.0) -> str:
     return with_sd(scale * entry["value"], scale * entry.get("sd", float("nan")), unit)
 
 
-def _values(document: Mapping[str, Any]) -> Table:
+def _model_tables(document: Mapping[str, Any]) -> list[Table]:
     rates = document["rates"]
-    return Table.of(
-        "Interior orientation",
-        document["interior"].items(),
-        {
-            "parameter": lambda r: parameter_label(r[0]),
-            f"at {document['reference_temperature']:g} °C": lambda r: _shown(
-                r[1], UNITS.get(r[0], "")
-            ),
-            "rate": lambda r: _shown(rates[r[0]], "µm/K", 1e3) if r[0] in rates else "",
-        },
-    )
-
-
-def _effects(document: Mapping[str, Any]) -> Table:
-    found = [
+    effects = [
         (effect["effect"], name, entry)
         for effect in document["effects"]
         for name, entry in effect["parameters"].items()
         if isinstance(entry, dict)
     ]
-    return Table.of(
-        "Effects",
-        found,
-        {
-            "effect": lambda r: str(r[0]),
-            "parameter": lambda r: str(r[1]),
-            "value ± sd": lambda r: _shown(r[2], "" if r[2]["unit"] == "1" else r[2]["unit"]),
-        },
-    )
+    return [
+        Table.of(
+            "Interior orientation",
+            document["interior"].items(),
+            {
+                "parameter": lambda r: parameter_label(r[0]),
+                f"at {document['reference_temperature']:g} °C": lambda r: _shown(
+                    r[1], UNITS.get(r[0], "")
+                ),
+                "rate": lambda r: _shown(rates[r[0]], "µm/K", 1e3) if r[0] in rates else "",
+            },
+        ),
+        Table.of(
+            "Effects",
+            effects,
+            {
+                "effect": lambda r: str(r[0]),
+                "parameter": lambda r: str(r[1]),
+                "value ± sd": lambda r: _shown(r[2], "" if r[2]["unit"] == "1" else r[2]["unit"]),
+            },
+        ),
+    ]
 
 
-def _evidence(document: Mapping[str, Any]) -> list[Table]:
+def _evidence_tables(document: Mapping[str, Any]) -> list[Table]:
     return [
         Table.of(
             "Series",

@@ -75,9 +75,23 @@ class ControlPoints:
         The CSV has target, X, Y, Z, sX, sY, sZ, optionally image points x, y, sx, sy (px), and
         kind, code and diameter as in a test field. Raises DataError naming file, line and column.
         """
-        if path.suffix.lower() in (".json", ".geojson"):
-            return _from_json(path)
-        return _from_table(path, unit)
+        if path.suffix.lower() not in (".json", ".geojson"):
+            return _from_table(path, unit)
+        try:
+            document = json.loads(path.read_text(encoding="utf-8-sig"))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: cannot be read as JSON: {error}") from error
+        try:
+            if isinstance(document, dict) and "gcps" in document:
+                return _from_pyorc(document, str(path))
+            if isinstance(document, dict) and document.get("type") == "FeatureCollection":
+                return _from_features(document, str(path))
+        except DataError:
+            raise
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            fault = f"{error} is missing" if isinstance(error, KeyError) else error
+            raise DataError(f"{path}: is not valid JSON of control points: {fault}") from error
+        raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 
     @classmethod
     def build(
@@ -219,24 +233,6 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
     return ControlPoints.build(
         words["target"], stacked("X", "Y", "Z"), sigmas, unit, str(path), seen, **looks
     )
-
-
-def _from_json(path: Path) -> ControlPoints:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {error}") from error
-    try:
-        if isinstance(document, dict) and "gcps" in document:
-            return _from_pyorc(document, str(path))
-        if isinstance(document, dict) and document.get("type") == "FeatureCollection":
-            return _from_features(document, str(path))
-    except DataError:
-        raise
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
-        fault = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise DataError(f"{path}: is not valid JSON of control points: {fault}") from error
-    raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 
 
 def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:

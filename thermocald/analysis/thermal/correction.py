@@ -94,9 +94,9 @@ def image_corrections(
     camera: ThermalCamera,
     log: TemperatureLog,
     times: Array,
-    to: float | None = None,
-    temperature_sd: float = 0.0,
-    extrapolate: bool = False,
+    to: float | None,
+    temperature_sd: float,
+    extrapolate: bool,
 ) -> tuple[Maps, Array, list[dict[str, float]]]:
     """Return maps, the values (n, 10) of the images' cameras to resample them with, and a summary.
 
@@ -218,9 +218,7 @@ class RowBlock:
         )  # fmt: skip
 
 
-def row_blocks(
-    path: Path, columns: tuple[str, ...], clock: DeviceClock | None = None
-) -> Iterator[RowBlock]:
+def row_blocks(path: Path, columns: tuple[str, ...], clock: DeviceClock) -> Iterator[RowBlock]:
     """Read a CSV with a column `time` and others, a block at a time; `-` is standard input.
 
     A block of standard input is what has arrived. clock: for times without a zone. Raises DataError
@@ -241,15 +239,13 @@ def row_blocks(
                         + (hint if len(header) == 1 else "")
                     )
         if lines:
-            yield _block(path, header, columns, lines, line, clock or DeviceClock())
+            yield _block(path, header, columns, lines, line, clock)
         line, empty = line + len(lines), empty + len(lines)
     if not empty:
         raise DataError(f"{path}: holds no rows")
 
 
-def first_times(
-    path: Path, clock: DeviceClock | None = None
-) -> tuple[list[str], tuple[float, float] | None]:
+def first_times(path: Path, clock: DeviceClock) -> tuple[list[str], tuple[float, float] | None]:
     """Return the columns of a CSV and the time span, s UTC, of its first rows.
 
     Returns [] and None for standard input, which can be read only once.

@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,7 +42,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.epoch.adjustment import Adjustment, failed
-from thermocald.photogrammetry.epoch.measuring import resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 from thermocald.photogrammetry.frame.tracking import Tracker
@@ -125,11 +123,20 @@ class Predictor:
             self._recent.clear()
         self._since_begin += 1
         if self._pair is not None and self._pair[0].keeps_all and self._since_begin > _REMEMBERED:
-            self._begin_again()
+            # such a model needs all readings: begin again with the last of them
+            kept = list(self._recent)[_REMEMBERED // 2 :]
+            self._begin(*kept[0])
+            for then, reading in kept:
+                for one in self._pair:
+                    one.update(then, reading)
         if self._pair is None:
             self._begin(time, row)
-        elif time - self._recent[-1][0] > _GAP_S:
-            self._cross_gap(time, row)
+        elif (gap := time - self._recent[-1][0]) > _GAP_S:
+            # the second camera is warmer than the straight line across the gap; both ends are
+            # known: the deviation is largest in the middle
+            last, before = self._recent[-1]
+            self._pair[1].update(last + 0.1 * gap, self._warmer(before, 0.5 * gap))
+            self._pair[1].update(time - 0.1 * gap, self._warmer(row, 0.5 * gap))
         self._recent.append((time, row))
         assert self._pair is not None
         self._now = (self._pair[0].update(time, row), self._pair[1].update(time, row))
@@ -181,24 +188,6 @@ class Predictor:
         warmer = self._warmer(row, math.inf)
         self._pair[1].update(time - _LONG_S, warmer)
         self._pair[1].update(time - _CHANGED_S, warmer)
-
-    def _begin_again(self) -> None:
-        """Start again from the last readings, for a model that would need all readings."""
-        kept = list(self._recent)[_REMEMBERED // 2 :]
-        self._begin(*kept[0])
-        assert self._pair is not None
-        for time, row in kept:
-            for one in self._pair:
-                one.update(time, row)
-
-    def _cross_gap(self, time: float, row: dict[str, float]) -> None:
-        """Update the second camera through a gap, warmer than the straight line across it."""
-        assert self._pair is not None
-        last, before = self._recent[-1]
-        gap = time - last
-        # both ends are known: the deviation is largest in the middle
-        self._pair[1].update(last + 0.1 * gap, self._warmer(before, 0.5 * gap))
-        self._pair[1].update(time - 0.1 * gap, self._warmer(row, 0.5 * gap))
 
     def _warmer(self, row: Mapping[str, float], seconds: float) -> dict[str, float]:
         return {name: value + self._change(seconds) for name, value in row.items()}
@@ -404,15 +393,11 @@ class GaugeCalibrator(EpochCalibrator):
             count = 0 if seen is None else len(seen)
             return self._without_pose(epoch, now, seen, f"{count} control points are seen ({why})")
         start = None if self.pose is None else self.pose.eop
-        interior, covariance = now.camera.interior, now.camera.covariance
-        place = partial(
-            resect, self.sensor, interior, covariance, self.testfield, seen,
-            snooping_alpha=self._alpha,
-        )  # fmt: skip
-        result = place(start)
-        # the last pose is a bad start if the camera was turned by a large angle
-        if not result.ok and start is not None and len(seen) > _FEWEST and (again := place()).ok:
-            result = again
+        result = now.camera.resect(self.testfield, seen, self._alpha, start)
+        if not result.ok and start is not None and len(seen) > _FEWEST:
+            # the last pose is a bad start if the camera was turned by a large angle
+            again = now.camera.resect(self.testfield, seen, self._alpha)
+            result = again if again.ok else result
         if not result.ok:
             return self._without_pose(epoch, now, seen, f"{result.status}: {result.reason}")
         assert result.exterior is not None
@@ -492,16 +477,13 @@ class GaugeCalibrator(EpochCalibrator):
         inverse = inverse_of_determined(N)
         gain = inverse @ (A[:, EOP] / noise[:, None]).T
         lever = gain @ A[:, IOP]
-        drift = lever @ self._change_covariance(before, after) @ lever.T
-        return Movement(now.time, gain @ moved, inverse + drift)
-
-    def _change_covariance(self, before: PredictedCamera, after: PredictedCamera) -> Array:
-        """Return the covariance (10, 10) of the camera's predicted change."""
+        # the covariance of the camera's predicted change
         T = before.camera.temperature, after.camera.temperature
         _, covariance = self.thermal.steady_change(*T)
         unsure_k = math.hypot(before.temperature_sd, after.temperature_sd)
         rates, unknown = self.thermal.model.rate_vector, after.unknown - before.unknown
-        return covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
+        covariance = covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
+        return Movement(now.time, gain @ moved, inverse + lever @ covariance @ lever.T)
 
     def observe(self, calibrated: CalibratedEpoch, *_: object) -> dict[str, float]:
         """Report changes of the rows' status, and movements.

@@ -235,7 +235,8 @@ class Places(Result):
                 )
         names = list(self.names)
         if np.ptp(self.times):
-            names = [f"{n} {_utc(t):%H:%M:%S}" for n, t in zip(names, self.times, strict=True)]
+            moments = [datetime.fromtimestamp(time, UTC) for time in self.times]
+            names = [f"{n} {moment:%H:%M:%S}" for n, moment in zip(names, moments, strict=True)]
         wide = max(map(len, names), default=4)
         lines = [pose, f"{'':{wide}}  X ± sd, Y ± sd, Z ± sd in {self.unit}; thermal correction mm"]
         for name, p, sd, shift in zip(names, self.points, self.sd, self.shift_mm, strict=True):
@@ -244,7 +245,7 @@ class Places(Result):
         for one in self.levels:
             said = f"level of {one.places} places: {one.level:.{digits}f} ± {one.sd:.{digits}f}"
             lines.append(
-                f"{_utc(one.time):%Y-%m-%d %H:%M:%S} UTC, {said} {self.unit}"
+                f"{datetime.fromtimestamp(one.time, UTC):%Y-%m-%d %H:%M:%S} UTC, {said} {self.unit}"
                 + (f", sigma0 {one.sigma0:.2f}" if one.places > 1 else "")
                 + (": the places contradict each other" if one.contradicted else "")
             )
@@ -289,7 +290,7 @@ def measure_places(
     sensor = camera.model.sensor
     pose = control.pose(then[0])
     image, sigmas = observed[:, :2], observed[:, 2:]
-    without, _ = place_on(sensor, pose.values, pose.covariance, image, sigmas, surface)
+    without, _ = then[0].on_plane(image, pose, surface, sigmas)
     states = pose.values + np.pad(now.values - then.values, ((0, 0), (0, 6)))
     points, covariance = place_on(
         sensor, states[member], pose.covariance, image, sigmas, surface, now.covariance, member
@@ -362,10 +363,6 @@ def _reliability(
             names.append(control.field.names[target])
             worst = max(worst, float(largest.max()))
     return tuple(names), worst
-
-
-def _utc(time: float) -> datetime:
-    return datetime.fromtimestamp(time, UTC)
 
 
 def _levels(

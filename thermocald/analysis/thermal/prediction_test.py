@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
     from thermocald.physics.effect import Prediction
     from thermocald.physics.model import ThermalModel
-    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -68,11 +67,11 @@ _ITERATIONS = 8
 
 def average_residuals(
     series: ReducedSeries, prediction: Prediction
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the weighted mean of measured minus predicted image points (T, 2) px.
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return measured minus predicted image points (E, T, 2) px, and their weighted mean (T, 2).
 
-    Also returns its weights (T, 2), and which targets (T,) the model moves; of these only the
-    epochs before their movement count.
+    Also returns the mean's weights (T, 2), and which targets (T,) the model moves; of these only
+    the epochs before their movement count.
     """
     moved = np.zeros(len(series.source.field), dtype=bool)
     use = series.weights[..., :2]
@@ -81,18 +80,14 @@ def average_residuals(
         if active.any():
             use = use.copy()
             use[np.ix_(active, rows)] = 0.0
-    left = series.source.grid.points - project_targets(series, prediction)
-    total = np.einsum("etc,etc->tc", use, np.where(use > 0, left, 0.0))
-    weight = use.sum(axis=0)
-    return total / np.where(weight > 0, weight, 1.0), weight, moved
-
-
-def project_targets(series: ReducedSeries, prediction: Prediction) -> Array:
-    """Return the model's image points (E, T, 2) px."""
     points = series.source.field.points
     if prediction.moves_points:
         points = prediction.points(points, slice(None))
-    return project(series.source.sensor, prediction.iop, prediction.eop, points)
+    seen = project(series.source.sensor, prediction.iop, prediction.eop, points)
+    left = series.source.grid.points - seen
+    total = np.einsum("etc,etc->tc", use, np.where(use > 0, left, 0.0))
+    weight = use.sum(axis=0)
+    return left, total / np.where(weight > 0, weight, 1.0), weight, moved
 
 
 def estimate_level(
@@ -127,7 +122,7 @@ def estimate_level(
         for k, (s, m) in enumerate(zip(series, models, strict=True)):
             now = placed(m, k)
             prediction = now.predict(s.history, s.source.field)
-            mean, weight, _ = average_residuals(s, prediction)
+            _, mean, weight, _ = average_residuals(s, prediction)
             at = linearise(s.source.sensor, s.source.field, prediction.iop.mean(axis=0), eops[k])
             columns = np.concatenate([np.arange(n), n + 6 * k + np.arange(6)])
             A = at.A[:, :, 10 - n :]
@@ -239,33 +234,29 @@ def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     for effect in sorted(listed, key=lambda e: catalogue.get(e.name).is_event):
         fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search=False)))
     fit = fitter.fit(without_chance_events(fitter, fit))
-    own = {
-        term.effect: _own_values(model, series, fit, i)
-        for i, term in enumerate(fit.terms)
-        if term.is_separate
-    }
+    own: dict[str, dict[str, float]] = {}
+    for number, term in enumerate(fit.terms):
+        if not term.is_separate:
+            continue
+        kind = term.kind
+        found = coefficients_of(fit, [b for b in fit.blocks if b.term == number], series.scale)
+        columns = {n: kind.column(n) for n in kind.linear if kind.column(n) in found}
+        if kind.is_periodic:
+            # the phase alone, opposite if the fitted amplitude is
+            size = {
+                n: found[c][0] * series.scale[COLUMNS.index(c)] ** 2 for n, c in columns.items()
+            }
+            along = sum(v * model.value(f"{term.effect}.{n}") for n, v in size.items())
+            (key,) = kind.fresh
+            own[term.effect] = {key: found["phase"][0] + (0.0 if along > 0.0 else float(np.pi))}
+        else:
+            # an event's time and height, 0 if there is none
+            height = {n: found[column][0] for n, column in columns.items()}
+            times = dict(term.fresh[0] or ())
+            middle = {n: series.locate(float(time))[1] for n, time in times.items()}
+            own[term.effect] = {**dict.fromkeys(kind.linear, 0.0), **height, **middle}
     effects = (replace(e, values={**e.values, **own.get(e.name, {})}) for e in model.effects)
     return replace(model, effects=tuple(effects))
-
-
-def _own_values(
-    model: ThermalModel, series: ReducedSeries, fit: Fit, number: int
-) -> dict[str, float]:
-    """Return the phase of a fitted cycle, or time and height of an event, 0 if there is none."""
-    term = fit.terms[number]
-    kind = term.kind
-    blocks = [b for b in fit.blocks if b.term == number]
-    found = coefficients_of(fit, blocks, series.scale)
-    columns = {n: kind.column(n) for n in kind.linear if kind.column(n) in found}
-    if not kind.is_periodic:
-        height = {n: found[column][0] for n, column in columns.items()}
-        times = dict(term.fresh[0] or ())
-        middle = {n: series.locate(float(time))[1] for n, time in times.items()}
-        return {**dict.fromkeys(kind.linear, 0.0), **height, **middle}
-    (key,) = kind.fresh
-    size = {n: found[c][0] * series.scale[COLUMNS.index(c)] ** 2 for n, c in columns.items()}
-    along = sum(v * model.value(f"{term.effect}.{n}") for n, v in size.items())
-    return {key: found["phase"][0] + (0.0 if along > 0.0 else float(np.pi))}
 
 
 NORMAL_95 = 1.959964  # standard deviations of a 95 % band
@@ -300,16 +291,23 @@ def predicted_error(
             f"px), {source.name} of {source.camera} ({source.sensor.width}×"
             f"{source.sensor.height} px): a thermal model belongs to one camera"
         )
-    series = _as_fitted(model, series)
+    # the model's T₀ and reference, whichever column comes first
+    history = series.history
+    reference = next(iter(model.validity), history.reference)
+    if reference not in history.readings:
+        raise DataError(
+            f"{source.name}: has no temperature column {reference!r}, which the model was fitted "
+            f"on; there are: {', '.join(history.readings)}"
+        )
+    series = series.in_basis(model.distortion)
+    series = replace(series, history=replace(history, T0=model.T0, reference=reference))
     index = source.field.index
     rows = np.array([index[t] for t in targets_of(model.effects) if t in index], dtype=np.int64)
     model = _of_series(model, series, rows)
     history = series.readings_history
     prediction = model.predict(history, source.field)
-    mean, _, _ = average_residuals(series, prediction)
-    weights = series.weights[..., :2]
-    used = weights > 0
-    residuals = source.grid.points - project_targets(series, prediction)
+    residuals, mean, _, _ = average_residuals(series, prediction)
+    used = series.weights[..., :2] > 0
     if len(rows):
         # the step of a moved target is no gross error
         near = np.abs(np.nan_to_num(residuals[:, rows] - mean[rows])) < 1.0
@@ -329,19 +327,6 @@ def predicted_error(
     scale = source.sensor.pixel_pitch / model.interior.c * 10_000.0
     floor_px = float(np.sqrt(np.mean(floor[used])))
     return PredictedError(source.series or source.name, rms, floor_px, coverage, rms * scale)
-
-
-def _as_fitted(model: ThermalModel, series: ReducedSeries) -> ReducedSeries:
-    """Return the series with the model's T₀ and reference, whichever column comes first."""
-    history = series.history
-    reference = next(iter(model.validity), history.reference)
-    if reference not in history.readings:
-        raise DataError(
-            f"{series.source.name}: has no temperature column {reference!r}, which the model was "
-            f"fitted on; there are: {', '.join(history.readings)}"
-        )
-    series = series.in_basis(model.distortion)
-    return replace(series, history=replace(history, T0=model.T0, reference=reference))
 
 
 def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int64]) -> ThermalModel:

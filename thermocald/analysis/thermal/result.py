@@ -21,7 +21,6 @@ from thermocald.analysis.thermal.prediction_test import (
     average_residuals,
     estimate_level,
     image_partials,
-    project_targets,
     thermometer_noise,
 )
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -93,7 +92,11 @@ def examine_rest(
             continue
         found = found or (a.misfit_px > _MATERIAL * e.sigma_px and (examined or s not in short))
         power = _power(a)
-        unknowns += _carried(fitter, fit, s, a, power)
+        # what the misfit adds to the covariance of the unknowns
+        X, V, places = fitter.tangent(fit, fit.searched, s)
+        _, _, B = fit.weightings[s].scan(a.trajectories[:, :, None], a.directions, (X, V))
+        lever = fit.covariance @ np.einsum("jdr,rk->jkd", B, np.eye(size)[places])
+        unknowns += np.einsum("jkd,jde,jle->kl", lever, power, lever)
         N = e.N.mean(axis=0)
         taken = inverse_of_determined(N[np.ix_(free, free)]) @ N[free] @ a.directions
         half = np.mean(a.trajectories**2, axis=1)
@@ -120,16 +123,6 @@ def _power(a: Adequacy) -> Array:
     power = np.einsum("j,jd,je->jde", np.minimum(ratio, 4.0), along, along)
     rest = strongest - np.minimum(ratio, 4.0) * own
     total: Array = power + np.einsum("j,d,e->jde", rest / (shape @ shape), shape, shape)
-    return total
-
-
-def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power: Array) -> Array:
-    """Return the covariance (K + L, K + L) that one series' misfit adds to the fit's unknowns."""
-    X, V, places = fitter.tangent(fit, fit.searched, series)
-    _, _, B = fit.weightings[series].scan(a.trajectories[:, :, None], a.directions, (X, V))
-    T = np.eye(len(fit.covariance))[places]
-    lever = fit.covariance @ np.einsum("jdr,rk->jkd", B, T)
-    total: Array = np.einsum("jkd,jde,jle->kl", lever, power, lever)
     return total
 
 
@@ -236,10 +229,14 @@ def _assess(
     A = image_partials(s, np.zeros(0, dtype=np.int64))
     for share, of_targets in thermometer_noise(s, model, A, reading_sd)[0]:
         variance += float(share.mean() * of_targets.mean())
+    # the residuals less a constant per target
+    left, mean, _, moved = average_residuals(s, model.predict(s.readings_history, s.source.field))
+    use = (s.weights[..., :2] > 0) & ~moved[:, None]
+    rms = float(np.sqrt(np.sum((left - mean)[use] ** 2) / max(int(use.sum()), 1)))
     return SeriesFit(
         s.source.series or s.source.name,
         int(s.source.per_row[s.n > 0].sum()),
-        _rms(s, model),
+        rms,
         reading_sd * averaged,
         None if s.source.counts is None else int((s.n > 0).sum()),
         float(np.sqrt(variance)),
@@ -253,7 +250,7 @@ def build_camera(
     listed: Sequence[ModelEffect],
     growth: NoiseGrowth | None,
     moved: Sequence[Moved],
-    distortion_sigmas: float | None = None,
+    distortion_sigmas: float | None,
 ) -> ThermalCamera:
     """Build the thermal camera of a fit; its events and phases are those of the first series.
 
@@ -392,15 +389,6 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
     empty = np.diag(M) <= 0
     M[empty, empty] = 1e12  # a coefficient of a series that does not take part
     return M
-
-
-def _rms(series: ReducedSeries, model: ThermalModel) -> float:
-    """Return the RMS px of measured minus predicted image points, less a constant per target."""
-    prediction = model.predict(series.readings_history, series.source.field)
-    mean, _, moved = average_residuals(series, prediction)
-    left = series.source.grid.points - project_targets(series, prediction) - mean
-    use = (series.weights[..., :2] > 0) & ~moved[:, None]
-    return float(np.sqrt(np.sum(left[use] ** 2) / max(int(use.sum()), 1)))
 
 
 def _with_event_sd(effect: ModelEffect, series: ReducedSeries) -> ModelEffect:

@@ -85,21 +85,6 @@ Track = tuple["NDArray[np.int64]", "Array"]
 """One frame's features that follow the common movement: rows (n,), image points (n, 2) px."""
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMovement:
-    """The movement that a frame shows beyond the model's prediction.
-
-    values (4,): turns about the camera's x, y and z axes in rad, change of the principal distance
-    in mm; covariance (4, 4); locked (4,): the part of the sds that more frames do not reduce;
-    follow (n,): which features share the movement.
-    """
-
-    values: Array
-    covariance: Array
-    locked: Array
-    follow: NDArray[np.bool_]
-
-
 def detect_features(reference: NDArray[Any]) -> NDArray[np.float32]:
     """Detect features (F, 2) px in a reference frame (H, W). Raises DataError for too few."""
     corners = cv2.goodFeaturesToTrack(
@@ -135,10 +120,13 @@ def track_features(
 
 def estimate_movement(
     then: Camera, now: Camera, points: Array, moved: Array, seed: int = 0
-) -> SceneMovement | None:
+) -> tuple[Array, Array, Array, NDArray[np.bool_]] | None:
     """Estimate the movement that features share beyond the prediction; None if too few share it.
 
     then, now: the predicted cameras; points (n, 2) px in the reference frame; moved (n, 2) px.
+    Returns turns about the camera's x, y and z axes in rad and the change of the principal distance
+    in mm (4,), their covariance (4, 4), the part of their sds that more frames do not reduce (4,),
+    and which features (n,) share the movement.
     """
     predicted = then.as_seen_by(points, now.interior) - points
     left = moved - predicted
@@ -174,7 +162,7 @@ def estimate_movement(
     covariance = inverse @ (score.T @ score) @ inverse * groups / max(groups - 2, 1)
     covariance += _LOCKED_PX**2 * np.eye(4)
     whole = covariance / np.outer(scale, scale)
-    return SceneMovement(x / scale, whole, _LOCKED_PX / scale, weight > 0)
+    return x / scale, whole, _LOCKED_PX / scale, weight > 0
 
 
 def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
@@ -195,10 +183,12 @@ def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
 class SceneCourse(Result):
     """The movements of a scene over a series of frames, beyond a thermal model's prediction.
 
-    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and covariance (E, 4, 4) as in
-    `SceneMovement`, NaN for a frame without a common movement; unsure (E, 4): sds of the predicted
-    change since the reference frame; features (E,): that share the movement; reasons (E): why a
-    frame has none; locked (4,) as in `SceneMovement`; pitch_rad: the angle of a pixel.
+    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4): turns about the camera's x, y
+    and z axes in rad, change of the principal distance in mm; covariance (E, 4, 4); both are NaN
+    for a frame without a common movement; unsure (E, 4): sds of the predicted change since the
+    reference frame; features (E,): that share the movement; reasons (E): why a frame has none;
+    locked (4,): the part of the sds that more frames do not reduce; pitch_rad: the angle of a
+    pixel.
     """
 
     camera: str
@@ -255,18 +245,32 @@ class SceneCourse(Result):
         least = _LEAST_PX * float(self.locked[3]) / _LOCKED_PX
         if len(rows) < 4 or float(np.sqrt(np.mean(self.values[rows, 3] ** 2))) < least:
             return False
-        return self._has_smooth_course(rows) or self._has_course(rows)
+        # c less the prediction; the reference frame's noise is common to all, and the prediction's
+        # error is one number times its sds
+        y, variance = self.values[rows, 3], self.covariance[rows, 3, 3]
+        noise = np.diag(variance) + float(np.median(variance))
+        errors = self.unsure[rows, 3] * np.sign(self.temperatures[rows] - self.temperatures[0])
+        known = np.outer(errors, errors)
+        if self._has_smooth_course(rows, y, noise, known):
+            return True
+        # another systematic course; the noise is that of the differences from both neighbours' mean
+        bends = np.diff(y, 2) ** 2 / (variance[2:] + 4.0 * variance[1:-1] + variance[:-2])
+        factor = max(1.0, float(bends.mean()))
+        whole = float(y @ np.linalg.solve(factor * noise + known, y))
+        return whole / len(rows) > _f_bound(len(rows), factor, len(rows) / 2.0)
 
-    def _has_smooth_course(self, rows: NDArray[np.int64]) -> bool:
+    def _has_smooth_course(
+        self, rows: NDArray[np.int64], y: Array, noise: Array, known: Array
+    ) -> bool:
         """Test whether c changes with temperature, its square, time, or since the reference frame.
 
-        The noise is estimated from the residuals. Four parameters describe all frames together, so
-        that the effect does not count as noise: one that no single frame shows is found.
+        y (n,): c less the prediction, with covariances from noise and from the prediction. The size
+        of the noise is estimated from the residuals. Four parameters describe all frames together,
+        so that the effect does not count as noise: one that no single frame shows is found.
         """
         T, hours = self.temperatures[rows] - self.temperatures[0], self.times[rows] - self.times[0]
         A = np.column_stack([np.ones(len(T)), T, T**2, hours])
         A = A / np.maximum(np.abs(A).max(axis=0), 1e-9)
-        y, noise, known = self._beside(rows)
         weight = np.linalg.inv(noise)
         N = A.T @ weight @ A
         rank = int(np.linalg.matrix_rank(N, hermitian=True))
@@ -279,23 +283,6 @@ class SceneCourse(Result):
         right = A.T @ weight @ y
         explained = float(right @ np.linalg.pinv(A.T @ weight @ A, hermitian=True) @ right)
         return explained / rank > _f_bound(rank, factor, free)
-
-    def _has_course(self, rows: NDArray[np.int64]) -> bool:
-        """Test whether c changes systematically; noise: differences from both neighbours' mean."""
-        y, noise, known = self._beside(rows)
-        v = self.covariance[rows, 3, 3]
-        bends = np.diff(y, 2) ** 2 / (v[2:] + 4.0 * v[1:-1] + v[:-2])
-        factor = max(1.0, float(bends.mean()))
-        whole = float(y @ np.linalg.solve(factor * noise + known, y))
-        return whole / len(rows) > _f_bound(len(rows), factor, len(rows) / 2.0)
-
-    def _beside(self, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-        """Return c less the prediction (n,), its covariance from noise and from the prediction."""
-        variance = self.covariance[rows, 3, 3]
-        known = self.unsure[rows, 3] * np.sign(self.temperatures[rows] - self.temperatures[0])
-        # the reference frame's noise is common to all
-        noise = np.diag(variance) + float(np.median(variance))
-        return self.values[rows, 3], noise, np.outer(known, known)
 
     @cached_property
     def movements(self) -> list[tuple[int, Array, Array]]:
@@ -431,10 +418,9 @@ def follow_scene(
         except ImageError as error:
             reasons[k] = str(error)
         if found is not None:
-            follow = found.follow
+            values[k], covariance[k], locked, follow = found
             tracks[k] = rows[follow], points[rows][follow] + moved[follow]
-            values[k], covariance[k] = found.values, found.covariance
-            count[k], locked = int(follow.sum()), found.locked
+            count[k] = int(follow.sum())
         advance(1)
     if recording is not None:
         write_scene(recording, along[0], log, times, points, tracks)

@@ -261,14 +261,20 @@ class ThermalCamera(Result):
 
         temperature_sd K: is propagated into the covariance; channels: °C of other thermometers, for
         a model that uses them. Warns outside the model's validity; raises UsageError far outside it
-        (unless `extrapolate`), also for a temperature that looks like Fahrenheit.
+        (unless `extrapolate`), also for a temperature that looks like Fahrenheit and for a
+        thermometer that the model does not know.
         """
         T = float(temperature)
         if math.isnan(T):
             raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
-        if channels is not None:
-            self._require_channels(channels)
+        known = list(dict.fromkeys([*self.model.validity, *self.channels]))
+        for name, value in (channels or {}).items():
+            if name not in known:
+                there = ", ".join(known) or "none"
+                raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
+            if not math.isfinite(value):
+                raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
         values, slope, J = steady_camera(self.model, self.parameters, channels, T)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
         (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
@@ -389,16 +395,6 @@ class ThermalCamera(Result):
                 outside = np.maximum(outside, beyond)
                 drift = drift + np.abs(beyond[:, None] * own)
         return outside, variance + drift**2
-
-    def _require_channels(self, given: Mapping[str, float]) -> None:
-        """Raise UsageError for thermometers that the model does not know, or without a reading."""
-        known = list(dict.fromkeys([*self.model.validity, *self.channels]))
-        for name, value in given.items():
-            if name not in known:
-                there = ", ".join(known) or "none"
-                raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
-            if not math.isfinite(value):
-                raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.

@@ -235,6 +235,12 @@ def test_without_covariances_there_is_a_note_instead_of_a_monte_carlo(warm_up):
     assert "No epoch has a covariance matrix" in " ".join(camera.notes)
 
 
+@pytest.mark.parametrize("drift", [{}, {"x0": 1e-3}])
+def test_errors_on_the_plane_that_are_the_epochs_noise_are_told(warm_up, drift):
+    notes = " ".join(study([warm_up(drift)()], SETTINGS).cameras[0].notes)
+    assert ("mostly the noise of an epoch's calibration" in notes) == (not drift)
+
+
 def blur(f, f_number, focus, distance):
     """Return the diameter of the blur circle of a thin lens."""
     image, other = (f * s / (s - f) for s in (focus, distance))

@@ -48,7 +48,7 @@ from thermocald.analysis.study.montecarlo import (
     trajectories,
 )
 from thermocald.errors import GeometryError
-from thermocald.numbers import parameter_label
+from thermocald.numbers import parameter_label, percent
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
 
 if TYPE_CHECKING:
@@ -144,6 +144,7 @@ def depth_of_field(
 _COURSE = 500
 _GAP_IN_INTERVALS = 1.5
 _LEAST_DEPENDENCE = 4
+_MOSTLY_NOISE = 0.5  # of the variance of the errors in object space
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,13 +478,15 @@ def study_camera(
     notes: list[str] = []
     studies = tuple(study_series(one, settings) for one in series)
     iop = np.mean([one.mean for one in series], axis=0)
-    squares, degrees = np.zeros(10), np.zeros(10)
+    squares, noise, degrees = np.zeros(10), np.zeros(10), np.zeros(10)
     for one in series:
         for name in one.free:
             k = IOP_NAMES.index(name)
-            squares[k] += np.var(one.column(name)[0]) * len(one)
+            values, of_epochs = one.column(name)
+            squares[k] += np.var(values) * len(one)
+            noise[k] += np.mean(of_epochs**2) * (len(one) - 1)
             degrees[k] += len(one) - 1
-    sds = np.sqrt(squares / np.maximum(degrees, 1))
+    sds, noise = (np.sqrt(total / np.maximum(degrees, 1)) for total in (squares, noise))
     correlations = median_correlations([one.correlations for one in series])
     if correlations is None:
         notes.append(
@@ -506,6 +509,14 @@ def study_camera(
             below = np.mean(shares_within(axes, settings.clusters_mm), axis=0)
             shares = np.diff(below, prepend=0.0, append=1.0)
             first_order = FirstOrder(covariance, *mean_and_largest(axes, settings.sets), shares)
+            root = draw_root(noise, correlation)
+            by_noise = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
+            share = np.trace(by_noise.sum(axis=0)) / np.trace(covariance.sum(axis=0))
+            if share > _MOSTLY_NOISE:
+                notes.append(
+                    f"The errors on the plane are mostly the noise of an epoch's calibration "
+                    f"({percent(min(share, 1.0))} of their variance), not changes of the camera."
+                )
         except GeometryError as error:
             notes.append(f"No Monte-Carlo: {error}.")
     if montecarlo is not None and montecarlo.folded:

@@ -26,6 +26,18 @@ def test_the_sheets_of_a_corner_are_separated(layout):
     assert (labels == labels[:, :1]).all()
 
 
+@pytest.mark.parametrize("planes", [2, 3])
+@pytest.mark.parametrize("stretch", [1.0, 1.5])
+@pytest.mark.parametrize("inset", [20.0, 45.0, 100.0])
+def test_four_targets_on_each_wall_are_plates(planes, stretch, inset):
+    """Regression: the inner four of two walls formed a plate, or none had a normal."""
+    field, normals = corner_field(per_side=2, inset=inset)
+    some = slice(4 * planes)
+    points = field.points[some] * [1.0, 1.0, stretch]
+    points += np.random.default_rng(2).normal(0, 0.2, points.shape)
+    assert np.all(np.abs(np.sum(target_normals(points) * normals[some], axis=1)) > 0.999)
+
+
 def test_two_boards_on_one_wall_and_a_loose_target():
     rng = np.random.default_rng(1)
     board = 50.0 * np.stack(np.meshgrid(np.arange(4), np.arange(4), 0), axis=-1).reshape(-1, 3)

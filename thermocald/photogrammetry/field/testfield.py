@@ -8,8 +8,8 @@ A test field's file states neither its boards nor its targets' normals. We searc
 with the most targets, with a tolerance from the field's spacing and the errors of its coordinates.
 Groups far apart in one plane are different boards; boards that touch in one plane count as one. A
 target's normal is that of the plane through its nearest neighbours on the same board, so that a
-board may be slightly bent. A target on no board and no small plate has no normal; its eccentricity
-cannot be computed and is neglected.
+board may be slightly bent. Four targets in a parallelogram are a plate, that of its corners. A target on
+no board and no plate has no normal; its eccentricity cannot be computed and is neglected.
 
 Source: planes are found one after the other as by Fischler, Bolles (1981), Comm. ACM 24, 381-395
 (RANSAC), but with targets as seeds instead of random samples.
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -292,6 +293,7 @@ _APART = 2.5  # times the distance between neighbours; farther is another board
 _SEEDS = 60
 _LOCAL = 8  # nearest targets on a board, for a normal
 _PLATE = 4  # targets of a small plate, or at the rim of a board
+_SKEW = 0.1  # of the spacing, by which the targets of a plate may miss a parallelogram
 _LOOSE = 0.03  # flatness of a target and its nearest, as a share of the spacing, without a board
 _COMPACT = 1.6  # for that, the largest ratio of their distances
 
@@ -315,6 +317,8 @@ def target_normals(points: Array) -> Array:
     reach = np.linalg.norm(points[near[:, :_PLATE]] - points[:, None], axis=2)
     spacing = float(np.median(reach[:, 1]))
     normals = sheet_normals(points, _sheets(points, 0.0), _LOCAL)
+    for plate in _plates(points, near, np.isnan(normals[:, 0]), _SKEW * spacing):
+        normals[plate] = plane_fit(points[plate])[1][2]
     for row in np.flatnonzero(np.isnan(normals[:, 0])):
         local = points[near[row, :_PLATE]]
         spread = local - local.mean(axis=0)
@@ -326,6 +330,33 @@ def target_normals(points: Array) -> Array:
         ):
             normals[row] = axes[2]
     return normals
+
+
+def _plates(
+    points: Array, near: NDArray[np.int64], loose: NDArray[np.bool_], tolerance: float
+) -> list[list[int]]:
+    """Return the plates of four targets in a parallelogram, among loose targets (n,), by size.
+
+    Of each target the smallest parallelogram at whose corner it is. Where two plates meet at an
+    edge, their inner targets may form a smaller one across it, but the outer ones cannot; so the
+    larger of two plates with a common target is the true one.
+    """
+    rows, found = np.flatnonzero(loose), []
+    for row in rows.tolist():
+        beside = near[row, 1:][loose[near[row, 1:]]][:_PLATE]
+        for u, v in combinations(points[beside] - points[row], 2):
+            size = float(u @ u + v @ v)
+            corners = points[row] + np.array([0 * u, u, v, u + v])
+            away = np.linalg.norm(points[rows] - corners[:, None], axis=2)
+            in_a_row = np.linalg.norm(np.cross(u, v)) < 0.1 * size
+            if away[3].min() < tolerance and not in_a_row:
+                found.append((size, row, rows[away.argmin(axis=1)].tolist()))
+    smallest = {row: (size, plate) for size, row, plate in sorted(found, reverse=True)}
+    plates: list[list[int]] = []
+    for _, plate in sorted(smallest.values(), reverse=True):
+        if not any(row in plate for other in plates for row in other):
+            plates.append(plate)
+    return plates
 
 
 def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Array:

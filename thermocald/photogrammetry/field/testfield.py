@@ -8,8 +8,8 @@ A test field's file states neither its boards nor its targets' normals. We searc
 with the most targets, with a tolerance from the field's spacing and the errors of its coordinates.
 Groups far apart in one plane are different boards; boards that touch in one plane count as one. A
 target's normal is that of the plane through its nearest neighbours on the same board, so that a
-board may be slightly bent. Four targets in a parallelogram are a plate, that of its corners. A target on
-no board and no plate has no normal; its eccentricity cannot be computed and is neglected.
+board may be slightly bent. Four targets in a parallelogram are a plate with a normal of its own. A
+target on no board and no plate has no normal; its eccentricity cannot be computed and is neglected.
 
 Source: planes are found one after the other as by Fischler, Bolles (1981), Comm. ACM 24, 381-395
 (RANSAC), but with targets as seeds instead of random samples.

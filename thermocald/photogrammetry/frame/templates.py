@@ -64,10 +64,31 @@ class Templates:
         inside = ((clicks.points >= low) & (clicks.points < high)).all(axis=1)
         self._rows = clicks.targets[inside]
         pairs = zip(clicks.points[inside], clicks.sigmas[inside], strict=True)
-        meant = [_define(reference, point, sigma) for point, sigma in pairs]
+        # a click defines a centre of symmetry near it, or else is the point itself
+        meant = []
+        for click, sigma in pairs:
+            farthest = _FARTHEST_CLICK * float(sigma.max())
+            found = (_find_centre(reference, click, half, farthest) for half in _SYMMETRIC)
+            centres = [centre for centre in found if centre is not None]
+            default = click, np.diag(sigma**2)
+            meant.append(max(centres, key=lambda c: c[2])[:2] if centres else default)
         self._points = np.array([point for point, _ in meant]).reshape(-1, 2)
         self._defined = np.array([C for _, C in meant]).reshape(-1, 2, 2)
-        self._prepare(reference)
+        # the patches, and their steps of least squares
+        v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
+        spline = _spline(reference, self._points, _HALF + 8)
+        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
+        every = np.arange(len(self._points))
+        grey = _sampled(spline, every, np.hstack([self._points, unturned]), u, v)
+        self._grey, self._grid = grey, (u.ravel(), v.ravel())
+        self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
+        gy, gx = np.gradient(grey, axis=(1, 2)) if len(grey) else (grey, grey)
+        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, grey, np.ones_like(grey)]
+        J = np.stack(flat, axis=-1).reshape(len(grey), self._weight.size, 8)
+        weighted = J * self._weight.reshape(-1, 1)
+        N = np.linalg.pinv(np.swapaxes(weighted, -1, -2) @ J, rcond=1e-9, hermitian=True)
+        self._step = N @ np.swapaxes(weighted, -1, -2)
+        self._sandwich = (self._step @ np.swapaxes(self._step, -1, -2))[:, :2, :2]
         self.reset()
 
     @classmethod
@@ -132,23 +153,6 @@ class Templates:
             return Measurement(seen, FrameStatus("too_few", f"not recognised: {names}"), missed)
         self._reach = _TRACKED_PX
         return Measurement(seen, OK, missed)
-
-    def _prepare(self, reference: NDArray[Any]) -> None:
-        """Cut out the patches, and compute their steps of least squares."""
-        v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
-        spline = _spline(reference, self._points, _HALF + 8)
-        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
-        every = np.arange(len(self._points))
-        grey = _sampled(spline, every, np.hstack([self._points, unturned]), u, v)
-        self._grey, self._grid = grey, (u.ravel(), v.ravel())
-        self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
-        gy, gx = np.gradient(grey, axis=(1, 2)) if len(grey) else (grey, grey)
-        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, grey, np.ones_like(grey)]
-        J = np.stack(flat, axis=-1).reshape(len(grey), self._weight.size, 8)
-        weighted = J * self._weight.reshape(-1, 1)
-        N = np.linalg.pinv(np.swapaxes(weighted, -1, -2) @ J, rcond=1e-9, hermitian=True)
-        self._step = N @ np.swapaxes(weighted, -1, -2)
-        self._sandwich = (self._step @ np.swapaxes(self._step, -1, -2))[:, :2, :2]
 
     def _match(
         self, image: NDArray[Any], reach: int, rows: NDArray[np.int64] | slice
@@ -280,16 +284,6 @@ def _basis(x: Array, size: int) -> tuple[NDArray[np.int64], list[Array]]:
     t3, s3 = t2 * t / 6, s2 * s / 6
     weights = [s3, 2 / 3 - t2 + 3 * t3, 2 / 3 - s2 + 3 * s3, t3]
     return whole.astype(np.int64) - 1, weights
-
-
-def _define(image: NDArray[Any], click: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return the point that a click defines, and its covariance, px²: a centre of symmetry of the
-    image near the click, or else the click itself.
-    """
-    farthest = _FARTHEST_CLICK * float(sigma.max())
-    found = (_find_centre(image, click, half, farthest) for half in _SYMMETRIC)
-    centres = [centre for centre in found if centre is not None]
-    return max(centres, key=lambda c: c[2])[:2] if centres else (click, np.diag(sigma**2))
 
 
 def _find_centre(

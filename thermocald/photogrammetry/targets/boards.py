@@ -259,17 +259,14 @@ def _find_board(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | Non
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0:
         grid = grid[::-1]
-    return grid if _begins_black(grey, grid) else np.ascontiguousarray(grid[::-1, ::-1])
-
-
-def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
-    """Return whether the square outside the first corner is darker than its neighbours."""
+    # black: the square outside the first corner is darker than its neighbours
     right, down = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
     around = [-right - down, right + down, right - down, down - right]
     at = np.rint(grid[0, 0] + 0.4 * np.array(around))
     x, y = np.clip(at, 0, np.array(grey.shape[::-1]) - 1).astype(int).T
     values = grey[y, x].astype(float)
-    return bool(values[:2].sum() < values[2:].sum())
+    begins_black = values[:2].sum() < values[2:].sum()
+    return grid if begins_black else np.ascontiguousarray(grid[::-1, ::-1])
 
 
 def predict_corners(

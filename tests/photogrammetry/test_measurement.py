@@ -175,7 +175,6 @@ def mixed():
     kinds, codes = ["circle"] * len(field), [""] * len(field)
     plain = TestField.build(names, points, 0.01, 15.0)
     scene = draw(plain, normals)
-    markers: dict = {}
     number = 0
     for plane in range(3):
         u, v = np.eye(3)[(plane + 1) % 3], np.eye(3)[(plane + 2) % 3]
@@ -184,7 +183,7 @@ def mixed():
             # For a viewer against the normal u × v, u is right and v up; OpenCV's order is
             # clockwise from the top left
             corners = np.array([at + 40 * v, at + 40 * u + 40 * v, at + 40 * u, at])
-            draw_marker(scene, "DICT_APRILTAG_36h11", number, corners, markers)
+            draw_marker(scene, "DICT_APRILTAG_36h11", number, corners)
             if number % 3:
                 for k in range(4):
                     names.append(f"M{number}.{k}")

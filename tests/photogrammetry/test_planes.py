@@ -28,10 +28,13 @@ def test_the_sheets_of_a_corner_are_separated(layout):
 
 @pytest.mark.parametrize("planes", [2, 3])
 @pytest.mark.parametrize("stretch", [1.0, 1.5])
-@pytest.mark.parametrize("inset", [20.0, 45.0, 100.0])
-def test_four_targets_on_each_wall_are_plates(planes, stretch, inset):
-    """Regression: the inner four of two walls formed a plate, or none had a normal."""
-    field, normals = corner_field(per_side=2, inset=inset)
+@pytest.mark.parametrize(("spacing", "inset"), [(60, 20), (60, 45), (60, 100), (300, 20)])
+def test_four_targets_on_each_wall_are_plates(planes, stretch, spacing, inset):
+    """Regression: the inner ones of several walls formed a plate or a board, or none had a normal.
+
+    (300, 20): large sheets with a target in each corner.
+    """
+    field, normals = corner_field(2, spacing, inset=inset)
     some = slice(4 * planes)
     points = field.points[some] * [1.0, 1.0, stretch]
     points += np.random.default_rng(2).normal(0, 0.2, points.shape)

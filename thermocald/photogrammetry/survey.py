@@ -283,6 +283,8 @@ def survey(
             # the nominal field shows best which sheet a target is on, as its sheets are plane
             of_field, labels = nominal.points[rows], field_sheets(nominal)[rows]
             normals = sheet_normals(expected.points, labels, _NEAREST)
+            loose = np.isnan(normals[:, 0])
+            normals[loose] = target_normals(expected.points)[loose]
         photos = _measure_again(pictures, network, expected, normals, notes, progress)
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
         network = adjust_network(

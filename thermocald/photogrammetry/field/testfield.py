@@ -316,8 +316,11 @@ def target_normals(points: Array) -> Array:
     near, _ = _neighbours(points)
     reach = np.linalg.norm(points[near[:, :_PLATE]] - points[:, None], axis=2)
     spacing = float(np.median(reach[:, 1]))
-    normals = sheet_normals(points, _sheets(points, 0.0), _LOCAL)
-    for plate in _plates(points, near, np.isnan(normals[:, 0]), _SKEW * spacing):
+    labels = _sheets(points, 0.0)
+    normals = sheet_normals(points, labels, _LOCAL)
+    # in a corner, a plate and the nearest targets of other ones may pass for a small board
+    small = np.isnan(normals[:, 0]) | (np.bincount(labels + 1)[labels + 1] <= 2 * _PLATE)
+    for plate in _plates(points, near, small, _SKEW * spacing):
         normals[plate] = plane_fit(points[plate])[1][2]
     for row in np.flatnonzero(np.isnan(normals[:, 0])):
         local = points[near[row, :_PLATE]]

@@ -162,13 +162,18 @@ class Templates:
         Returns places (n, 2) px, covariances (n, 2, 2) px², and why a patch was not found (n,).
         """
         places = self._points[rows] + self._shift
-        patches, reasons = self._grey[rows], np.full(len(places), "", dtype=object)
-        for k, patch in enumerate(patches):
-            place = _search_patch(image, patch, places[k], reach)
-            if place is None:
-                reasons[k] = "outside the frame, or in the dark"
-            else:
-                places[k] = place
+        reasons = np.full(len(places), "outside the frame, or in the dark", dtype=object)
+        for k, patch in enumerate(self._grey[rows]):
+            x, y = (round(float(c)) for c in places[k])
+            left, top = max(x - reach - _HALF, 0), max(y - reach - _HALF, 0)
+            if x < 0 or y < 0:
+                continue
+            window = image[top : y + reach + _HALF + 1, left : x + reach + _HALF + 1]
+            window = window.astype(np.float32)
+            if min(window.shape) > 2 * _HALF and cv2.meanStdDev(window)[1][0, 0] >= _LEAST_CONTRAST:
+                score = cv2.matchTemplate(window, patch.astype(np.float32), cv2.TM_CCOEFF_NORMED)
+                row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+                places[k], reasons[k] = (left + column + _HALF, top + row + _HALF), ""
         covariance = np.zeros((len(places), 2, 2))
         seen = np.flatnonzero(reasons == "")
         which = np.arange(len(self._grey))[rows][seen]
@@ -328,21 +333,6 @@ def _find_centre(
     # each pair of pixels is counted twice
     variance = 2.0 * float((weight * r**2).sum() / weight.sum())
     return p, inverse @ M @ inverse * variance * _correlated(r), symmetric
-
-
-def _search_patch(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Array | None:
-    """Return the pixel where a patch correlates best; None if out of the image or in the dark."""
-    half = patch.shape[0] // 2
-    x, y = (round(float(c)) for c in near)
-    left, top = max(x - reach - half, 0), max(y - reach - half, 0)
-    if x < 0 or y < 0:
-        return None
-    window = image[top : y + reach + half + 1, left : x + reach + half + 1].astype(np.float32)
-    if min(window.shape) <= 2 * half or cv2.meanStdDev(window)[1][0, 0] < _LEAST_CONTRAST:
-        return None
-    score = cv2.matchTemplate(window, patch.astype(np.float32), cv2.TM_CCOEFF_NORMED)
-    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-    return np.array([left + column + half, top + row + half], dtype=float)
 
 
 def _symmetry(window: Array, weight: Array) -> float:

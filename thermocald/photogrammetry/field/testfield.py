@@ -344,16 +344,16 @@ def _plates(
     edge, their inner targets may form a smaller one across it, but the outer ones cannot; so the
     larger of two plates with a common target is the true one.
     """
-    rows, found = np.flatnonzero(loose), []
-    for row in rows.tolist():
-        beside = near[row, 1:][loose[near[row, 1:]]][:_PLATE]
-        for u, v in combinations(points[beside] - points[row], 2):
+    found: list[tuple[float, int, list[int]]] = []
+    for row in np.flatnonzero(loose).tolist():
+        around = near[row, 1:][loose[near[row, 1:]]]
+        for a, b in combinations(around[:_PLATE].tolist(), 2):
+            u, v = points[a] - points[row], points[b] - points[row]
             size = float(u @ u + v @ v)
-            corners = points[row] + np.array([0 * u, u, v, u + v])
-            away = np.linalg.norm(points[rows] - corners[:, None], axis=2)
+            off = np.linalg.norm(points[around] - (points[row] + u + v), axis=1)
             in_a_row = np.linalg.norm(np.cross(u, v)) < 0.1 * size
-            if away[3].min() < tolerance and not in_a_row:
-                found.append((size, row, rows[away.argmin(axis=1)].tolist()))
+            if off.min() < tolerance and not in_a_row:
+                found.append((size, row, [row, a, b, int(around[off.argmin()])]))
     smallest = {row: (size, plate) for size, row, plate in sorted(found, reverse=True)}
     plates: list[list[int]] = []
     for _, plate in sorted(smallest.values(), reverse=True):

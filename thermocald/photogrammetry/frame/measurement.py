@@ -145,7 +145,7 @@ class _Frame:
         self._markers = self._places = locate_markers(image, testfield, self._missed)
 
     def measure(self) -> Measurement:
-        """Measure markers and squares, then the circles."""
+        """Measure markers and squares, orient the frame with them and the codes, then circles."""
         if turned := corners_turned_deg(self._markers, self._field):
             return self._other_field(_TURNED.format(turned))
         if "chess_corner" in self._field.kinds:
@@ -155,7 +155,24 @@ class _Frame:
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
             return self._finish(corners)
-        return self._measure_circles(corners)
+        rows, maps, foreign = find_coded(
+            self._image, self._field, _FEWEST, needed=len(corners) < _FEWEST
+        )
+        pairs = np.concatenate([corners.targets, rows])
+        if len(pairs) < _FEWEST:  # too few for an orientation; the circles found, as ellipses
+            fit = fit_circles(self._image, maps, have_rings(self._field, rows))
+            self._missed.update(fit.missed(rows))
+            circles = fit.observations(rows, fit.good)
+            return self._finish(corners.joined(circles), foreign=foreign)
+        try:
+            orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
+        except GeometryError as error:
+            return self._other_field(
+                f"{len(pairs)} codes of the test field are seen, but not where it has them: {error}"
+            )
+        measured, missed, orientation = self._fit_circles(orientation, corners)
+        self._missed.update(missed)
+        return self._finish(corners.joined(measured), orientation, foreign)
 
     def _second_look(self, corners: Observations) -> Observations:
         """Measure further corners at the places predicted by the orientation from the others.
@@ -193,27 +210,6 @@ class _Frame:
             camera.sensor, self._field.points[rows], points, camera.principal_distance,
             camera.interior,
         )  # fmt: skip
-
-    def _measure_circles(self, corners: Observations) -> Measurement:
-        """Orient the frame with the codes and the corners, and measure the circles."""
-        rows, maps, foreign = find_coded(
-            self._image, self._field, _FEWEST, needed=len(corners) < _FEWEST
-        )
-        pairs = np.concatenate([corners.targets, rows])
-        if len(pairs) < _FEWEST:  # too few for an orientation; the circles found, as ellipses
-            fit = fit_circles(self._image, maps, have_rings(self._field, rows))
-            self._missed.update(fit.missed(rows))
-            circles = fit.observations(rows, fit.good)
-            return self._finish(corners.joined(circles), foreign=foreign)
-        try:
-            orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
-        except GeometryError as error:
-            return self._other_field(
-                f"{len(pairs)} codes of the test field are seen, but not where it has them: {error}"
-            )
-        measured, missed, orientation = self._fit_circles(orientation, corners)
-        self._missed.update(missed)
-        return self._finish(corners.joined(measured), orientation, foreign)
 
     def _fit_circles(
         self, orientation: Orientation, corners: Observations

@@ -338,11 +338,12 @@ def target_normals(points: Array) -> Array:
 def _plates(
     points: Array, near: NDArray[np.int64], loose: NDArray[np.bool_], tolerance: float
 ) -> list[list[int]]:
-    """Return the plates of four targets in a parallelogram, among loose targets (n,), by size.
+    """Return the rows of plates: four targets each in a parallelogram, among the loose ones (n,).
 
-    Of each target the smallest parallelogram at whose corner it is. Where two plates meet at an
-    edge, their inner targets may form a smaller one across it, but the outer ones cannot; so the
-    larger of two plates with a common target is the true one.
+    near (n, k): each target and its nearest; tolerance: of the fourth corner, mm. A target's plate
+    is the smallest parallelogram at whose corner it is. Where two plates meet at an edge, their
+    inner targets may form a smaller one across it, but the outer ones cannot; so the larger of two
+    plates with a common target is the true one.
     """
     found: list[tuple[float, int, list[int]]] = []
     for row in np.flatnonzero(loose).tolist():

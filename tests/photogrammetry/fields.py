@@ -73,14 +73,14 @@ def small_field(bits: int = 14) -> tuple[TestField, np.ndarray]:
 
 
 def draw_marker(
-    scene: Scene, dictionary: str, number: int, corners: np.ndarray, markers: dict
+    scene: Scene, dictionary: str, number: int, corners: np.ndarray, border: int = 1
 ) -> None:
-    """Draw a marker with outer corners (4, 3) mm in OpenCV's order; record it in `markers`."""
+    """Draw a marker with outer corners (4, 3) mm in OpenCV's order, and a border in cells."""
     import cv2
 
     d = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    cells = d.markerSize + 2
-    image = cv2.aruco.generateImageMarker(d, number, cells)
+    cells = d.markerSize + 2 * border
+    image = cv2.aruco.generateImageMarker(d, number, cells, borderBits=border)
     a, b, _, e = corners
     for row in range(cells):
         # Each black run is one piece, without seams between its cells
@@ -89,4 +89,3 @@ def draw_marker(
             u = np.array([begin, end, end, begin])[:, None] / cells
             v = np.array([row, row, row + 1, row + 1])[:, None] / cells
             scene.patch(a + u * (b - a) + v * (e - a))
-    markers[(dictionary, number)] = corners

@@ -10,6 +10,7 @@ import pytest
 from tests.marks import mostly_slow
 from tests.photogrammetry import board_images as images
 from tests.photogrammetry import exact_rendering
+from tests.photogrammetry.fields import draw_marker
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph
 from thermocald.errors import TestFieldError
@@ -37,21 +38,12 @@ OBLIQUE = [(0.0, 0.0, 300.0), (-200.0, 50.0, 220.0), (-260.0, 90.0, 180.0)]
 def drawn_exactly(field, columns, rows, size, spacing):
     """Draw Kalibr's AprilGrid from polygons of computed area instead of a raster."""
     scene = exact_rendering.Scene(paper=205.0, ink=35.0)
-
-    def rectangle(x, y, wide, high):
-        scene.patch([(x, y, 0), (x + wide, y, 0), (x + wide, y + high, 0), (x, y + high, 0)])
-
-    gap, cell = spacing * size, size / 10
+    gap = spacing * size
     for x in np.arange(columns + 1) * (size + gap) - gap:
         for y in np.arange(rows + 1) * (size + gap) - gap:
-            rectangle(x, y, gap, gap)
+            scene.patch([(x, y, 0), (x + gap, y, 0), (x + gap, y + gap, 0), (x, y + gap, 0)])
     for tag in range(columns * rows):
-        x, y = field.points[field.index[f"{tag}.1"], :2]  # lower left
-        cells = np.rot90(markers.marker_cells("DICT_APRILTAG_36h11", tag, 2), 2)
-        for j, row in enumerate(cells):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
-            for a, b in edges.reshape(-1, 2):
-                rectangle(x + a * cell, y + size - (j + 1) * cell, (b - a) * cell, cell)
+        draw_marker(scene, "DICT_APRILTAG_36h11", tag, field.points[4 * tag : 4 * tag + 4], 2)
     return scene
 
 

@@ -16,7 +16,6 @@ from thermocald.photogrammetry.targets import image_file
 from thermocald.photogrammetry.targets.image_file import (
     EncodedImage,
     decode_grey,
-    decode_parts,
     with_comment,
 )
 
@@ -73,7 +72,7 @@ def test_segments_give_the_same_grey_values(units, grey, monkeypatch):
         return original(part, **options)
 
     monkeypatch.setattr(image_file.simplejpeg, "decode_jpeg", decode)
-    found = decode_parts(data, BOXES)
+    found = EncodedImage(data).around(BOXES, image.shape[:2])
     whole = _opencv(data)
     assert found is not None
     assert found.shape == whole.shape
@@ -92,7 +91,7 @@ def test_other_files_are_decoded_whole(options):
         data = _cv2_jpeg(_colours(), cv2.IMWRITE_JPEG_RST_INTERVAL, 21)
         at = data.index(b"\xff\xd3")
         data = data[:at] + data[at + 2 :]
-    assert decode_parts(data, np.array([[0, 200, 9, HEIGHT]])) is None
+    assert EncodedImage(data).around(np.array([[0, 200, 9, HEIGHT]]), (HEIGHT, WIDTH)) is None
 
 
 def test_a_truncated_jpeg_is_refused():

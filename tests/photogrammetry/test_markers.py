@@ -25,18 +25,16 @@ APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
 
 def _board(size=60.0):
     """Return field and scene of 4 × 3 markers in Z = 0, from alternating dictionaries."""
-    scene, markers = Scene(), {}
-    for k in range(12):
+    scene, names, points = Scene(), [(APRILTAG, ARUCO)[k % 2] for k in range(12)], []
+    for k, name in enumerate(names):
         # For a viewer along -Z, x is right and y up; OpenCV's order is clockwise from top left
         x, y = 130.0 * (k % 4), 130.0 * (k // 4)
-        corners = np.array(
-            [[x, y + size, 0], [x + size, y + size, 0], [x + size, y, 0], [x, y, 0.0]]
-        )
-        draw_marker(scene, (APRILTAG, ARUCO)[k % 2], k, corners, markers)
-    names = [f"{number}.{k}" for _, number in markers for k in range(4)]
-    codes = [f"{name}:{number}:{k}" for name, number in markers for k in range(4)]
-    points = np.concatenate(list(markers.values()))
-    return TestField.build(names, points, 0.01, np.nan, "marker_corner", codes), scene
+        square = [[x, y + size], [x + size, y + size], [x + size, y], [x, y]]
+        points.append(np.column_stack([square, np.zeros(4)]))
+        draw_marker(scene, name, k, points[-1])
+    codes = [f"{name}:{number}:{k}" for number, name in enumerate(names) for k in range(4)]
+    points = np.concatenate(points)
+    return TestField.build(codes, points, 0.01, np.nan, "marker_corner", codes), scene
 
 
 FIELD, SCENE = _board()

@@ -26,6 +26,21 @@ def test_the_sheets_of_a_corner_are_separated(layout):
     assert (labels == labels[:, :1]).all()
 
 
+@pytest.mark.parametrize("planes", [2, 3])
+@pytest.mark.parametrize("stretch", [1.0, 1.5])
+@pytest.mark.parametrize(("spacing", "inset"), [(60, 20), (60, 45), (60, 100), (300, 20)])
+def test_four_targets_on_each_wall_are_plates(planes, stretch, spacing, inset):
+    """Regression: the inner ones of several walls formed a plate or a board, or none had a normal.
+
+    (300, 20): large sheets with a target in each corner.
+    """
+    field, normals = corner_field(2, spacing, inset=inset)
+    some = slice(4 * planes)
+    points = field.points[some] * [1.0, 1.0, stretch]
+    points += np.random.default_rng(2).normal(0, 0.2, points.shape)
+    assert np.all(np.abs(np.sum(target_normals(points) * normals[some], axis=1)) > 0.999)
+
+
 def test_two_boards_on_one_wall_and_a_loose_target():
     rng = np.random.default_rng(1)
     board = 50.0 * np.stack(np.meshgrid(np.arange(4), np.arange(4), 0), axis=-1).reshape(-1, 3)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from tests.photogrammetry import network_cases as cases
+from tests.photogrammetry.exact_rendering import look_at
+from tests.photogrammetry.fields import corner_field
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
@@ -95,6 +99,20 @@ def test_bent_sheet_without_a_nominal_field(sheet):
     assert result.field.diameters == pytest.approx(np.full(len(coded), 16.0), rel=0.01)
     for name, code in zip(result.field.names, result.field.codes, strict=True):
         assert truth.codes[truth.index[name]] == code
+
+
+def test_a_corner_with_four_targets_on_each_wall():
+    """Regression: their normals were not known, and their discs not measured."""
+    truth, _ = corner_field(2, 150.0, 20.0, bits=12, coded_every=1, inset=60.0)
+    rng, middle = np.random.default_rng(5), truth.points.mean(axis=0)
+    away = [900 * d / np.linalg.norm(d) for d in 1 + rng.uniform(-0.48, 0.48, (14, 3))]
+    pictures = photograph(truth, [look_at(middle + d, middle, i) for i, d in enumerate(away)])
+    nominal = replace(truth, points=truth.points + rng.normal(0, 0.3, truth.points.shape))
+    length = float(np.linalg.norm(truth.points[0] - truth.points[-1]))
+    distance = Distance(truth.names[0], truth.names[-1], length, 0.02)
+    result = survey(pictures, [distance], 0.00224, nominal=nominal, interior=CAMERA.interior)
+    assert len(result.network.names) == 12
+    assert_true(result, truth, 1 / 10_000)
 
 
 def test_photographs_that_do_not_fit_together_are_refused(sheet):

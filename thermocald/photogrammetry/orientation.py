@@ -70,8 +70,18 @@ def approximate_orientation(
         raise GeometryError(
             f"too few targets for an orientation: {len(X)}, at least {_MINIMUM} are needed"
         )
+    if interior is not None:
+        candidates = [interior]
+    elif nominal_c is not None:
+        candidates = [InteriorOrientation(nominal_c * f) for f in (1.0, 0.97, 1.03, 0.93, 1.07)]
+    else:  # about the field of view that fits best
+        lengths = _distances(sensor, _FIELDS_OF_VIEW_DEG)
+        tried = [_robust_resection(sensor, InteriorOrientation(c), X, uv) for c in lengths]
+        c = lengths[int(np.argmin([np.inf if t is None else np.median(t[1]) for t in tried]))]
+        near = (1.0, 0.96, 1.04, 0.92, 1.08, 0.88, 1.12)
+        candidates = [InteriorOrientation(c * f) for f in near]
     best: tuple[float, InteriorOrientation, ExteriorOrientation, Mask] | None = None
-    for candidate in _interiors(sensor, X, uv, nominal_c, interior):
+    for candidate in candidates:
         found = _robust_resection(sensor, candidate, X, uv)
         if found is None:
             continue
@@ -86,26 +96,6 @@ def approximate_orientation(
             "these images, and its units (mm)"
         )
     return best[1:]
-
-
-def _interiors(
-    sensor: Sensor,
-    X: Array,
-    uv: Array,
-    nominal_c: float | None,
-    interior: InteriorOrientation | None,
-) -> list[InteriorOrientation]:
-    if interior is not None:
-        return [interior]
-    if nominal_c is not None:
-        return [InteriorOrientation(nominal_c * f) for f in (1.0, 0.97, 1.03, 0.93, 1.07)]
-    coarse = [InteriorOrientation(c) for c in _distances(sensor, _FIELDS_OF_VIEW_DEG)]
-    scores = []
-    for candidate in coarse:
-        found = _robust_resection(sensor, candidate, X, uv)
-        scores.append(np.inf if found is None else float(np.median(found[1])))
-    c = coarse[int(np.argmin(scores))].c
-    return [InteriorOrientation(c * f) for f in (1.0, 0.96, 1.04, 0.92, 1.08, 0.88, 1.12)]
 
 
 def _distances(sensor: Sensor, views_deg: Sequence[float]) -> list[float]:

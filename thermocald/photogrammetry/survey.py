@@ -97,22 +97,11 @@ def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) 
     rows = np.array([nominal.index[name] for name in network.names])
     points = nominal.points.copy()
     others = np.setdiff1d(np.arange(len(nominal)), rows)
-    if len(others):
-        points[others] += _neighbours_shift(
-            nominal.points[rows], network.points - nominal.points[rows], nominal.points[others]
-        )
-    points[rows] = network.points
-    moved = replace(nominal, points=points)
-    return moved.subset(np.sort(rows)) if trusted_only else moved
-
-
-def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
-    """Interpolate the known points' shifts (n, 3) mm at the wanted points by local planes.
-
-    Weights are inverse squares of the distance, so that a fold in the paper is preserved.
-    """
-    result = np.empty((len(wanted), 3))
-    for i, x in enumerate(wanted):
+    known, shifts = nominal.points[rows], network.points - nominal.points[rows]
+    # the shifts (n, 3) mm are interpolated by local planes, whose weights are inverse squares of
+    # the distance, so that a fold in the paper is preserved
+    for row in others:
+        x = nominal.points[row]
         d = np.linalg.norm(known - x, axis=1)
         near = np.argsort(d)[:12]
         weight = 1.0 / (d[near] + 1e-3 * d[near].max()) ** 2
@@ -120,8 +109,10 @@ def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
         # the ridge holds slopes at zero that the neighbours do not determine (across a plane)
         AtW = A.T * weight
         ridge = 1e-3 * np.trace(AtW @ A) / 4 * np.diag([0.0, 1, 1, 1])
-        result[i] = np.linalg.solve(AtW @ A + ridge, AtW @ shifts[near])[0]
-    return result
+        points[row] += np.linalg.solve(AtW @ A + ridge, AtW @ shifts[near])[0]
+    points[rows] = network.points
+    moved = replace(nominal, points=points)
+    return moved.subset(np.sort(rows)) if trusted_only else moved
 
 
 def field_of_codes(
@@ -283,6 +274,8 @@ def survey(
             # the nominal field shows best which sheet a target is on, as its sheets are plane
             of_field, labels = nominal.points[rows], field_sheets(nominal)[rows]
             normals = sheet_normals(expected.points, labels, _NEAREST)
+            loose = np.isnan(normals[:, 0])
+            normals[loose] = target_normals(expected.points)[loose]
         photos = _measure_again(pictures, network, expected, normals, notes, progress)
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
         network = adjust_network(

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 FORMATS: dict[str, Format] = {
     format_.name: format_ for format_ in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN)
@@ -140,25 +139,21 @@ def read(
         values, covariance, exact, largest, rms = conversions.convert(
             sensor, record.family, record.values, conversions.BROWN, record.covariance
         )
-        _require_plausible(sensor, values)
+        # an interior orientation that no camera has
+        aspect = 1.0 + float(values[8])
+        if not 1.0 / _LARGEST_ASPECT < aspect < _LARGEST_ASPECT:
+            raise ConfigurationError(f"fx is {aspect:.3g} times fy: is a number or a comma wrong?")
+        u, v = image_to_px(sensor, values[1:3])
+        W, H = sensor.width, sensor.height
+        if not sensor.contains([u, v], _EDGE * min(W, H)):
+            raise ConfigurationError(
+                f"the principal point ({u:.0f}, {v:.0f}) px lies outside the {W} × {H} px of the "
+                "image or at its edge: is a number wrong, or the size that of another image?"
+            )
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
     model = CameraModel(sensor, InteriorOrientation.from_array(values))
     return ImportedCamera(model, chosen.name, record.name, exact, largest, rms, covariance)
-
-
-def _require_plausible(sensor: Sensor, interior: Array) -> None:
-    """Raise ConfigurationError for an interior orientation (10,) that no camera has."""
-    aspect = 1.0 + float(interior[8])
-    if not 1.0 / _LARGEST_ASPECT < aspect < _LARGEST_ASPECT:
-        raise ConfigurationError(f"fx is {aspect:.3g} times fy: is a number or a comma wrong?")
-    u, v = image_to_px(sensor, interior[1:3])
-    W, H = sensor.width, sensor.height
-    if not sensor.contains([u, v], _EDGE * min(W, H)):
-        raise ConfigurationError(
-            f"the principal point ({u:.0f}, {v:.0f}) px lies outside the {W} × {H} px of the image "
-            "or at its edge: is a number wrong, or the size that of another image?"
-        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -323,7 +323,15 @@ def _encode_aicon(record: CameraRecord) -> str:
 
 def _decode_aicon(text: str) -> CameraRecord:
     record = _aicon_record(text)
-    found, spread, name = _read_sheet(text) if record is None else _read_comments(text, record)
+    if record is None:
+        found, spread, name = _read_sheet(text)
+    else:  # the standard deviations and the name are in comments that we write
+        found, spread, name = record, {}, "camera"
+        for words in map(str.split, text.splitlines()):
+            if words[:2] == ["#", "name:"]:
+                name = " ".join(words[2:]) or name
+            if words[:2] == ["#", "sd"] and len(words) == 4:
+                spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
     r0 = number(found.get("R0", 0.0), "R0")
     values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
     if record is not None and r0 == 0 and values[3:8].any():
@@ -350,20 +358,6 @@ def _aicon_record(text: str) -> dict[str, str] | None:
         return found if [float(w) for w in words][2] < 0 else None
     except ValueError:
         return None
-
-
-def _read_comments(
-    text: str, record: dict[str, str]
-) -> tuple[dict[str, str], dict[str, float], str]:
-    """Return a record, with standard deviations and the name from the comments that we write."""
-    spread, name = {}, "camera"
-    for line in text.splitlines():
-        words = line.split()
-        if words[:2] == ["#", "name:"]:
-            name = " ".join(words[2:]) or name
-        if words[:2] == ["#", "sd"] and len(words) == 4:
-            spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
-    return record, spread, name
 
 
 def _read_sheet(text: str) -> tuple[dict[str, str], dict[str, float], str]:
@@ -452,23 +446,19 @@ def _decode_metashape(text: str) -> CameraRecord:
         if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
             raise ConfigurationError(f"<{tag}> has no counterpart in this model")
     pixels = number(size[0], "width"), number(size[1], "height")
-    return CameraRecord(pixels, METASHAPE_FRAME, values, covariance=_metashape_covariance(root))
-
-
-def _metashape_covariance(root: ET.Element) -> Array | None:
-    """Return the covariance in the order of the family, zero for parameters held fixed."""
-    node = root.find(".//sensor/covariance")
-    names = [] if node is None else (node.findtext("params") or "").split()
-    if node is None or not names:
-        return None
-    n = len(names)
-    C = numbers((node.findtext("coeffs") or "").split(), "covariance", (n * n,)).reshape(n, n)
-    full = np.zeros((len(_TAGS),) * 2)
-    rows = [_TAGS.index(name) for name in names if name in _TAGS]
-    if len(rows) != n:
-        raise ConfigurationError("the covariance names parameters that this model does not have")
-    full[np.ix_(rows, rows)] = C
-    return full
+    covariance = None
+    names = root.findtext(".//sensor/covariance/params", "").split()
+    if n := len(names):
+        stated = root.findtext(".//sensor/covariance/coeffs", "").split()
+        rows = [_TAGS.index(name) for name in names if name in _TAGS]
+        C = numbers(stated, "covariance", (n * n,)).reshape(n, n)
+        if len(rows) != n:
+            raise ConfigurationError(
+                "the covariance names parameters that this model does not have"
+            )
+        covariance = np.zeros((len(_TAGS),) * 2)  # zero for parameters held fixed
+        covariance[np.ix_(rows, rows)] = C
+    return CameraRecord(pixels, METASHAPE_FRAME, values, covariance=covariance)
 
 
 METASHAPE = Format(

@@ -8,8 +8,8 @@ A test field's file states neither its boards nor its targets' normals. We searc
 with the most targets, with a tolerance from the field's spacing and the errors of its coordinates.
 Groups far apart in one plane are different boards; boards that touch in one plane count as one. A
 target's normal is that of the plane through its nearest neighbours on the same board, so that a
-board may be slightly bent. A target on no board and no small plate has no normal; its eccentricity
-cannot be computed and is neglected.
+board may be slightly bent. Four targets in a parallelogram are a plate with a normal of its own. A
+target on no board and no plate has no normal; its eccentricity cannot be computed and is neglected.
 
 Source: planes are found one after the other as by Fischler, Bolles (1981), Comm. ACM 24, 381-395
 (RANSAC), but with targets as seeds instead of random samples.
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -292,6 +293,7 @@ _APART = 2.5  # times the distance between neighbours; farther is another board
 _SEEDS = 60
 _LOCAL = 8  # nearest targets on a board, for a normal
 _PLATE = 4  # targets of a small plate, or at the rim of a board
+_SKEW = 0.1  # of the spacing, by which the targets of a plate may miss a parallelogram
 _LOOSE = 0.03  # flatness of a target and its nearest, as a share of the spacing, without a board
 _COMPACT = 1.6  # for that, the largest ratio of their distances
 
@@ -314,7 +316,12 @@ def target_normals(points: Array) -> Array:
     near, _ = _neighbours(points)
     reach = np.linalg.norm(points[near[:, :_PLATE]] - points[:, None], axis=2)
     spacing = float(np.median(reach[:, 1]))
-    normals = sheet_normals(points, _sheets(points, 0.0), _LOCAL)
+    labels = _sheets(points, 0.0)
+    normals = sheet_normals(points, labels, _LOCAL)
+    # in a corner, a plate and the nearest targets of other ones may pass for a small board
+    small = np.isnan(normals[:, 0]) | (np.bincount(labels + 1)[labels + 1] <= 2 * _PLATE)
+    for plate in _plates(points, near, small, _SKEW * spacing):
+        normals[plate] = plane_fit(points[plate])[1][2]
     for row in np.flatnonzero(np.isnan(normals[:, 0])):
         local = points[near[row, :_PLATE]]
         spread = local - local.mean(axis=0)
@@ -326,6 +333,34 @@ def target_normals(points: Array) -> Array:
         ):
             normals[row] = axes[2]
     return normals
+
+
+def _plates(
+    points: Array, near: NDArray[np.int64], loose: NDArray[np.bool_], tolerance: float
+) -> list[list[int]]:
+    """Return the rows of plates: four targets each in a parallelogram, among the loose ones (n,).
+
+    near (n, k): each target and its nearest; tolerance: of the fourth corner, mm. A target's plate
+    is the smallest parallelogram at whose corner it is. Where two plates meet at an edge, their
+    inner targets may form a smaller one across it, but the outer ones cannot; so the larger of two
+    plates with a common target is the true one.
+    """
+    found: list[tuple[float, int, list[int]]] = []
+    for row in np.flatnonzero(loose).tolist():
+        around = near[row, 1:][loose[near[row, 1:]]]
+        for a, b in combinations(around[:_PLATE].tolist(), 2):
+            u, v = points[a] - points[row], points[b] - points[row]
+            size = float(u @ u + v @ v)
+            off = np.linalg.norm(points[around] - (points[row] + u + v), axis=1)
+            in_a_row = np.linalg.norm(np.cross(u, v)) < 0.1 * size
+            if off.min() < tolerance and not in_a_row:
+                found.append((size, row, [row, a, b, int(around[off.argmin()])]))
+    smallest = {row: (size, plate) for size, row, plate in sorted(found, reverse=True)}
+    plates: list[list[int]] = []
+    for _, plate in sorted(smallest.values(), reverse=True):
+        if not any(row in plate for other in plates for row in other):
+            plates.append(plate)
+    return plates
 
 
 def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Array:

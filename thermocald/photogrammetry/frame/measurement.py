@@ -145,7 +145,7 @@ class _Frame:
         self._markers = self._places = locate_markers(image, testfield, self._missed)
 
     def measure(self) -> Measurement:
-        """Measure markers and squares, then the circles."""
+        """Measure markers and squares, orient the frame with them and the codes, then circles."""
         if turned := corners_turned_deg(self._markers, self._field):
             return self._other_field(_TURNED.format(turned))
         if "chess_corner" in self._field.kinds:
@@ -155,7 +155,24 @@ class _Frame:
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
             return self._finish(corners)
-        return self._measure_circles(corners)
+        rows, maps, foreign = find_coded(
+            self._image, self._field, _FEWEST, needed=len(corners) < _FEWEST
+        )
+        pairs = np.concatenate([corners.targets, rows])
+        if len(pairs) < _FEWEST:  # too few for an orientation; the circles found, as ellipses
+            fit = fit_circles(self._image, maps, have_rings(self._field, rows))
+            self._missed.update(fit.missed(rows))
+            circles = fit.observations(rows, fit.good)
+            return self._finish(corners.joined(circles), foreign=foreign)
+        try:
+            orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
+        except GeometryError as error:
+            return self._other_field(
+                f"{len(pairs)} codes of the test field are seen, but not where it has them: {error}"
+            )
+        measured, missed, orientation = self._fit_circles(orientation, corners)
+        self._missed.update(missed)
+        return self._finish(corners.joined(measured), orientation, foreign)
 
     def _second_look(self, corners: Observations) -> Observations:
         """Measure further corners at the places predicted by the orientation from the others.
@@ -193,27 +210,6 @@ class _Frame:
             camera.sensor, self._field.points[rows], points, camera.principal_distance,
             camera.interior,
         )  # fmt: skip
-
-    def _measure_circles(self, corners: Observations) -> Measurement:
-        """Orient the frame with the codes and the corners, and measure the circles."""
-        rows, maps, foreign = find_coded(
-            self._image, self._field, _FEWEST, needed=len(corners) < _FEWEST
-        )
-        pairs = np.concatenate([corners.targets, rows])
-        if len(pairs) < _FEWEST:  # too few for an orientation; the circles found, as ellipses
-            fit = fit_circles(self._image, maps, have_rings(self._field, rows))
-            self._missed.update(fit.missed(rows))
-            circles = fit.observations(rows, fit.good)
-            return self._finish(corners.joined(circles), foreign=foreign)
-        try:
-            orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
-        except GeometryError as error:
-            return self._other_field(
-                f"{len(pairs)} codes of the test field are seen, but not where it has them: {error}"
-            )
-        measured, missed, orientation = self._fit_circles(orientation, corners)
-        self._missed.update(missed)
-        return self._finish(corners.joined(measured), orientation, foreign)
 
     def _fit_circles(
         self, orientation: Orientation, corners: Observations
@@ -269,40 +265,33 @@ class _Frame:
         foreign: bool = False,
     ) -> Measurement:
         """Return the measurement with its status; foreign: codes of another field were seen."""
-        status = self._status(len(observations), foreign)
+        status, n = OK, len(observations)
+        if n < _FEWEST and foreign:
+            why = "the ring codes in the frame are not those of this test field"
+            status = FrameStatus("other_field", why)
+        elif 0 < n < _FEWEST:
+            status = FrameStatus("too_few", f"only {n} targets are found in the frame")
+        elif n == 0:
+            status = FrameStatus("nothing_found", self._why_nothing())
         return Measurement(observations, status, self._missed, orientation, self._places)
 
-    def _status(self, n: int, foreign: bool) -> FrameStatus:
-        if n >= _FEWEST:
-            return OK
-        if foreign:
-            why = "the ring codes in the frame are not those of this test field"
-            return FrameStatus("other_field", why)
-        if n:
-            return FrameStatus("too_few", f"only {n} targets are found in the frame")
-        why = _why_nothing(self._missed)
+    def _why_nothing(self) -> str:
+        """Return why no target can be measured, by the most frequent reason."""
         if not any(self._field.codes):
-            why = (
+            return (
                 "the test field has no coded target and the camera's orientation is unknown: "
                 "plain circles alone cannot be identified"
             )
-        return FrameStatus("nothing_found", why)
+        reasons = [why for why in self._missed.values() if why != "not found"]
+        if not reasons:
+            return "no target of the test field is found in the frame"
+        word, count = Counter(reasons).most_common(1)[0]
+        remedy = f"; {_REMEDIES[word]}" if word in _REMEDIES else ""
+        return f"{len(reasons)} targets are seen and none can be measured: {word} ({count}){remedy}"
 
     def _other_field(self, why: str) -> Measurement:
         status = FrameStatus("other_field", why)
         return Measurement(Observations.none(), status, self._missed, None, self._places)
-
-
-def _why_nothing(missed: dict[int, str]) -> str:
-    """Return why no target can be measured, by the most frequent reason."""
-    reasons = [why for why in missed.values() if why != "not found"]
-    if not reasons:
-        return "no target of the test field is found in the frame"
-    word, count = Counter(reasons).most_common(1)[0]
-    remedy = _REMEDIES.get(word)
-    return f"{len(reasons)} targets are seen and none can be measured: {word} ({count})" + (
-        f"; {remedy}" if remedy else ""
-    )
 
 
 REPEATED = "shows the view of {}, with the same errors: a copy in another encoding? Counts once"
@@ -337,7 +326,7 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
     right edge, from top to bottom), `blur_curvature` (px from the middle to the corners), each with
     `sd_…`; medians over the targets of `contrast` (DN, negative for dark targets), `grey` (DN of
     the background), `noise` (DN), `saturation` (share of pixels). A figure that cannot be estimated
-    is absent.
+    is absent; a trend that the distribution of the targets does not determine has a large sd.
     """
     figures: dict[str, float] = {}
     for name in ("contrast", "grey", "noise", "saturation", "blur"):
@@ -345,23 +334,11 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
         if values is not None and np.isfinite(values).any():
             figures["blur_px" if name == "blur" else name] = float(np.nanmedian(values))
     blur = observations.quality.get("blur")
-    if blur is not None and np.isfinite(blur).sum() >= _FEWEST_BLURS:
-        values, sd = blur_trend(observations.points, blur, sensor)
-        for name, value, s in zip(
-            ("blur_px", "blur_trend_x", "blur_trend_y", "blur_curvature"), values, sd, strict=True
-        ):
-            figures[name], figures[f"sd_{name}"] = float(value), float(s)
-    return figures
-
-
-def blur_trend(points: Array, blur: Array, sensor: Sensor) -> tuple[Array, Array]:
-    """Fit b + tx·x + ty·y + k·r² to the blur at points (n, 2) px.
-
-    x and y are -½ to ½ over the image, r is 0 in its middle and 1 in its corners. Returns
-    (b, tx, ty, k) and their sd (4,), px. The fit is robust against disturbed targets. Terms that
-    the distribution of the targets does not determine have large standard deviations.
-    """
-    x, y = ((points - sensor.centre) / (sensor.width, sensor.height)).T
+    if blur is None or np.isfinite(blur).sum() < _FEWEST_BLURS:
+        return figures
+    # the blur is fitted by b + tx·x + ty·y + k·r², robustly against disturbed targets; x and y are
+    # -½ to ½ over the image, r is 0 in its middle and 1 in its corners
+    x, y = ((observations.points - sensor.centre) / (sensor.width, sensor.height)).T
     design = np.column_stack([np.ones(len(x)), x, y, 2 * (x * x + y * y)])
     good = np.isfinite(blur)
     solution, variance = np.zeros(4), 0.0
@@ -374,4 +351,7 @@ def blur_trend(points: Array, blur: Array, sensor: Sensor) -> tuple[Array, Array
         good = np.isfinite(blur) & (np.abs(residual) <= _BLUR_CUT * max(sd, 1e-6))
     normal = design[good].T @ design[good]
     inverse = np.linalg.pinv(normal + 1e-9 * np.eye(4))
-    return solution, np.sqrt(np.maximum(np.diag(inverse) * variance, 0.0))
+    sds = np.sqrt(np.maximum(np.diag(inverse) * variance, 0.0))
+    for i, name in enumerate(("blur_px", "blur_trend_x", "blur_trend_y", "blur_curvature")):
+        figures[name], figures[f"sd_{name}"] = float(solution[i]), float(sds[i])
+    return figures

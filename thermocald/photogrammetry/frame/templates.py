@@ -64,10 +64,31 @@ class Templates:
         inside = ((clicks.points >= low) & (clicks.points < high)).all(axis=1)
         self._rows = clicks.targets[inside]
         pairs = zip(clicks.points[inside], clicks.sigmas[inside], strict=True)
-        meant = [_define(reference, point, sigma) for point, sigma in pairs]
+        # a click defines a centre of symmetry near it, or else is the point itself
+        meant = []
+        for click, sigma in pairs:
+            farthest = _FARTHEST_CLICK * float(sigma.max())
+            found = (_find_centre(reference, click, half, farthest) for half in _SYMMETRIC)
+            centres = [centre for centre in found if centre is not None]
+            default = click, np.diag(sigma**2)
+            meant.append(max(centres, key=lambda c: c[2])[:2] if centres else default)
         self._points = np.array([point for point, _ in meant]).reshape(-1, 2)
         self._defined = np.array([C for _, C in meant]).reshape(-1, 2, 2)
-        self._prepare(reference)
+        # the patches, and their steps of least squares
+        v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
+        spline = _spline(reference, self._points, _HALF + 8)
+        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
+        every = np.arange(len(self._points))
+        grey = _sampled(spline, every, np.hstack([self._points, unturned]), u, v)
+        self._grey, self._grid = grey, (u.ravel(), v.ravel())
+        self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
+        gy, gx = np.gradient(grey, axis=(1, 2)) if len(grey) else (grey, grey)
+        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, grey, np.ones_like(grey)]
+        J = np.stack(flat, axis=-1).reshape(len(grey), self._weight.size, 8)
+        weighted = J * self._weight.reshape(-1, 1)
+        N = np.linalg.pinv(np.swapaxes(weighted, -1, -2) @ J, rcond=1e-9, hermitian=True)
+        self._step = N @ np.swapaxes(weighted, -1, -2)
+        self._sandwich = (self._step @ np.swapaxes(self._step, -1, -2))[:, :2, :2]
         self.reset()
 
     @classmethod
@@ -133,23 +154,6 @@ class Templates:
         self._reach = _TRACKED_PX
         return Measurement(seen, OK, missed)
 
-    def _prepare(self, reference: NDArray[Any]) -> None:
-        """Cut out the patches, and compute their steps of least squares."""
-        v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
-        spline = _spline(reference, self._points, _HALF + 8)
-        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
-        every = np.arange(len(self._points))
-        grey = _sampled(spline, every, np.hstack([self._points, unturned]), u, v)
-        self._grey, self._grid = grey, (u.ravel(), v.ravel())
-        self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
-        gy, gx = np.gradient(grey, axis=(1, 2)) if len(grey) else (grey, grey)
-        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, grey, np.ones_like(grey)]
-        J = np.stack(flat, axis=-1).reshape(len(grey), self._weight.size, 8)
-        weighted = J * self._weight.reshape(-1, 1)
-        N = np.linalg.pinv(np.swapaxes(weighted, -1, -2) @ J, rcond=1e-9, hermitian=True)
-        self._step = N @ np.swapaxes(weighted, -1, -2)
-        self._sandwich = (self._step @ np.swapaxes(self._step, -1, -2))[:, :2, :2]
-
     def _match(
         self, image: NDArray[Any], reach: int, rows: NDArray[np.int64] | slice
     ) -> tuple[Array, Array, NDArray[Any]]:
@@ -158,13 +162,18 @@ class Templates:
         Returns places (n, 2) px, covariances (n, 2, 2) px², and why a patch was not found (n,).
         """
         places = self._points[rows] + self._shift
-        patches, reasons = self._grey[rows], np.full(len(places), "", dtype=object)
-        for k, patch in enumerate(patches):
-            place = _search_patch(image, patch, places[k], reach)
-            if place is None:
-                reasons[k] = "outside the frame, or in the dark"
-            else:
-                places[k] = place
+        reasons = np.full(len(places), "outside the frame, or in the dark", dtype=object)
+        for k, patch in enumerate(self._grey[rows]):
+            x, y = (round(float(c)) for c in places[k])
+            left, top = max(x - reach - _HALF, 0), max(y - reach - _HALF, 0)
+            if x < 0 or y < 0:
+                continue
+            window = image[top : y + reach + _HALF + 1, left : x + reach + _HALF + 1]
+            window = window.astype(np.float32)
+            if min(window.shape) > 2 * _HALF and cv2.meanStdDev(window)[1][0, 0] >= _LEAST_CONTRAST:
+                score = cv2.matchTemplate(window, patch.astype(np.float32), cv2.TM_CCOEFF_NORMED)
+                row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+                places[k], reasons[k] = (left + column + _HALF, top + row + _HALF), ""
         covariance = np.zeros((len(places), 2, 2))
         seen = np.flatnonzero(reasons == "")
         which = np.arange(len(self._grey))[rows][seen]
@@ -282,16 +291,6 @@ def _basis(x: Array, size: int) -> tuple[NDArray[np.int64], list[Array]]:
     return whole.astype(np.int64) - 1, weights
 
 
-def _define(image: NDArray[Any], click: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return the point that a click defines, and its covariance, px²: a centre of symmetry of the
-    image near the click, or else the click itself.
-    """
-    farthest = _FARTHEST_CLICK * float(sigma.max())
-    found = (_find_centre(image, click, half, farthest) for half in _SYMMETRIC)
-    centres = [centre for centre in found if centre is not None]
-    return max(centres, key=lambda c: c[2])[:2] if centres else (click, np.diag(sigma**2))
-
-
 def _find_centre(
     image: NDArray[Any], click: Array, half: int, farthest: float
 ) -> tuple[Array, Array, float] | None:
@@ -334,21 +333,6 @@ def _find_centre(
     # each pair of pixels is counted twice
     variance = 2.0 * float((weight * r**2).sum() / weight.sum())
     return p, inverse @ M @ inverse * variance * _correlated(r), symmetric
-
-
-def _search_patch(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Array | None:
-    """Return the pixel where a patch correlates best; None if out of the image or in the dark."""
-    half = patch.shape[0] // 2
-    x, y = (round(float(c)) for c in near)
-    left, top = max(x - reach - half, 0), max(y - reach - half, 0)
-    if x < 0 or y < 0:
-        return None
-    window = image[top : y + reach + half + 1, left : x + reach + half + 1].astype(np.float32)
-    if min(window.shape) <= 2 * half or cv2.meanStdDev(window)[1][0, 0] < _LEAST_CONTRAST:
-        return None
-    score = cv2.matchTemplate(window, patch.astype(np.float32), cv2.TM_CCOEFF_NORMED)
-    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-    return np.array([left + column + half, top + row + half], dtype=float)
 
 
 def _symmetry(window: Array, weight: Array) -> float:

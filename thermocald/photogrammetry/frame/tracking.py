@@ -291,7 +291,8 @@ def _track_circles(
             image, weights.maps.select(which).at(old[which, :2] + shift), weights.coded[which],
             blur, weights.noise,
         )  # fmt: skip
-        fit.put(which, others)
+        for name in ("parameters", "covariances", "misfit", "saturation", "reasons"):
+            getattr(fit, name)[which] = getattr(others, name)
     good = fit.good
     if good.sum() < (1 - _LOST_SHARE) * seen.sum():
         return None

@@ -207,27 +207,24 @@ def chess_code(columns: int, rows: int, number: int) -> str:
     return f"CHESS:{columns}x{rows}:{number}"
 
 
-def parse_chess(code: str) -> tuple[int, int, int]:
-    """Parse `CHESS:9x6:17` to (9, 6, 17); TestFieldError if it is not such a code."""
-    found = _CODE.fullmatch(code)
-    if found is None:
-        raise TestFieldError(f"{code!r} is not a corner of a chessboard: write CHESS:9x6:17")
-    columns, rows, number = (int(n) for n in found.groups())
-    if not (columns >= 3 and rows >= 3 and number < columns * rows):
-        raise TestFieldError(f"{code!r}: a board has at least 3 × 3 inner corners, numbered from 0")
-    chess_code(columns, rows, number)
-    return columns, rows, number
-
-
 def locate_chessboards(
     image: NDArray[Any], testfield: TestField, missed: dict[int, str]
 ) -> Corners:
     """Find a field's plain chessboards; `missed` receives {row: reason} for corners not found."""
     boards: dict[tuple[int, int], dict[int, int]] = {}
     for row, code in enumerate(testfield.codes):
-        if code.startswith("CHESS:"):
-            columns, rows, number = parse_chess(code)
-            boards.setdefault((columns, rows), {})[number] = row
+        if not code.startswith("CHESS:"):
+            continue
+        parsed = _CODE.fullmatch(code)
+        if parsed is None:
+            raise TestFieldError(f"{code!r} is not a corner of a chessboard: write CHESS:9x6:17")
+        columns, rows, number = (int(n) for n in parsed.groups())
+        if not (columns >= 3 and rows >= 3 and number < columns * rows):
+            raise TestFieldError(
+                f"{code!r}: a board has at least 3 × 3 inner corners, numbered from 0"
+            )
+        chess_code(columns, rows, number)  # refuses a board that looks the same upside down
+        boards.setdefault((columns, rows), {})[number] = row
     found = Corners.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():
@@ -259,17 +256,14 @@ def _find_board(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | Non
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0:
         grid = grid[::-1]
-    return grid if _begins_black(grey, grid) else np.ascontiguousarray(grid[::-1, ::-1])
-
-
-def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
-    """Return whether the square outside the first corner is darker than its neighbours."""
+    # black: the square outside the first corner is darker than its neighbours
     right, down = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
     around = [-right - down, right + down, right - down, down - right]
     at = np.rint(grid[0, 0] + 0.4 * np.array(around))
     x, y = np.clip(at, 0, np.array(grey.shape[::-1]) - 1).astype(int).T
     values = grey[y, x].astype(float)
-    return bool(values[:2].sum() < values[2:].sum())
+    begins_black = values[:2].sum() < values[2:].sum()
+    return grid if begins_black else np.ascontiguousarray(grid[::-1, ::-1])
 
 
 def predict_corners(

@@ -189,11 +189,6 @@ class CircleFit:
         bad = ~self.good
         return dict(zip(rows[bad].tolist(), self.reasons[bad], strict=True))
 
-    def put(self, which: NDArray[np.int64], others: CircleFit) -> None:
-        """Replace some fits by others, in place."""
-        for name in ("parameters", "covariances", "misfit", "saturation", "reasons"):
-            getattr(self, name)[which] = getattr(others, name)
-
     def observations(self, rows: NDArray[np.int64], keep: NDArray[np.bool_]) -> Observations:
         """Return some of the fits (mask) as observations; rows (n,): those of the test field."""
         p = self.parameters[keep]

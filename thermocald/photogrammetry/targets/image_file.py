@@ -19,10 +19,9 @@ of a JPEG); PNG specification (third edition), 11.3.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -71,7 +70,15 @@ def image_size(data: bytes) -> tuple[int, int] | None:
             height, width = struct.unpack(">HH", data[at + 5 : at + 9])
             return width, height
         if data[:4] in (b"II*\0", b"MM\0*"):
-            return _tiff(data, "<" if data[:2] == b"II" else ">")
+            order = "<" if data[:2] == b"II" else ">"
+            (start,) = struct.unpack_from(order + "I", data, 4)
+            (count,) = struct.unpack_from(order + "H", data, start)
+            tags = data[start + 2 : start + 2 + 12 * min(count, _MOST_TAGS)]
+            size = {}
+            for tag, kind, _, raw in struct.iter_unpack(order + "HHI4s", tags):
+                (size[tag],) = struct.unpack_from(order + ("H" if kind == _SHORT else "I"), raw)
+            width, height = (size.get(tag, 0) for tag in _TIFF_SIZE)
+            return (width, height) if width and height else None
         if data[:2] == b"BM":
             width, height = struct.unpack("<ii", data[18:26])
             return abs(width), abs(height)
@@ -85,35 +92,13 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _tiff(data: bytes, order: str) -> tuple[int, int] | None:
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    tags = data[start + 2 : start + 2 + 12 * min(count, _MOST_TAGS)]
-    size = {}
-    for tag, kind, _, raw in struct.iter_unpack(order + "HHI4s", tags):
-        (size[tag],) = struct.unpack_from(order + ("H" if kind == _SHORT else "I"), raw)
-    width, height = (size.get(tag, 0) for tag in _TIFF_SIZE)
-    return (width, height) if width and height else None
-
-
 _WORTH_IT = 0.98  # of the image; beyond, it is decoded as a whole
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """The layout of a JPEG with restart markers.
-
-    size: width and height, px; size_at: where the frame header states them; scan: where the coded
-    bits start; tile: width and height, px, of the tile that a segment covers; tiles: columns and
-    rows of tiles; coded: height of all minimum coded units, px.
-    """
-
-    size: tuple[int, int]
-    size_at: int
-    scan: int
-    tile: tuple[int, int]
-    tiles: tuple[int, int]
-    coded: int
+_Layout: TypeAlias = tuple[int, int, tuple[int, int], tuple[int, int], int]
+"""A JPEG with restart markers: where its frame header states the size, where its coded bits start,
+width and height, px, of the tile that a segment covers, columns and rows of tiles, and the height
+of all minimum coded units, px."""
 
 
 def _layout(data: bytes) -> _Layout | None:
@@ -144,40 +129,28 @@ def _layout(data: bytes) -> _Layout | None:
     if across % interval and interval % across:
         return None
     columns, rows = max(across // interval, 1), max(interval // across, 1)
-    return _Layout(
-        (width, height), frame + 5, head + 2 + word(head + 2),
-        (across // columns * unit[0], rows * unit[1]), (columns, -(-down // rows)), down * unit[1],
+    return (
+        frame + 5, head + 2 + word(head + 2), (across // columns * unit[0], rows * unit[1]),
+        (columns, -(-down // rows)), down * unit[1],
     )  # fmt: skip
 
 
-def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | None:
-    """Return grey values (H, W) of a JPEG that are valid in boxes (n, 4) px.
-
-    A box is left, top, right and bottom, the last two exclusive. Elsewhere the values are
-    undefined. The next call in this thread reuses the memory. None if the file cannot be decoded in
-    parts or this would save no time.
-    """
-    try:
-        layout = _layout(data)
-        return None if layout is None else _decode_tiles(data, layout, boxes)
-    except (IndexError, ValueError):
-        return None  # damaged; decoding the whole file reports how
-
-
 def _decode_tiles(
-    data: bytes, layout: _Layout, boxes: NDArray[np.int64]
+    data: bytes, full: tuple[int, int], layout: _Layout, boxes: NDArray[np.int64]
 ) -> NDArray[np.uint8] | None:
-    low, high = np.clip(boxes.reshape(-1, 2, 2), 0, layout.size).swapaxes(0, 1)
+    """Decode a JPEG of width and height `full` px; return as `EncodedImage.around`."""
+    low, high = np.clip(boxes.reshape(-1, 2, 2), 0, full).swapaxes(0, 1)
     seen = (high > low).all(axis=1)
-    (tile_width, tile_height), (columns, rows) = layout.tile, layout.tiles
+    size_at, scan, tile, (columns, rows), coded = layout
+    tile_width, tile_height = tile
     # which tiles meet a box, by cumulative sums of the boxes' corners
-    left, top = (low[seen] // layout.tile).T
-    right, bottom = ((high[seen] - 1) // layout.tile + 1).T
+    left, top = (low[seen] // tile).T
+    right, bottom = ((high[seen] - 1) // tile + 1).T
     count = np.zeros((rows + 1, columns + 1), dtype=np.int64)
     for y, x, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
         np.add.at(count, (y, x), sign)
     chosen = np.flatnonzero(count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1].ravel() > 0)
-    segments = _bits(data, layout, columns * rows)
+    segments = _bits(data, scan, columns * rows)
     if segments is None or not 0 < len(chosen) <= _WORTH_IT * columns * rows:
         return None
     row, column = np.divmod(chosen, columns)
@@ -186,9 +159,9 @@ def _decode_tiles(
     filled = np.r_[chosen, np.repeat(chosen[-1:], lines * columns - len(chosen))]
     width, height = columns * tile_width, lines * tile_height
     if row[-1] == rows - 1:  # the last tiles may have fewer rows of units
-        height -= rows * tile_height - layout.coded
+        height -= rows * tile_height - coded
     size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
-    parts = [data[: layout.size_at] + size + data[layout.size_at + 4 : layout.scan]]
+    parts = [data[:size_at] + size + data[size_at + 4 : scan]]
     for k, i in enumerate(filled.tolist()):
         parts += [data[segments[i, 0] : segments[i, 1]], bytes((0xFF, 0xD0 + k % 8))]
     parts[-1] = bytes((0xFF, _EOI))
@@ -200,12 +173,12 @@ def _decode_tiles(
     image.reshape(rows, *shape)[row, :, column] = packed.reshape(lines, *shape)[
         places // columns, :, places % columns
     ]
-    return np.ascontiguousarray(image[: layout.size[1], : layout.size[0]])
+    return np.ascontiguousarray(image[: full[1], : full[0]])
 
 
-def _bits(data: bytes, layout: _Layout, count: int) -> NDArray[np.int64] | None:
+def _bits(data: bytes, scan: int, count: int) -> NDArray[np.int64] | None:
     """Return start and end (count, 2) of all segments' bits in `data`; None if some are missing."""
-    bits = np.frombuffer(data, np.uint8)[layout.scan :]
+    bits = np.frombuffer(data, np.uint8)[scan:]
     at = np.flatnonzero(bits[:-1] == 0xFF)
     after = bits[at + 1]
     restart = (after & 0xF8) == 0xD0
@@ -216,7 +189,7 @@ def _bits(data: bytes, layout: _Layout, count: int) -> NDArray[np.int64] | None:
     marks = at[restart]
     if len(marks) != count - 1 or np.any((after[restart] & 7) != np.arange(len(marks)) % 8):
         return None
-    return layout.scan + np.stack([np.r_[0, marks + 2], np.r_[marks, others[0]]], axis=1)
+    return scan + np.stack([np.r_[0, marks + 2], np.r_[marks, others[0]]], axis=1)
 
 
 _MOST_PIXELS = 250_000_000
@@ -281,13 +254,19 @@ class EncodedImage:
         return image
 
     def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-        """Return grey values (H, W) that are valid in boxes (n, 4) px, as `decode_parts`.
+        """Return grey values (H, W) that are valid in boxes (n, 4) px.
 
-        None if the file cannot be decoded in parts or does not have the shape (H, W).
+        A box is left, top, right and bottom, the last two exclusive. Elsewhere the values are
+        undefined. The next call in this thread reuses the memory. None if the file does not have
+        the shape (H, W), cannot be decoded in parts, or this would save no time.
         """
         if not self._is_jpeg or self._size is None or self._size[::-1] != tuple(shape):
             return None
-        return decode_parts(self.data, boxes)
+        try:
+            layout = _layout(self.data)
+            return layout and _decode_tiles(self.data, self._size, layout, boxes)
+        except (IndexError, ValueError):
+            return None  # damaged; decoding the whole file reports how
 
 
 def decode_grey(source: Path | bytes) -> NDArray[Any]:

@@ -61,24 +61,19 @@ if TYPE_CHECKING:
 BITS = (12, 14)
 
 
-def smallest_rotation(number: int, bits: int) -> int:
-    """Return the smallest of the cyclic rotations of a number of `bits` bits."""
-    mask = (1 << bits) - 1
-    return min(((number << k) & mask) | (number >> (bits - k)) for k in range(bits))
-
-
 @cache
 def codes(bits: int) -> tuple[int, ...]:
     """Return all codes of 12 or 14 bits in increasing order; ValueError for other bits."""
     if bits not in BITS:
         raise ValueError(f"ring codes have {' or '.join(map(str, BITS))} bits, not {bits}")
-    half = bits // 2
+    half, mask = bits // 2, (1 << bits) - 1
     return tuple(
         number
         for number in range(1, 1 << (bits - 1), 2)  # starts with a 0: a closed ring is not a code
         if number.bit_count() % 2 == 0
         and number & (number >> half) & ((1 << half) - 1)
-        and number == smallest_rotation(number, bits)
+        # the smallest of its rotations
+        and number == min((number << k) & mask | number >> (bits - k) for k in range(bits))
     )
 
 
@@ -289,20 +284,8 @@ def read_codes(
     rows, gap, contrast = _disc_and_gap(image, candidates, polarity)
     ink = gap, contrast
     # Seen from near and obliquely, a large ring is eccentric to its disc by pixels.
-    found = _read(image, in_perspective(image, candidates.select(rows), ink), ink)
-    read = [(bits, number) for bits, number in found.tolist()]
-    count = Counter(read)
-    return {
-        code: int(row) for code, row in zip(read, rows, strict=True) if code[0] and count[code] == 1
-    }
-
-
-def _read(
-    image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]
-) -> NDArray[np.int64]:
-    """Return bits and numbers (n, 2) of the codes around discs; bits are 0 if none is certain."""
+    maps = in_perspective(image, candidates.select(rows), ink)
     level = sample(image, maps, RADII, ANGLES, ink)
-    families = np.array(BITS, dtype=np.int64)
     readings = zip(*(_read_family(level, maps, n) for n in BITS), strict=True)
     numbers, misfits = (np.stack(column) for column in readings)
     best, at = np.argmin(misfits, axis=0), np.arange(len(maps))
@@ -312,7 +295,12 @@ def _read(
     good = np.isfinite(misfit) & (
         misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
     )
-    return np.stack([np.where(good, families[best], 0), numbers[best, at]], axis=1)
+    read = [
+        (BITS[k], n)
+        for k, n in zip(best[good].tolist(), numbers[best, at][good].tolist(), strict=True)
+    ]
+    count = Counter(read)
+    return {code: int(row) for code, row in zip(read, rows[good], strict=True) if count[code] == 1}
 
 
 def _disc_and_gap(

@@ -27,8 +27,9 @@ from thermocald.figures import (
     legend_above,
     new_drawing,
 )
-from thermocald.numbers import enumerated, parameter_label, shortened, with_sd
+from thermocald.numbers import enumerated, parameter_label, percent, shortened, with_sd
 from thermocald.photogrammetry.linalg import best_level
+from thermocald.physics import catalogue
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
 
@@ -191,7 +192,14 @@ def _trajectory(d: Discovery) -> Figure:
     e = d.examination.fitter.series[0]
     base, final = (fit.parameters(0) for fit in (d.base_fit, d.final_fit))
     rests = [_without_level(e, e.values - m) for m in (base, final)]
-    found = bool(np.abs(final - base).max() > 0)
+    # a defocus and displaced targets move no parameter
+    moving = [
+        effect.effect
+        for effect in d.effects
+        if effect.effect not in catalogue.names()
+        or catalogue.get(effect.effect).seen_in == "trajectory"
+    ]
+    found = bool(moving) and bool(np.abs(final - base).max() > 0)
     root = _root(e)
     model = _without_level(e, final - base) if found else rests[0]
     _, _, v = np.linalg.svd(model @ root, full_matrices=False)
@@ -200,8 +208,7 @@ def _trajectory(d: Discovery) -> Figure:
     along = root @ v[0] * noise
     measured, (before, after) = _without_level(e, e.values) @ along, (r @ along for r in rests)
     sd = float(np.hypot(noise, _of_readings(d) @ along))
-    name = " + ".join(effect.effect for effect in d.effects) if found else ""
-    label = f"with {name}" if len(d.effects) == 1 else "with all effects"
+    label = f"with {moving[0]}" if len(d.effects) == 1 and found else "with all effects"
     above, below = [], []
     for x, of in (
         (e.times / 60.0, "time in min"),
@@ -225,7 +232,7 @@ def _trajectory(d: Discovery) -> Figure:
         "trajectory",
         "Measured and modelled",
         "Movement of the image in the pattern of "
-        + (name if found else "the largest misfit")
+        + (" + ".join(moving) if found else "the largest misfit")
         + ", root mean square over the targets of M1, as measured and as modelled. Below: the "
         "residuals of each model; grey: 95 % of the noise of an epoch and of the readings.",
         (*above, *below),
@@ -362,10 +369,10 @@ def _effect(effect: EffectFound) -> Section:
         test = proposal["surrogates"]
         text.append(
             f"Formula {proposal['formula']}: with constants of M1 alone it explains "
-            f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of M2. Formulas on a grid of "
-            f"constants explain {test['explained']:.0%} of the misfit, but of {test['count']} "
-            "surrogates whose cause was not recorded at most "
-            f"{test['largest_of_surrogates']:.0%}: probability of a false formula "
+            f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of M2. Formulas on a "
+            f"grid of constants explain {percent(test['explained'])} of the misfit, but of "
+            f"{test['count']} surrogates whose cause was not recorded at most "
+            f"{percent(test['largest_of_surrogates'])}: probability of a false formula "
             f"{_p(proposal['false_alarm_probability'], test['count'])}."
         )
     excluded = [a for a in effect.alternatives if not a.get("resembles")]

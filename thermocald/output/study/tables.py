@@ -90,8 +90,8 @@ def deviation_table(camera: CameraStudy) -> Table:
     def change(name: str, value: float, sd: float | None = None) -> str:
         # Positions are given in mm, their changes in µm.
         factor, unit = _small_unit(UNITS.get(name, "K"))
-        if sd is None:
-            return plain(factor * value, unit, 3)
+        if sd is None:  # the unit stands with the difference: again it would take the columns' room
+            return plain(factor * value, digits=3)
         return with_sd(factor * value, factor * sd, unit)
 
     return Table.of(
@@ -111,7 +111,7 @@ def deviation_table(camera: CameraStudy) -> Table:
         "The standard deviation alongside a difference is that of the two adjustments (for "
         "temperatures: of the two readings). Largest is the greatest departure from the first "
         "epoch, range the largest minus the smallest value, noise included; sd over "
-        "time is what the simulation below draws from.",
+        "time is what the simulation below draws from. These three have the difference's unit.",
     )
 
 

@@ -260,7 +260,8 @@ function draw(columns, name) {
     }
   });
   Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
-  $("course-note").textContent = `${name}: ${counted(columns.epochs, "epoch")}` +
+  // isolated: a name from right to left would exchange it with the numbers
+  $("course-note").textContent = `\u2068${name}\u2069: ${counted(columns.epochs, "epoch")}` +
     (columns.per_point > 1 ? `, up to ${columns.per_point} averaged per point` : "") +
     (columns.unset ? `; ${counted(columns.unset, "epoch")} from before the clock was set not shown` : "") +
     "; bands: 95 % uncertainty of a single epoch";

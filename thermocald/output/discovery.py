@@ -52,11 +52,16 @@ _ADVICE = {
 
 def report_html(discovery: Discovery, title: str) -> str:
     """Return the report as HTML text."""
+    sources = [e.source for e in discovery.examination.fitter.series]
     return Chapter(
         f"Discovery: {title}",
         _answer(discovery),
         tuple(_sections(discovery)),
-        tuple(_origin(discovery)),
+        tuple(
+            f"{one.camera}, {one.sensor}; {name} measured {day(float(one.frame_times[0]))}, "
+            f"{int(one.per_row.sum())} epochs."
+            for name, one in zip(_names(discovery), sources, strict=True)
+        ),
         tuple(
             as_sentence(line)
             for line in (
@@ -70,7 +75,9 @@ def report_html(discovery: Discovery, title: str) -> str:
 
 def _answer(d: Discovery) -> Answer:
     before, after = d.stages[0], d.stages[-1]
-    temperatures, noise = _temperatures(d), d.examination.fitter.series[0].sigma_px
+    first = d.examination.fitter.series[0]
+    T, noise = first.averaged(first.history.temperature()), first.sigma_px
+    temperatures = f" between {np.nanmin(T):.0f} and {np.nanmax(T):.0f} °C"
     by_gap = sorted(d.effects_with_gaps(), key=lambda e: e[2].rms_px - e[1].rms_px)
     if closing := [e for e, _, _ in by_gap]:
         sentence = as_sentence(_statement(closing[0]))
@@ -92,40 +99,27 @@ def _answer(d: Discovery) -> Answer:
             f"{' and from '.join(changes)}{temperatures}; the noise of an image coordinate is "
             f"{noise:.3f} px."
         )
-    return Answer(sentence, _trajectory(d), tuple(more), _next_steps(d), _not_covered(d))
-
-
-def _statement(effect: EffectFound) -> str:
-    """Return an effect's statement without the full stop; an amplitude a_x0 is written as x₀."""
-    text = re.sub(r"\ba_(\w+)", lambda m: parameter_label(m[1]), effect.statement)
-    return text.rstrip(".")
-
-
-def _temperatures(d: Discovery) -> str:
-    e = d.examination.fitter.series[0]
-    T = e.averaged(e.history.temperature())
-    return f" between {np.nanmin(T):.0f} and {np.nanmax(T):.0f} °C"
-
-
-def _next_steps(d: Discovery) -> tuple[str, ...]:
     steps = [
         f"To distinguish {e.effect} from {a['effect']}: {a['experiment']}."
         for e in d.effects
         for a in e.alternatives
         if not a.get("resembles") and a.get("experiment")
     ]
-    if d.stages[0].verify is None:
+    uncovered = [
+        f"Temperatures other than those{temperatures}, and changes faster than those measured."
+    ]
+    if before.verify is None:
         steps.append("Record a second series (M2) and give it with --verify, as the proof.")
-    return (*steps, _ADVICE[d.verdict])
+        uncovered.append("Whether the constants hold on another day: no M2 was given.")
+    steps.append(_ADVICE[d.verdict])
+    uncovered.append("Effects that move the image by less than its noise: they are not detected.")
+    return Answer(sentence, _trajectory(d), tuple(more), tuple(steps), tuple(uncovered))
 
 
-def _not_covered(d: Discovery) -> tuple[str, ...]:
-    alone = "Whether the constants hold on another day: no M2 was given."
-    return (
-        f"Temperatures other than those{_temperatures(d)}, and changes faster than those measured.",
-        *([alone] if d.stages[0].verify is None else []),
-        "Effects that move the image by less than its noise: they are not detected.",
-    )
+def _statement(effect: EffectFound) -> str:
+    """Return an effect's statement without the full stop; an amplitude a_x0 is written as x₀."""
+    text = re.sub(r"\ba_(\w+)", lambda m: parameter_label(m[1]), effect.statement)
+    return text.rstrip(".")
 
 
 def _names(d: Discovery) -> list[str]:
@@ -136,15 +130,6 @@ def _names(d: Discovery) -> list[str]:
         own = [Path(s.name).name for s in sources]
     named = zip(roles, own, strict=True)
     return [role if name in ("", role) else f"{role} ({name})" for role, name in named]
-
-
-def _origin(d: Discovery) -> list[str]:
-    sources = [e.source for e in d.examination.fitter.series]
-    return [
-        f"{one.camera}, {one.sensor}; {name} measured {day(float(one.frame_times[0]))}, "
-        f"{int(one.per_row.sum())} epochs."
-        for name, one in zip(_names(d), sources, strict=True)
-    ]
 
 
 def _sections(d: Discovery) -> list[Section]:

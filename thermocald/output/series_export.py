@@ -24,7 +24,7 @@ import numpy as np
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError, UsageError
 from thermocald.files import write_text
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, ExteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP
 from thermocald.photogrammetry.frame.templates import Templates
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import in_parts, jsonable
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.series.epochs import Epochs
-    from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.result import Columns
 
@@ -165,6 +164,8 @@ def renew_configuration(
     reference: the frame in which the points were clicked; frame: a frame of the video in which to
     measure them. Raises DataError if they give no pose.
     """
+    import cv2
+
     document = _document(path)
     control = ControlPoints.read(path, "m")
     if (frame is None) != (reference is None):
@@ -184,29 +185,19 @@ def renew_configuration(
     # pose and camera are correlated: write the camera that was estimated together with the pose
     now = replace(camera, values=pose.values[IOP], covariance=pose.covariance[IOP, IOP])
     K, distortion = now.opencv()
-    rvec, tvec = opencv_pose(pose.exterior, control.origin)
     # pyorc solves for the pose again when it reads the file: with the points as this camera
     # projects them it obtains this pose
     six = pose.exterior.as_array()
+    R, centre = _AXES @ pose.exterior.rotation.T, (control.origin + six[3:]) / 1000.0
     document["gcps"]["src"] = now.project(control.field.points, six).tolist()
     document |= {
         "camera_matrix": K.tolist(),
         "dist_coeffs": [[k] for k in distortion.tolist()],
-        "rvec": rvec.tolist(),
-        "tvec": tvec.tolist(),
-        "lens_position": ((control.origin + six[3:]) / 1000.0).tolist(),
+        "rvec": cv2.Rodrigues(R)[0].ravel().tolist(),
+        "tvec": (-R @ centre).tolist(),
+        "lens_position": centre.tolist(),
     }
     return RenewedConfiguration(document, now, control, pose)
-
-
-def opencv_pose(pose: ExteriorOrientation, origin: Array) -> tuple[Array, Array]:
-    """Return OpenCV's rotation vector and translation (m); origin: of the pose, mm."""
-    import cv2
-
-    R = _AXES @ pose.rotation.T
-    centre = (np.asarray(pose.as_array()[3:]) + origin) / 1000.0
-    rvec, _ = cv2.Rodrigues(R)
-    return np.asarray(rvec, dtype=float).ravel(), -R @ centre
 
 
 def _document(path: Path) -> dict[str, Any]:

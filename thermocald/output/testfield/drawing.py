@@ -221,6 +221,7 @@ def _seen(points: Array) -> Array:
 
 _TARGET_NAME = 0.7
 """Height of a target's name in radii of its disc."""
+_EDGE_LETTER = 3.0
 
 
 def draw(sheet: Sheet) -> Any:
@@ -233,7 +234,10 @@ def draw(sheet: Sheet) -> Any:
         (x, y, _), code = field.points[row].tolist(), field.codes[row]
         pen.fill(Curve.circle((x, y), r), pen.colour)
         for begin, end in ring_code.segments(*ring_code.parse(code)) if code else ():
-            pen.fill(_ring_segment((x, y), r, begin, end), pen.colour)
+            # codes run clockwise but y is up: angles are negated
+            angles, width = (-360 * end, -360 * begin), outline.RING_OUTER - outline.RING_INNER
+            arc = Wedge((x, y), outline.RING_OUTER * r, *angles, width=width * r)
+            pen.fill(arc.get_path(), pen.colour)
         _label(pen, x, y - (outline.RING_OUTER if code else 1.0) * r, field.names[row], r)
     for name, (x, y), side, cells in markers_of(field):
         if sheet.design.light:  # a marker is always black on white
@@ -243,33 +247,21 @@ def draw(sheet: Sheet) -> Any:
     crop_marks(pen, sheet.size)
     rulers(pen, sheet.size)
     _legend(pen, sheet)
-    _edge_letters(pen, sheet)
-    return pen.figure
-
-
-def _edge_letters(pen: Pen, sheet: Sheet) -> None:
-    """Write the common letter at each edge that meets another sheet."""
-    (w, h), size = sheet.size, 3.0
+    w, h = sheet.size
     places = {
         "left": (1.5, 0.75 * h),
-        "right": (w - 1.5 - size, 0.75 * h),
+        "right": (w - 1.5 - _EDGE_LETTER, 0.75 * h),
         "lower": (0.75 * w, 1.5),
     }
-    for side, letter in sheet.edges.items():
-        pen.text(*places[side], letter, size, color=GREY)
+    for side, letter in sheet.edges.items():  # the common letter of two edges that meet
+        pen.text(*places[side], letter, _EDGE_LETTER, color=GREY)
+    return pen.figure
 
 
 def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
     """Write a target's name, grey and too small to be mistaken for a target."""
     height = min(_TARGET_NAME * r, 3.0)
     pen.text(x, below - 0.35 * r - height, name, height, ha="center", color=GREY)
-
-
-def _ring_segment(centre: tuple[float, float], r: float, begin: float, end: float) -> Any:
-    """Return an arc of the ring; codes run clockwise but y is up: angles are negated."""
-    width = (outline.RING_OUTER - outline.RING_INNER) * r
-    angles = -360 * end, -360 * begin
-    return Wedge(centre, outline.RING_OUTER * r, *angles, width=width).get_path()
 
 
 def _legend(pen: Pen, sheet: Sheet) -> None:

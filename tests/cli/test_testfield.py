@@ -47,6 +47,17 @@ def test_check_says_before_printing_whether_a_series_gets_a_result(arguments, ca
         assert any("correlate at" in reason for reason in document["weak"])
 
 
+def photograph(folder, truth):
+    """Write eight rendered photographs of a field to a new folder; return the camera."""
+    model = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
+    scene = Scene(model.sensor, truth)
+    folder.mkdir()
+    for i, station in enumerate(cases.convergent_stations(truth.points, 8, distance=440.0)):
+        frame = scene.render(model.interior.as_array(), station.as_array(), seed=i)
+        cv2.imwrite(str(folder / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return model
+
+
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory):
     """A printed A3 sheet, a little bent, as JPEG photographs in a folder."""
@@ -59,12 +70,7 @@ def photographs(tmp_path_factory):
     truth = TestField.build(
         nominal.names, points, 0.0, nominal.diameters, nominal.kinds, nominal.codes
     )
-    model = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
-    scene = Scene(model.sensor, truth)
-    (folder / "photos").mkdir()
-    for i, station in enumerate(cases.convergent_stations(points, 8, distance=440.0)):
-        frame = scene.render(model.interior.as_array(), station.as_array(), seed=i)
-        cv2.imwrite(str(folder / "photos" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    model = photograph(folder / "photos", truth)
     a, b = "R65", next(n for n, p in zip(truth.names, points, strict=True)
                        if n.startswith("R") and p[0] > 300 and p[1] < 80)  # fmt: skip
     length = np.linalg.norm(points[truth.index[a]] - points[truth.index[b]])

@@ -31,7 +31,7 @@ from thermocald.result import in_parts, jsonable
 from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from thermocald.analysis.camera.camera import Camera
@@ -45,21 +45,8 @@ _IN_IMAGE, _ANGLES = ("c", "x0", "y0"), ("omega", "phi", "kappa")
 _PLACE = ("X0", "Y0", "Z0")
 
 
-@dataclass(frozen=True, slots=True)
-class ExportStyle:
-    """The style of an exported table.
-
-    units: a choice of UNITS, otherwise mm and rad; time: `seconds` or `iso`; separator and decimal.
-    """
-
-    units: frozenset[str] = frozenset()
-    time: str = "seconds"
-    separator: str = ","
-    decimal: str = "."
-
-
-def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle:
-    """Return the style that options describe; UsageError for unknown values."""
+def check_style(units: str, time: str, separator: str, decimal: str) -> tuple[list[str], str]:
+    """Return the units and the separator that options give; UsageError for unknown values."""
     wanted = [u.strip() for u in units.split(",") if u.strip()]
     for unit in wanted:
         if unit not in UNITS:
@@ -75,23 +62,24 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
         raise UsageError(f"--decimal {decimal}: must be . or ,")
     if decimal == mark:
         raise UsageError("--decimal , needs another --separator, such as ';'")
-    return ExportStyle(frozenset(wanted), time, mark, decimal)
+    return wanted, mark
 
 
 def column_parts(
-    table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns | None = None
+    table: Epochs, units: Sequence[str], iso_times: bool, pixel_pitch: float, others: Columns | None
 ) -> Iterator[Columns]:
-    """Yield the columns of a series in a style, then the other columns unchanged.
+    """Yield the columns of a series, then the other columns unchanged.
 
-    They come some thousand rows at a time, because of the memory for a year. pixel_pitch: mm.
+    They come some thousand rows at a time, because of the memory for a year. units: a choice of
+    UNITS, otherwise mm and rad; iso_times: times as text, otherwise s; pixel_pitch: mm.
     """
     done = 0
     for part in in_parts(table.columns()):
         columns: Columns = {}
         for name, values in part.items():
-            suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
+            suffix, factor = _unit(name.removeprefix("sd_"), units, pixel_pitch)
             columns[name + suffix] = values if not suffix else np.asarray(values) * factor
-        if style.time == "iso":
+        if iso_times:
             columns["frame_time"] = tuple(iso(float(t), "microseconds") for t in part["frame_time"])
         rows = slice(done, done + len(part["epoch"]))
         for name, column in (others or {}).items():
@@ -100,13 +88,13 @@ def column_parts(
         done = rows.stop
 
 
-def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float]:
+def _unit(name: str, units: Sequence[str], pixel_pitch: float) -> tuple[str, float]:
     """Return the suffix of a parameter's column, and the factor from mm or rad to its unit."""
-    if name in _IN_IMAGE and "px" in style.units:
+    if name in _IN_IMAGE and "px" in units:
         return "_px", 1.0 / pixel_pitch
-    if name in (*_IN_IMAGE, *_PLACE) and "um" in style.units:
+    if name in (*_IN_IMAGE, *_PLACE) and "um" in units:
         return "_um", 1000.0
-    if name in _ANGLES and "deg" in style.units:
+    if name in _ANGLES and "deg" in units:
         return "_deg", 180.0 / np.pi
     return "", 1.0
 

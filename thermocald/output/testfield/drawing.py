@@ -103,17 +103,15 @@ def draw_marker(
             pen.fill(rectangle(left + a * cell, low, (b - a) * cell, cell + seam), "white")
 
 
-def crop_marks(pen: Pen, size: tuple[float, float]) -> None:
-    """Draw the crop marks, short lines outside the four corners."""
+def draw_margins(pen: Pen, size: tuple[float, float]) -> None:
+    """Draw the crop marks outside the four corners, and a ruler in each direction, because printers
+    scale the two differently.
+    """
     w, h = size
     for x, sx in ((0.0, -1.0), (w, 1.0)):
         for y, sy in ((0.0, -1.0), (h, 1.0)):
             pen.line([(x + sx * 1, y), (x + sx * (TRIM - 1.5), y)], "black", 0.1)
             pen.line([(x, y + sy * 1), (x, y + sy * (TRIM - 1.5))], "black", 0.1)
-
-
-def rulers(pen: Pen, size: tuple[float, float]) -> None:
-    """Draw a ruler in each direction, because printers scale the two differently."""
     for along, length in enumerate(size):
         total = min(_RULER, 10 * int((length - STRIP - 10) / 10))
 
@@ -244,8 +242,7 @@ def draw(sheet: Sheet) -> Any:
             pen.fill(square(x, y, side * (1 + 2 / len(cells))), "white")
         draw_marker(pen, (x, y), side, cells)
         _label(pen, x, y - side / 2, name, r)
-    crop_marks(pen, sheet.size)
-    rulers(pen, sheet.size)
+    draw_margins(pen, sheet.size)
     _legend(pen, sheet)
     w, h = sheet.size
     places = {
@@ -284,8 +281,7 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
     """Draw a board in the middle of a page (mm), with rulers and its name, as a Figure."""
     pen = Pen(page, light=False)
     size = (page[0] - 2 * TRIM, page[1] - 2 * TRIM)
-    crop_marks(pen, size)
-    rulers(pen, size)
+    draw_margins(pen, size)
     name = board.name.partition(" ")[2]
     pen.text(STRIP, STRIP - 4.6, f"{name}, {board.measures}", _LEGEND_HEIGHT)
     dx, dy = board.place(page)
@@ -296,16 +292,12 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
     return pen.figure
 
 
-def write_pdf(pages: Sequence[Any], path: Path) -> None:
-    """Write Figures as the pages of one PDF."""
-    about = {"Title": "thermocald test field", "Creator": "thermocald", "CreationDate": None}
-    with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as document:
-        for page in pages:
-            document.savefig(page)
-
-
-def write_svg(page: Any, path: Path) -> None:
-    """Write a Figure as SVG."""
-    about = {"Title": "thermocald test field", "Creator": "thermocald", "Date": None}
-    with rc_context({"svg.hashsalt": "thermocald"}):
-        page.savefig(path, format="svg", metadata=about)
+def write(pages: Sequence[Any], pdf: Path, svgs: Sequence[Path]) -> None:
+    """Write Figures as the pages of one PDF, and the first of them as SVG files."""
+    about = {"Title": "thermocald test field", "Creator": "thermocald"}
+    with rc_context({"pdf.fonttype": 42, "svg.hashsalt": "thermocald"}):
+        with PdfPages(pdf, metadata={**about, "CreationDate": None}) as document:
+            for page in pages:
+                document.savefig(page)
+        for page, path in zip(pages, svgs, strict=False):  # the plan is only in the PDF
+            page.savefig(path, format="svg", metadata={**about, "Date": None})

@@ -559,8 +559,6 @@ def _publish(
     names = ["testfield.pdf", *drawings, "testfield.csv"]
     with ExitStack() as opened:
         partial = {name: opened.enter_context(new_file(folder / name)) for name in names}
-        _drawing().write_pdf(pages, partial["testfield.pdf"])
-        for page, name in zip(pages, drawings, strict=False):  # the plan is only in the PDF
-            _drawing().write_svg(page, partial[name])
+        _drawing().write(pages, partial["testfield.pdf"], [partial[name] for name in drawings])
         partial["testfield.csv"].write_text(testfield_csv(field), encoding="utf-8")
     return tuple(folder / name for name in names)

@@ -250,8 +250,8 @@ def draw(sheet: Sheet) -> Any:
         "right": (w - 1.5 - _EDGE_LETTER, 0.75 * h),
         "lower": (0.75 * w, 1.5),
     }
-    for side, letter in sheet.edges.items():  # the common letter of two edges that meet
-        pen.text(*places[side], letter, _EDGE_LETTER, color=GREY)
+    for edge, letter in sheet.edges.items():  # the common letter of two edges that meet
+        pen.text(*places[edge], letter, _EDGE_LETTER, color=GREY)
     return pen.figure
 
 

@@ -155,18 +155,22 @@ def _discovery_unexplained(**_):
     return _discovered(("outside",), LONG, seed=24, with_m2=False)
 
 
-def _calibration(**_):
-    """Photographs from five places, with a gross error and a photograph without targets."""
+def _calibrated(title, names=("",), gross=0.0, factor=1.0, more=()):
+    """Photographs from five places with a gross error, sds of a factor, and more photographs."""
     field = corner_field("plain", per_side=6, pitch_mm=100.0)
     model = demonstration_model(field)
-    measured = from_five_places(field, model)
-    measured[1].points[3] += 20.0
-    names = [f"{NAMES[k % 3]}-{k}.jpg" for k in range(5)]
+    measured = [replace(o, sigmas=factor * o.sigmas) for o in from_five_places(field, model)]
+    measured[1].points[3] += gross
+    measured += more
     result = calibrate_observations(
-        names, measured, {}, field, CameraSpec("", model.sensor, model.interior.c),
-        AdjustmentSettings(),
+        [f"{names[k % len(names)]}{k}.jpg" for k in range(len(measured))], measured, {}, field,
+        CameraSpec("", model.sensor, model.interior.c), AdjustmentSettings(),
     )  # fmt: skip
-    return render_calibration(result, model.sensor, NAMES[2])
+    return render_calibration(result, model.sensor, title)
+
+
+def _calibration(**_):
+    return _calibrated(NAMES[2], NAMES, gross=20.0)
 
 
 def _fleet(**_):
@@ -365,18 +369,8 @@ def test_down_in_a_figure_is_down_in_the_image(name, page_text, open_page):
 
 
 def test_photographs_without_targets_are_one_line(open_page):
-    field = corner_field("plain", per_side=6, pitch_mm=100.0)
-    model = demonstration_model(field)
-    nothing = Observations(np.arange(0), np.zeros((0, 2)), np.zeros((0, 2)))
-    measured = [
-        *(replace(o, sigmas=o.sigmas / 4) for o in from_five_places(field, model)),
-        *[nothing] * 90,
-    ]
-    result = calibrate_observations(
-        [f"{k}.jpg" for k in range(95)], measured, {}, field,
-        CameraSpec("", model.sensor, model.interior.c), AdjustmentSettings(),
-    )  # fmt: skip
-    page = open_page(render_calibration(result, model.sensor, "camera"), 1280)
+    html = _calibrated("camera", factor=0.25, more=[Observations.none()] * 90)
+    page = open_page(html, 1280)
     steps = page.locator(".answer li").all_text_contents()
     assert [s.split(":")[0] for s in steps if ".jpg" in s] == ["5.jpg, 6.jpg, 7.jpg and 87 more"]
     assert re.search(

@@ -178,12 +178,8 @@ def _trajectory(d: Discovery) -> Figure:
     base, final = (fit.parameters(0) for fit in (d.base_fit, d.final_fit))
     rests = [_without_level(e, e.values - m) for m in (base, final)]
     # a defocus and displaced targets move no parameter
-    moving = [
-        effect.effect
-        for effect in d.effects
-        if effect.effect not in catalogue.names()
-        or catalogue.get(effect.effect).seen_in == "trajectory"
-    ]
+    still = {n for n in catalogue.names() if catalogue.get(n).seen_in != "trajectory"}
+    moving = [effect.effect for effect in d.effects if effect.effect not in still]
     found = bool(moving) and bool(np.abs(final - base).max() > 0)
     root = _root(e)
     model = _without_level(e, final - base) if found else rests[0]

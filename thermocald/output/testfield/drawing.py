@@ -220,6 +220,7 @@ def _seen(points: Array) -> Array:
 _TARGET_NAME = 0.7
 """Height of a target's name in radii of its disc."""
 _EDGE_LETTER = 3.0
+"""Height of the letter at an edge, mm."""
 
 
 def draw(sheet: Sheet) -> Any:

@@ -64,7 +64,7 @@ NOT_RUN = {
 
 ELSEWHERE = {
     "thermocald study --reference --report reference.html": (
-        "tests/cli/test_study_command.py", '"--reference", "--json", "-"',
+        "tests/cli/test_study_command.py", 'document("study", "--reference")',
     ),
     "python -m benchmarks.audit": ("tests/test_audit.py", "from benchmarks.audit import"),
     "python -m benchmarks.object_space": (

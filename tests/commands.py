@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import subprocess
 import sys
@@ -47,6 +48,11 @@ def finish(*arguments: object, folder: Path | None = None) -> subprocess.Complet
     done = call(*arguments, folder=folder)
     assert done.returncode == 0, done.stderr
     return done
+
+
+def document(*arguments: object, folder: Path | None = None) -> Any:
+    """Return the JSON document of a command that has to end well, all of its standard output."""
+    return json.loads(finish(*arguments, "--json", "-", folder=folder).stdout)
 
 
 def answer(*arguments: object, given: str | None = None, **environment: str) -> Result:

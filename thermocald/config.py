@@ -60,12 +60,6 @@ FilePath = Annotated[
 """A path relative to the file's folder."""
 
 
-def _is_number(annotation: Any) -> bool:
-    """Return whether a field holds a number, with limits and None or without."""
-    parts = (annotation, *get_args(annotation))
-    return any(part in (int, float) or get_args(part)[:1] in ((int,), (float,)) for part in parts)
-
-
 class Section(BaseModel):
     """A section of the file: immutable, with finite numbers and without unknown keys."""
 
@@ -78,7 +72,11 @@ class Section(BaseModel):
             known = cls.model_fields.get(key)
             if known is None and cls.model_config["extra"] == "forbid":
                 raise _of_key(str(key), f"unknown{nearest(str(key), list(cls.model_fields))}")
-            if isinstance(value, bool) and known and _is_number(known.annotation):
+            # a number, with limits and None or without
+            kinds = (known.annotation, *get_args(known.annotation)) if known else ()
+            if isinstance(value, bool) and any(
+                kind in (int, float) or get_args(kind)[:1] in ((int,), (float,)) for kind in kinds
+            ):
                 message = f"is {value}, as YAML reads yes, no, on, off; a number is needed"
                 raise _of_key(key, message)
         return data

@@ -87,17 +87,15 @@ class Result(ABC):
         return f"<pre>{escape(str(self))}</pre>"
 
 
-def new_figure(
-    rows: int, columns: int = 1, panel: tuple[float, float] = (5.0, 2.0)
-) -> tuple[Figure, Any]:
-    """Make a matplotlib figure and its axes (rows, columns) without a window or pyplot's state.
+def new_figure(rows: int, panel: tuple[float, float] = (5.0, 2.0)) -> tuple[Figure, Any]:
+    """Make a matplotlib figure and its axes (rows, 1) without a window or pyplot's state.
 
     panel: width and height of an axis, inches. Raises DriverMissing if matplotlib is not installed.
     """
     from thermocald.figures import new_drawing
 
-    with new_drawing(panel[0] * columns, panel[1] * rows) as figure:
-        return figure, figure.subplots(rows, columns, squeeze=False, sharex=columns == 1)
+    with new_drawing(panel[0], panel[1] * rows) as figure:
+        return figure, figure.subplots(rows, 1, squeeze=False, sharex=True)
 
 
 def jsonable(value: Any) -> Any:

@@ -19,7 +19,7 @@ from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
-from thermocald.numbers import typeset_powers, with_sd
+from thermocald.numbers import percent, typeset_powers, with_sd
 from thermocald.output.study.report import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
@@ -306,7 +306,7 @@ def discovery_lines(found: Discovery) -> list[str]:
         if proposal := effect.evidence.get("proposal"):
             lines.append(
                 f"    constants of the first recording explain "
-                f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of the second; "
+                f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of the second; "
                 f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
             )
         lines += [

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 
 import pytest
 
-from tests.commands import call
+from tests.commands import call, document, finish
 from tests.store.small import create_small_series, small_epoch, small_result
 from thermocald.store.database.store import Store
 
@@ -31,23 +30,20 @@ def test_a_backup_is_made_beside_a_writer_verified_and_old_ones_go(store_path, t
     with Store.open(store_path, "append") as writer:
         series = writer.find_series()
         writer.append(series, small_epoch(6))  # in the -wal file
-        done = call("backup", store_path, folder, "--keep", "2", "--json", "-")
-    assert done.returncode == 0
-    document = json.loads(done.stdout)
-    assert document["epochs"] == 4
-    assert [p.rsplit("/", 1)[1] for p in document["deleted"]] == ["s-20200101T000000Z.db"]
+        done = document("backup", store_path, folder, "--keep", "2")
+    assert done["epochs"] == 4
+    assert [p.rsplit("/", 1)[1] for p in done["deleted"]] == ["s-20200101T000000Z.db"]
     assert len(list(folder.glob("*.db"))) == 3
-    with Store.open(folder / document["backup"].rsplit("/", 1)[1]) as copy:
+    with Store.open(folder / done["backup"].rsplit("/", 1)[1]) as copy:
         assert copy.last_epoch(copy.find_series()) == 6
-    with Store.open(folder / document["backup"].rsplit("/", 1)[1], "append") as restored:
+    with Store.open(folder / done["backup"].rsplit("/", 1)[1], "append") as restored:
         assert restored._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
 def test_a_folder_is_made_for_the_store_of_a_configuration(store_path, tmp_path):
     config = tmp_path / "config.yaml"
     config.write_text(f"thermometers: [{{name: t, driver: mock}}]\nstore: {{path: {store_path}}}\n")
-    done = call("backup", "--config", config, f"{tmp_path}/backups/", "--keep", "2")
-    assert done.returncode == 0, done.stderr
+    finish("backup", "--config", config, f"{tmp_path}/backups/", "--keep", "2")
     assert len(list((tmp_path / "backups").glob("s-*Z.db"))) == 1
 
 
@@ -79,7 +75,6 @@ def test_a_backup_is_never_written_over(store_path, tmp_path):
 
 
 def test_a_sound_store_with_gaps_is_sound(store_path):
-    done = call("check", store_path, "--json", "-")
-    document = json.loads(done.stdout)
-    assert (done.returncode, document["damaged"], document["epochs"]) == (0, [], 3)
-    assert document["gaps"] == [{"camera": "rpi", "series": "M1", "first": 3, "last": 4}]
+    done = document("check", store_path)
+    assert (done["damaged"], done["epochs"]) == ([], 3)
+    assert done["gaps"] == [{"camera": "rpi", "series": "M1", "first": 3, "last": 4}]

@@ -14,7 +14,7 @@ import pytest
 
 import thermocald as tc
 from tests.commands import call as run
-from tests.commands import finish
+from tests.commands import document, finish
 from tests.pictures import write_markers
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.store.database.store import Store
@@ -63,9 +63,9 @@ def test_an_interrupted_replay_goes_on(recording, tmp_path):
     kept = [lines[0]] + [line for line in lines[1:] if int(line.split(",")[0]) <= int(last)]
     (half / "observations.csv").write_text("\n".join(kept) + "\n")
     finish("replay", half, "--store", store)
-    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 12
+    assert document("check", store)["series"][0]["last_epoch"] == 12
     finish("replay", recording, "--store", store)
-    assert json.loads(run("check", store, "--json", "-").stdout)["series"][0]["last_epoch"] == 24
+    assert document("check", store)["series"][0]["last_epoch"] == 24
 
 
 @pytest.mark.parametrize("path", ["/proc/self/status", "/proc/1", "/sys", "/dev/null"])
@@ -115,9 +115,9 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     assert f"written: {out}" in done.stdout.replace("\n", "")
     for words in ("Residuals and coverage", "Made on", "3 of 3 photographs"):
         assert words in page.read_text(encoding="utf-8")
-    done = run("calibrate", images[0], "--testfield", tmp_path / "field.csv", "--camera", out,
-               "--free", "none", "--json", "-")  # fmt: skip
-    assert json.loads(done.stdout)["interior"]["c"] == c
+    field = ("--testfield", tmp_path / "field.csv")
+    held = document("calibrate", images[0], *field, "--camera", out, "--free", "none")
+    assert held["interior"]["c"] == c
 
     # a copy of a photograph adds no information, and neither does another encoding of it
     (tmp_path / "camera.yaml").write_text(
@@ -131,19 +131,18 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     (tmp_path / "broken.jpg").write_bytes(b"no image")
     (tmp_path / "empty.jpg").write_bytes(b"")
     added = (copy, smaller, tmp_path / "broken.jpg", tmp_path / "empty.jpg")
-    done = finish("calibrate", *images, *added, "--testfield", tmp_path / "field.csv",
-               "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
-    document = json.loads(done.stdout)
-    assert document["status"] == "ok"
-    assert [p["status"] for p in document["photographs"][:3]] == ["ok"] * 3
+    camera = ("--camera", tmp_path / "camera.yaml")
+    result = document("calibrate", *images, *added, *field, *camera)
+    assert result["status"] == "ok"
+    assert [p["status"] for p in result["photographs"][:3]] == ["ok"] * 3
     for name in ("c", "x0", "y0"):
-        found, sd = document["interior"][name], document["interior"][f"sd_{name}"]
+        found, sd = result["interior"][name], result["interior"][f"sd_{name}"]
         assert abs(found - getattr(model.interior, name)) < 4 * sd
         assert found == written["interior"][name]
         assert sd == written["interior"][f"sd_{name}"]
-    assert len(document["correlations"]["matrix"]) == 8
-    assert document["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
-    again, broken, empty = document["photographs"][4:]
+    assert len(result["correlations"]["matrix"]) == 8
+    assert result["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
+    again, broken, empty = result["photographs"][4:]
     assert again["status"] == broken["status"] == empty["status"] == "bad_image"
     assert "0 bytes" in empty["reason"]
     assert again["reason"].startswith(f"shows the view of {images[1].name}, with the same errors")
@@ -153,11 +152,10 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
 def test_the_demo_finds_what_was_put_in(tmp_path):
     """Ten epochs: the estimated drift is within 4 sd of the true one, and the files can be read."""
     out = tmp_path / "demo"
-    done = finish("demo", "--out", out, "--epochs", 10, "--no-discovery", "--json", "-")
-    document = json.loads(done.stdout)
-    assert document["ok"] == 10
-    assert document["targets"] >= 100
-    for row in document["parameters"]:
+    done = document("demo", "--out", out, "--epochs", 10, "--no-discovery")
+    assert done["ok"] == 10
+    assert done["targets"] >= 100
+    for row in done["parameters"]:
         difference = row["drift_found_px"] - row["drift_in_px"]
         assert abs(difference) < 4 * row["sd_drift_found_px"]
     finish("check", out / "M1")
@@ -166,8 +164,7 @@ def test_the_demo_finds_what_was_put_in(tmp_path):
 
 @pytest.mark.slow
 def test_the_whole_demo_ends_with_the_hidden_effect(tmp_path):
-    done = finish("demo", "--out", tmp_path / "demo", "--epochs", 12, "--json", "-")
-    found = json.loads(done.stdout)["discovery"]
+    found = document("demo", "--out", tmp_path / "demo", "--epochs", 12)["discovery"]
     assert [e["effect"] for e in found["effects"]] == ["thermal_lag"]
     tau = found["effects"][0]["estimates"]["tau"]
     assert abs(tau["value"] - found["hidden"]["tau_s"]) < 4 * tau["sd"]

@@ -12,7 +12,7 @@ import yaml
 import thermocald as tc
 from tests.blind.case import Case
 from tests.blind.generator import generate, write
-from tests.commands import succeed
+from tests.commands import document, succeed
 from thermocald.errors import DataError, UsageError
 
 PROGRAMME = """
@@ -51,10 +51,10 @@ def found(recordings):
 
 def test_everything_is_written(recordings, found):
     model, report = recordings / "model.yaml", recordings / "report.html"
-    document = json.loads(found.stdout)
-    assert document["verdict"] == "effects_found"
-    assert [e["effect"] for e in document["effects"]] == ["thermal_lag"]
-    assert document["model"] == str(model)
+    told = json.loads(found.stdout)
+    assert told["verdict"] == "effects_found"
+    assert [e["effect"] for e in told["effects"]] == ["thermal_lag"]
+    assert told["model"] == str(model)
     assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
     page = report.read_text().replace("\u00a0", " ")
     assert page.count("<figure") == 5
@@ -65,7 +65,7 @@ def test_everything_is_written(recordings, found):
     assert "http://" not in page.replace("http://www.w3.org", "").replace(
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
-    assert document["effects"][0]["statement"][1:] in page
+    assert told["effects"][0]["statement"][1:] in page
     stages = ("reading", "targets that moved", "measuring noise", "base model", "effect 1")
     assert [found.stderr.count(stage) for stage in stages[1:3]] == [1, 1]
     assert [*stages] == sorted(stages, key=found.stderr.index)
@@ -74,9 +74,8 @@ def test_everything_is_written(recordings, found):
 def test_with_the_model_found_nothing_is_missing(recordings, found):
     """The new model explains the recording, predicts, and keeps its effect in the next version."""
     model, again = recordings / "model.yaml", recordings / "again.yaml"
-    result = discover(recordings / "M1", "--model", model, "--json", "-", "--model-out", again)
-
-    assert json.loads(result.stdout)["verdict"] == "adequate"
+    known = document("discover", recordings / "M1", "--model", model, "--model-out", again)
+    assert known["verdict"] == "adequate"
     cameras = [tc.load_camera(model), tc.load_camera(again)]
     assert [[e.name for e in c.model.effects] for c in cameras] == [["thermal_lag"]] * 2
     first, second = (c.at(c.model.T0) for c in cameras)
@@ -99,22 +98,19 @@ def test_another_camera_is_refused(recordings, tmp_path):
 def test_plan(tmp_path):
     series, _ = generate(Case((), 0.1, 33, epochs=90, with_m2=False))
     write(series[0], tmp_path / "quiet")
-    result = discover("--plan", tmp_path / "quiet", "--strength", "0.2", "--json", "-")
-    document = json.loads(result.stdout)
-    assert document["power"]["nonlinear_expansion"] == 1.0
-    assert document["power"]["creep"] == 1.0
-    assert len(document["power"]) >= 15
+    power = document("discover", "--plan", tmp_path / "quiet", "--strength", "0.2")["power"]
+    assert power["nonlinear_expansion"] == power["creep"] == 1.0
+    assert len(power) >= 15
 
 
 @pytest.mark.slow
 def test_plan_of_a_preset():
     """Every effect of 0.1 px is found, or listed with the effect that it resembles."""
-    result = discover("--plan", "--preset", "rpi-v2.1-heating", "--seeds", "1", "--json", "-")
-    document = json.loads(result.stdout)
-    undecided = {name for pair in document["ambiguous"] for name in pair["effects"]}
-    assert {name for name, power in document["power"].items() if power < 1} <= undecided
-    assert sum(power == 1 for power in document["power"].values()) >= 14
-    assert ["thermal_lag", "time_offset"] in [pair["effects"] for pair in document["ambiguous"]]
+    plan = document("discover", "--plan", "--preset", "rpi-v2.1-heating", "--seeds", "1")
+    undecided = {name for pair in plan["ambiguous"] for name in pair["effects"]}
+    assert {name for name, power in plan["power"].items() if power < 1} <= undecided
+    assert sum(power == 1 for power in plan["power"].values()) >= 14
+    assert ["thermal_lag", "time_offset"] in [pair["effects"] for pair in plan["ambiguous"]]
 
 
 @pytest.mark.slow
@@ -122,9 +118,8 @@ def test_plan_of_a_programme(recordings, found, tmp_path):
     """The set-up is a user's model and programme."""
     model, programme = recordings / "model.yaml", tmp_path / "programme.yaml"
     programme.write_text(PROGRAMME)
-    result = discover("--plan", "--model", model, "--programme", programme, "--seeds", "1",
-                      "--strength", "0.3", "--json", "-")  # fmt: skip
-    assert json.loads(result.stdout)["power"]["creep"] == 1.0
+    set_up = ("--model", model, "--programme", programme, "--seeds", "1", "--strength", "0.3")
+    assert document("discover", "--plan", *set_up)["power"]["creep"] == 1.0
 
 
 @pytest.mark.slow
@@ -147,9 +142,8 @@ def test_an_unexplained_misfit_is_bridged_in_the_model(tmp_path):
     series, _ = generate(Case(("outside",), 0.3, 34, epochs=60, with_m2=False))
     write(series[0], tmp_path / "M1")
 
-    result = discover(tmp_path / "M1", "--json", "-", "--model-out", tmp_path / "m.yaml")
-
-    (entry,) = json.loads(result.stdout)["effects"]
+    found = document("discover", tmp_path / "M1", "--model-out", tmp_path / "m.yaml")
+    (entry,) = found["effects"]
     assert entry["effect"] == "unnamed"
     assert entry["evidence"]["base_misfit"]["against"][0]["rms_px"] > 0.05
     written = yaml.safe_load((tmp_path / "m.yaml").read_text())

@@ -19,19 +19,17 @@ from pathlib import Path
 from string import Formatter
 from threading import Thread
 
-import cv2
 import numpy as np
 import pytest
 
 import thermocald as tc
+from tests.cli.test_testfield import photograph
 from tests.commands import call, every_command, finish
 from tests.golden.workshop import photographs
-from tests.photogrammetry.network_cases import convergent_stations
 from thermocald.errors import OutputError
 from thermocald.files import new_file, write_text
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.physics.scene import Scene
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.recording.testfield_file import read_testfield
@@ -128,14 +126,8 @@ class World:
 
     @cached_property
     def photos(self) -> Path:
-        field, folder = read_testfield(self.field), self.folder / "photos"
-        interior = InteriorOrientation(3.05, 0.02, -0.01, -2e-3).as_array()
-        scene = Scene(Sensor(1640, 1232, 0.00224), field)
-        folder.mkdir()
-        for i, station in enumerate(convergent_stations(field.points, 8, distance=440.0)):
-            frame = scene.render(interior, station.as_array(), seed=i)
-            cv2.imwrite(str(folder / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
-        return folder
+        photograph(self.folder / "photos", read_testfield(self.field))
+        return self.folder / "photos"
 
     @cached_property
     def distances(self) -> Path:

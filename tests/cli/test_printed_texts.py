@@ -76,18 +76,14 @@ def test_the_line_of_a_session_stays_one_line(monkeypatch):
 def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path):
     places = (tmp_path / "config.yaml", tmp_path / "etc.yaml")
     monkeypatch.setattr(common, "CONFIG_PLACES", places)
-    with pytest.raises(UsageError, match=r"neither \./config\.yaml nor .*; give --store FILE"):
-        common.require_config(None, "--store FILE")
-    with pytest.raises(ThermocaldError, match=r"neither ./config.yaml nor /etc/thermocald"):
-        run("status")
-    with pytest.raises(ThermocaldError, match=r"neither ./config.yaml nor /etc/thermocald"):
-        run("run")
-    places[1].write_text("store: {path: there.db}\nthermometers: [{name: h, driver: mock}]\n")
-    assert common.require_config(None, "") == places[1]
-    places[0].write_text("store: {path: here.db}\nthermometers: [{name: h, driver: mock}]\n")
-    assert common.require_config(None, "") == places[0]
-    with pytest.raises(ThermocaldError, match=r"no daemon runs for .*here\.db"):
-        run("status")
+    for command, given in (("status", ".* --store FILE"), ("run", "one of --config FILE, --mock")):
+        neither = rf"neither \./config\.yaml nor /etc/thermocald/config\.yaml; give {given}"
+        with pytest.raises(UsageError, match=neither):
+            run(command)
+    for place, store in ((places[1], "there.db"), (places[0], "here.db")):
+        place.write_text(f"store: {{path: {store}}}\nthermometers: [{{name: h, driver: mock}}]\n")
+        with pytest.raises(ThermocaldError, match=f"no daemon runs for .*/{store}"):
+            run("status")
 
 
 def test_a_flat_field_says_what_it_is_good_for():

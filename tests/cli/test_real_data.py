@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.commands import call as run
-from tests.commands import finish
+from tests.commands import document, finish
 from tests.golden.workshop import walls
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
@@ -30,26 +30,25 @@ def test_fixed_cameras(shared, camera, exterior):
     path = shared / "data" / f"aviary-cam{camera}"
     done = finish("replay", path, "--exterior", exterior, "--json", "-")
     assert "Warning" not in done.stderr
-    document = json.loads(done.stdout)
-    assert document["epochs"] == 101
-    assert document["ok"] + len(document["without_result"]) == 101
-    assert document["ok"] >= 99
-    assert all(w["reason"] for w in document["without_result"])
-    ratios = np.array([p["scatter_over_sd"] for p in document["parameters"]])
+    found = json.loads(done.stdout)
+    assert found["epochs"] == 101
+    assert found["ok"] + len(found["without_result"]) == 101
+    assert found["ok"] >= 99
+    assert all(w["reason"] for w in found["without_result"])
+    ratios = np.array([p["scatter_over_sd"] for p in found["parameters"]])
     low, high = (0.9, 1.1) if exterior == "auto" else (0.75, 1.3)
     assert ((low <= ratios) & (ratios <= high)).all(), ratios
-    assert not any(p["drift"] for p in document["parameters"])
-    assert [p["name"] for p in document["parameters"]] == ["c", "x0", "y0"]
+    assert not any(p["drift"] for p in found["parameters"])
+    assert [p["name"] for p in found["parameters"]] == ["c", "x0", "y0"]
 
 
 def test_tags_on_walls(shared, tmp_path):
     """A pose if there are enough tags, otherwise a reason; never a camera from 1 to 3 tags."""
     walls(tmp_path)
-    done = finish("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv",
-               "--camera", tmp_path / "lifecam.yaml", "--json", "-")  # fmt: skip
-    document = json.loads(done.stdout)
-    assert document["status"] == "weak_geometry"
-    found = {p["image"].rsplit("/", 1)[-1]: p for p in document["photographs"]}
+    files = ("--testfield", tmp_path / "walls.csv", "--camera", tmp_path / "lifecam.yaml")
+    result = document("calibrate", shared / "data" / "frc", *files)
+    assert result["status"] == "weak_geometry"
+    found = {p["image"].rsplit("/", 1)[-1]: p for p in result["photographs"]}
     assert len(found) == 7
     for p in found.values():
         assert (p["status"] == "ok") == (p["exterior"] is not None)
@@ -124,16 +123,15 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     run("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
     report = tmp_path / "report.html"
     paths = ("--testfield", board, "--report", report)
-    done = finish("calibrate", folder, *paths, "--pixel-pitch", 0.003, "--json", "-")
-    document = json.loads(done.stdout)
-    status = {p["image"].rsplit("/", 1)[1]: p["status"] for p in document["photographs"]}
+    found = document("calibrate", folder, *paths, "--pixel-pitch", 0.003)
+    status = {p["image"].rsplit("/", 1)[1]: p["status"] for p in found["photographs"]}
     assert sum(status[n] == "ok" for n in images) >= len(opencv) == 9
     assert all(status[n] == "ok" for n in opencv)
-    assert 915 < document["interior"]["c"] / 0.003 < 975
+    assert 915 < found["interior"]["c"] / 0.003 < 975
     # random halves of the folder differ by 14 px in c; as if points were independent: 1.2 px
-    assert 4 < document["interior"]["sd_c"] / 0.003 < 16
-    assert document["doubts"][0].startswith("the photographs disagree")
-    assert document["doubts"][0] in report.read_text()
+    assert 4 < found["interior"]["sd_c"] / 0.003 < 16
+    assert found["doubts"][0].startswith("the photographs disagree")
+    assert found["doubts"][0] in report.read_text()
     words = ["wrong_size", "ok", "nothing_found", "large_residuals", "flat", "bad_image"]
     assert [status[n] for n in sorted(status) if n[1] == "_"] == words
-    assert all(p["reason"] for p in document["photographs"] if p["status"] != "ok")
+    assert all(p["reason"] for p in found["photographs"] if p["status"] != "ok")

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.commands import document, succeed
 from tests.commands import invoke as run
-from tests.commands import succeed
 from tests.photogrammetry import network_cases as cases
 from tests.pictures import ORIENTATION, save_photograph
 from thermocald.errors import GeometryError, ThermocaldError, UsageError
@@ -41,10 +41,21 @@ def test_check_says_before_printing_whether_a_series_gets_a_result(arguments, ca
     """The same bounds as the adjustment's, on what `print` would draw."""
     result = run("testfield", "check", *arguments)
     assert ("NOT ENOUGH" in result.stdout) is not calibrates
-    document = json.loads(run("testfield", "check", *arguments, "--json", "-").stdout)
-    assert document["calibrates"] is calibrates
+    found = document("testfield", "check", *arguments)
+    assert found["calibrates"] is calibrates
     if not calibrates:
-        assert any("correlate at" in reason for reason in document["weak"])
+        assert any("correlate at" in reason for reason in found["weak"])
+
+
+def photograph(folder, truth):
+    """Write eight rendered photographs of a field to a new folder; return the camera."""
+    model = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
+    scene = Scene(model.sensor, truth)
+    folder.mkdir()
+    for i, station in enumerate(cases.convergent_stations(truth.points, 8, distance=440.0)):
+        frame = scene.render(model.interior.as_array(), station.as_array(), seed=i)
+        cv2.imwrite(str(folder / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return model
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +70,7 @@ def photographs(tmp_path_factory):
     truth = TestField.build(
         nominal.names, points, 0.0, nominal.diameters, nominal.kinds, nominal.codes
     )
-    model = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
-    scene = Scene(model.sensor, truth)
-    (folder / "photos").mkdir()
-    for i, station in enumerate(cases.convergent_stations(points, 8, distance=440.0)):
-        frame = scene.render(model.interior.as_array(), station.as_array(), seed=i)
-        cv2.imwrite(str(folder / "photos" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    model = photograph(folder / "photos", truth)
     a, b = "R65", next(n for n, p in zip(truth.names, points, strict=True)
                        if n.startswith("R") and p[0] > 300 and p[1] < 80)  # fmt: skip
     length = np.linalg.norm(points[truth.index[a]] - points[truth.index[b]])
@@ -93,19 +99,19 @@ def test_survey_writes_the_field_and_everything_about_it(photographs, tmp_path):
     moved, _ = cases.onto(surveyed.points, known)
     # JPEG: these errors come from the image, not from the program
     assert np.sqrt(np.mean((moved - known) ** 2)) < 490 / 20_000
-    document = json.loads((tmp_path / "survey.json").read_text())
-    assert document["format"] == "thermocald-survey/1"
-    assert len(document["targets"]) == len(surveyed)
-    assert len(document["stations"]) == 8
-    first = document["targets"][0]
+    told = json.loads((tmp_path / "survey.json").read_text())
+    assert told["format"] == "thermocald-survey/1"
+    assert len(told["targets"]) == len(surveyed)
+    assert len(told["stations"]) == 8
+    first = told["targets"][0]
     assert np.sqrt(np.diag(first["covariance"])) == pytest.approx(
         [first["sd_X"], first["sd_Y"], first["sd_Z"]]
     )
-    assert document["relative_accuracy"] < 1 / 20_000
-    assert document["camera"]["c"] == pytest.approx(model.interior.c, rel=2e-4)
+    assert told["relative_accuracy"] < 1 / 20_000
+    assert told["camera"]["c"] == pytest.approx(model.interior.c, rel=2e-4)
     found = camera_files.read(camera_file)
-    assert found.model.interior.c == document["camera"]["c"]
-    assert found.covariance[0, 0] == pytest.approx(document["camera"]["sd_c"] ** 2)
+    assert found.model.interior.c == told["camera"]["c"]
+    assert found.covariance[0, 0] == pytest.approx(told["camera"]["sd_c"] ** 2)
 
 
 def test_survey_with_a_known_camera_held(photographs, tmp_path):
@@ -114,17 +120,16 @@ def test_survey_with_a_known_camera_held(photographs, tmp_path):
     (tmp_path / "distances.csv").write_text(
         f"a,b,length,sigma\n{scale[0]},{scale[1]},{scale[2]},0.02\n"
     )
-    result = succeed(
+    found = document(
         "testfield", "survey", *sorted((folder / "photos").glob("*.jpg")), "--distances",
         tmp_path / "distances.csv", "--camera", tmp_path / "camera.xml", "--hold-camera", "--out",
-        tmp_path / "s.csv", "--json", "-",
+        tmp_path / "s.csv",
     )  # fmt: skip
-    document = json.loads(result.stdout)
-    assert document["camera"]["free"] == []
-    assert document["camera"]["sd_c"] == 0.0
-    assert document["camera"]["c"] == model.interior.c
+    assert found["camera"]["free"] == []
+    assert found["camera"]["sd_c"] == 0.0
+    assert found["camera"]["c"] == model.interior.c
     # without a nominal field: the coded targets alone
-    assert all(row["target"].startswith("R") for row in document["targets"])
+    assert all(row["target"].startswith("R") for row in found["targets"])
 
 
 @pytest.mark.parametrize(
@@ -159,16 +164,13 @@ def test_a_wrong_file_of_distances_is_named_by_its_line(photographs, tmp_path):
 
 
 def test_check_json_from_a_place(photographs):
-    result = succeed(
-        "testfield", "check", photographs[0] / "testfield.csv", "--from", 700, 150, 400, "--roll",
-        20, "--json", "-",
-    )  # fmt: skip
-    document = json.loads(result.stdout)
-    assert document["format"] == "thermocald-testfield-check/1"
-    assert document["epoch"]["sd_c"] is None  # a plane: nothing finite to say
-    assert document["series"]["sd_c"] > 0
-    assert document["station"]["X0"] == 700
-    assert len(document["visible"]) + len(document["hidden"]) == document["targets"]
+    field = photographs[0] / "testfield.csv"
+    found = document("testfield", "check", field, "--from", 700, 150, 400, "--roll", 20)
+    assert found["format"] == "thermocald-testfield-check/1"
+    assert found["epoch"]["sd_c"] is None  # a plane: nothing finite to say
+    assert found["series"]["sd_c"] > 0
+    assert found["station"]["X0"] == 700
+    assert len(found["visible"]) + len(found["hidden"]) == found["targets"]
     with pytest.raises(GeometryError, match="visible from there"):
         run("testfield", "check", photographs[0] / "testfield.csv", "--from", 200, 150, -400,
             "--at", 200, 150, -900)  # fmt: skip

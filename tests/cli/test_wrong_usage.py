@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import socket
@@ -192,9 +193,20 @@ def test_what_is_no_store_gets_no_page(tmp_path, file, said):
     assert f"{file}: {said}" in lines[0]
 
 
-def test_an_input_in_a_closed_folder_cannot_be_read(monkeypatch):
+@pytest.mark.parametrize(
+    ("is_open", "why"), [(False, "read: Permission denied"), (True, "written")]
+)
+def test_an_input_in_a_closed_folder_cannot_be_read(monkeypatch, is_open, why):
     """The tests may run as root, to whom no folder is closed."""
-    monkeypatch.setattr(cli.os, "access", lambda *_: False)
-    assert cli._is_read(PermissionError(13, "Permission denied", "closed/recording.yaml"))
-    monkeypatch.setattr(cli.os, "access", lambda *_: True)
-    assert not cli._is_read(PermissionError(13, "Permission denied", "read-only/new.html"))
+
+    def denied(*_):
+        raise PermissionError(13, "Permission denied", "closed/recording.yaml")
+
+    monkeypatch.setattr(cli, "application", denied)
+    monkeypatch.setattr(cli.os, "access", lambda *_: is_open)
+    out, err = io.StringIO(), io.StringIO()
+    monkeypatch.setattr(cli.sys, "stdout", out)
+    monkeypatch.setattr(cli.sys, "stderr", err)
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    assert f"error: closed/recording.yaml: cannot be {why}" in err.getvalue()

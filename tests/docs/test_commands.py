@@ -64,7 +64,7 @@ NOT_RUN = {
 
 ELSEWHERE = {
     "thermocald study --reference --report reference.html": (
-        "tests/cli/test_study_command.py", '"--reference", "--json", "-"',
+        "tests/cli/test_study_command.py", 'document("study", "--reference")',
     ),
     "python -m benchmarks.audit": ("tests/test_audit.py", "from benchmarks.audit import"),
     "python -m benchmarks.object_space": (
@@ -231,19 +231,13 @@ class Page:
         """Ctrl-C for what stays, or for one of them."""
         for command, process in list(self.staying):
             if only in ("", command):
-                status = self.interrupted(process)
+                os.killpg(process.pid, signal.SIGINT)
+                try:
+                    status = process.wait(PATIENCE_S)
+                except subprocess.TimeoutExpired:
+                    pytest.fail(f"{self.page}: Ctrl-C does not end it:\n{self.output()[-2000:]}")
                 self.staying.remove((command, process))
                 assert status in (0, 130), f"{command}: {status}"
-
-    def interrupted(self, process: subprocess.Popen[str]) -> int:
-        """The exit status after Ctrl-C."""
-        os.killpg(process.pid, signal.SIGINT)
-        try:
-            return process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(
-                f"{self.page}: it does not end on Ctrl-C:\n{self.output()[-2000:]}"
-            ) from None
 
     def kill(self) -> None:
         for _, process in self.staying:

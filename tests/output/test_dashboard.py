@@ -34,22 +34,28 @@ _CSV_REQUEST = b"GET /api/series.csv?camera=rpi&series=M1 HTTP/1.1\r\nHost: 127.
 DEVICE = {"device": "open", "why": "", "faults": 0}
 
 
+def add_series(path, camera, times, values=None, size=(64, 48)):
+    """Add a series M1 to a store, 20 °C and 0.01 K more in each epoch; values: of all parameters,
+    None: not calibrated.
+    """
+    sensor = Sensor(*size, 0.003)
+    head = Head(camera, "M1", 10.0, CameraSpec(camera, sensor), {"temperature": Channel()})
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+        for k, time in enumerate(times, start=1):
+            result = None
+            if values is not None:
+                parameters = np.full(16, float(values[k - 1]))
+                result = EpochResult("ok", "", parameters, np.eye(16), 1.0, 10, 2, ())
+            store.append(series, Epoch(k, time, time, {"temperature": 20.0 + k / 100}), result)
+
+
 @pytest.fixture(scope="module")
 def store_path(tmp_path_factory):
     """A store of 1200 epochs."""
-    head = Head(
-        "rpi-M1", "M1", 10.0, CameraSpec("rpi", Sensor(3280, 2464, 0.00112)),
-        {"temperature": Channel()},
-    )  # fmt: skip
-    field = TestField.build(["a", "b"], np.zeros((2, 3)))
-    path = tmp_path_factory.mktemp("store") / "t.db"
-    with Store.open(path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for k in range(1, 1201):
-            values = np.full(16, float(k))
-            result = EpochResult("ok", "", values, np.eye(16), 1.0, 10, 2, ())
-            time = 1.6e9 + 10 * k
-            store.append(series, Epoch(k, time, time, {"temperature": 20.0 + k / 100}), result)
+    path, numbers = tmp_path_factory.mktemp("store") / "t.db", np.arange(1, 1201)
+    add_series(path, "rpi", (1.6e9 + 10 * numbers).tolist(), numbers)
+    with Store.open(path, "append") as store:
         store.add_event(Event(1.6e9, "knock", "<b>somebody</b> came"))
     return path
 
@@ -113,12 +119,8 @@ def client_of(folders):
 @pytest.mark.parametrize(("late", "shown"), [(0, 5), (3, 3)])
 def test_epochs_before_the_clock_was_set_are_counted_and_not_drawn(tmp_path, late, shown):
     """A Raspberry Pi without a battery begins in 1970; a simulated series stays there."""
-    head = Head("rpi", "M1", 10.0, CameraSpec("rpi", Sensor(64, 48, 0.003)), {"t": Channel()})
-    with Store.open(tmp_path / "t.db", "append", durable=False) as store:
-        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
-        for n in range(5):
-            t = 10.0 * n + (1.75e9 if n >= 5 - late else 0.0)
-            store.append(series, Epoch(n + 1, t, t, {"t": 20.0}), None)
+    times = [10.0 * n + (1.75e9 if n >= 5 - late else 0.0) for n in range(5)]
+    add_series(tmp_path / "t.db", "rpi", times)
     columns = View(tmp_path / "t.db", tmp_path).columns("rpi", "M1", None, None, 100)
     assert (columns["epochs"], columns["unset"]) == (shown, 5 - shown)
     assert min(columns["frame_time"]) == (1.75e9 + 20.0 if late else 0.0)
@@ -365,14 +367,12 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
 
 def test_the_table_of_a_series_without_epochs_has_its_header(tmp_path):
     """Its camera's name, which no header of an answer may hold, was an error of the server."""
-    head = Head("rpi", "M1", 10.0, CameraSpec("相机", Sensor(64, 48, 0.003)), {"t": Channel()})
-    with Store.open(tmp_path / "t.db", "append", durable=False) as store:
-        store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+    add_series(tmp_path / "t.db", "相机", [])
     client = Client(build_application(tmp_path / "t.db", tmp_path, None, "::1"), "http://[::1]")
     answer = client.get("/api/series.csv", params={"camera": "相机", "series": "M1"})
     assert answer.headers["content-disposition"] == 'attachment; filename="---M1.csv"'
     header, *rows = answer.text.splitlines()
-    assert header.startswith("epoch,frame_time,temperature_time,t,c,x0,")
+    assert header.startswith("epoch,frame_time,temperature_time,temperature,c,x0,")
     assert rows == []
 
 

@@ -5,18 +5,11 @@ from __future__ import annotations
 import json
 import os
 
-import numpy as np
 import pytest
 
-from tests.output.test_dashboard import start_page
+from tests.output.test_dashboard import add_series, start_page
 from tests.output.test_pages import _WIDER, keep
 from thermocald.daemon.live_state import status_warnings
-from thermocald.epoch import Epoch
-from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.database.store import Store
-from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.series import EpochResult
 
 _OPEN = {"device": "open", "why": "", "since": None, "faults": 0}
 # c of camera k is k mm, which identifies the camera of a value
@@ -54,28 +47,21 @@ def page_with(tmp_path):
             "frames": {"paused": ""}, "cameras": {}, "thermometers": {"housing": _OPEN},
             "outputs": {"mqtt": {**_OPEN, "device": "out", "why": "no broker", "since": 1.6e9}},
         }  # fmt: skip
-        with Store.open(path, "append", durable=False) as store:
-            for k in range(1, cameras + 1):
-                camera = CameraSpec(_name(k), Sensor(640, 480, 0.003))
-                head = Head(_name(k), "M1", 10.0, camera, {"temperature": Channel()})
-                series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
-                for n in range(1, 31):
-                    result = EpochResult("ok", "", np.full(16, float(k)), np.eye(16), 1.0, 10, 2,
-                                         ())  # fmt: skip
-                    time = 1.6e9 + 10 * n
-                    store.append(series, Epoch(n, time, time, {"temperature": 20.0 + n}), result)
-                last = {"epoch": 30, "frame_time": 1.6e9 + 300, "temperature": 50.0, "c": float(k),
-                        "sigma0": 1.0, "n_observations": k, "n_rejected": 0, "status": "ok",
-                        "state": "ready"}  # fmt: skip
-                status["cameras"][_name(k)] = {
-                    **_OPEN, "series": "M1", "period_s": 10.0, "late_p99_s": 0.0, "skipped": 0,
-                    "lost": 0, "deferred": 0, "caught_up": 0, "last": last,
-                }  # fmt: skip
-                targets = {"x": [9.0] * k, "y": [9.0] * k, "vx": [0.1] * k, "vy": [0.1] * k,
-                           "rejected": [False] * k}  # fmt: skip
-                (live / f"{_name(k)}.json").write_text(
-                    json.dumps({"row": {"epoch": 30}, "targets": targets})
-                )
+        for k in range(1, cameras + 1):
+            times = [1.6e9 + 10 * n for n in range(1, 31)]
+            add_series(path, _name(k), times, [k] * 30, (640, 480))
+            last = {"epoch": 30, "frame_time": 1.6e9 + 300, "temperature": 50.0, "c": float(k),
+                    "sigma0": 1.0, "n_observations": k, "n_rejected": 0, "status": "ok",
+                    "state": "ready"}  # fmt: skip
+            status["cameras"][_name(k)] = {
+                **_OPEN, "series": "M1", "period_s": 10.0, "late_p99_s": 0.0, "skipped": 0,
+                "lost": 0, "deferred": 0, "caught_up": 0, "last": last,
+            }  # fmt: skip
+            targets = {"x": [9.0] * k, "y": [9.0] * k, "vx": [0.1] * k, "vy": [0.1] * k,
+                       "rejected": [False] * k}  # fmt: skip
+            (live / f"{_name(k)}.json").write_text(
+                json.dumps({"row": {"epoch": 30}, "targets": targets})
+            )
         server, port = start_page(path, live)
         servers.append(server)
 

@@ -102,6 +102,16 @@ _CUT = """() => [...document.querySelectorAll('svg text')].filter(t => {
 # Tables that are wider than the page.
 _SCROLLED = """() => [...document.querySelectorAll('.scroll')]
   .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.getAttribute('aria-label'))"""
+# Tables with less than 12 px between the texts of two columns.
+_CLOSE = """() => [...document.querySelectorAll('table')].filter(t => {
+  const texts = [...t.rows].map(r => [...r.cells].map(c => {
+    const text = document.createRange();
+    text.selectNodeContents(c);
+    return text.getBoundingClientRect(); }));
+  return texts[0].some((_, k) => k &&
+    Math.min(...texts.filter(r => r[k].width).map(r => r[k].left))
+    - Math.max(...texts.map(r => r[k - 1].right)) < 12);
+}).map(t => t.closest('.scroll').getAttribute('aria-label'))"""
 # Drawings that must be scrolled sideways, and letters too small to read on a phone.
 _DRAGGED = """() => [...document.querySelectorAll('.panel')].filter(p =>
   p.scrollWidth > p.clientWidth + 1
@@ -145,18 +155,22 @@ def _discovery_unexplained(**_):
     return _discovered(("outside",), LONG, seed=24, with_m2=False)
 
 
-def _calibration(**_):
-    """Photographs from five places, with a gross error and a photograph without targets."""
+def _calibrated(title, names=("",), gross=0.0, factor=1.0, more=()):
+    """Photographs from five places with a gross error, sds of a factor, and more photographs."""
     field = corner_field("plain", per_side=6, pitch_mm=100.0)
     model = demonstration_model(field)
-    measured = from_five_places(field, model)
-    measured[1].points[3] += 20.0
-    names = [f"{NAMES[k % 3]}-{k}.jpg" for k in range(5)]
+    measured = [replace(o, sigmas=factor * o.sigmas) for o in from_five_places(field, model)]
+    measured[1].points[3] += gross
+    measured += more
     result = calibrate_observations(
-        names, measured, {}, field, CameraSpec("", model.sensor, model.interior.c),
-        AdjustmentSettings(),
+        [f"{names[k % len(names)]}{k}.jpg" for k in range(len(measured))], measured, {}, field,
+        CameraSpec("", model.sensor, model.interior.c), AdjustmentSettings(),
     )  # fmt: skip
-    return render_calibration(result, model.sensor, NAMES[2])
+    return render_calibration(result, model.sensor, title)
+
+
+def _calibration(**_):
+    return _calibrated(NAMES[2], NAMES, gross=20.0)
 
 
 def _fleet(**_):
@@ -304,8 +318,9 @@ def test_a_report_as_a_page(name, page_text, open_page):
         if width == 390:
             assert (page.evaluate(_DRAGGED), page.evaluate(_SMALL)) == ([], [])
             assert not any(page.evaluate(_SCROLLED))  # what a command prints may be wider
-        if width == 1280 and name != "study-names":
+        if width == 1280:
             assert page.evaluate(_SCROLLED) == []
+            assert page.evaluate(_CLOSE) == []
     page = open_page(html, 794)  # A4 at 96 px per inch
     page.emulate_media(media="print")
     assert page.locator("button:visible, nav:visible").count() == 0
@@ -321,6 +336,13 @@ def test_a_candidate_is_blue_only_where_it_is_named(name, bars, page_text, open_
     blue = """() => [...document.querySelectorAll('#candidates svg g[id*="patch_"] path')]
       .filter(p => getComputedStyle(p).fill === 'rgb(0, 114, 178)').length"""
     assert page.evaluate(blue) == bars
+
+
+@pytest.mark.slow
+def test_only_effects_that_move_the_image_have_a_pattern(undrawn):
+    words = words_of(_discovered(("decentering_drift", "defocus"), "two", seed=1))
+    assert "Effect found: defocus" in words
+    assert "in the pattern of decentering_drift, root mean square" in words
 
 
 def test_the_epochs_report_opens_with_the_drift(page_text, open_page):
@@ -347,18 +369,8 @@ def test_down_in_a_figure_is_down_in_the_image(name, page_text, open_page):
 
 
 def test_photographs_without_targets_are_one_line(open_page):
-    field = corner_field("plain", per_side=6, pitch_mm=100.0)
-    model = demonstration_model(field)
-    nothing = Observations(np.arange(0), np.zeros((0, 2)), np.zeros((0, 2)))
-    measured = [
-        *(replace(o, sigmas=o.sigmas / 4) for o in from_five_places(field, model)),
-        *[nothing] * 90,
-    ]
-    result = calibrate_observations(
-        [f"{k}.jpg" for k in range(95)], measured, {}, field,
-        CameraSpec("", model.sensor, model.interior.c), AdjustmentSettings(),
-    )  # fmt: skip
-    page = open_page(render_calibration(result, model.sensor, "camera"), 1280)
+    html = _calibrated("camera", factor=0.25, more=[Observations.none()] * 90)
+    page = open_page(html, 1280)
     steps = page.locator(".answer li").all_text_contents()
     assert [s.split(":")[0] for s in steps if ".jpg" in s] == ["5.jpg, 6.jpg, 7.jpg and 87 more"]
     assert re.search(
@@ -366,19 +378,32 @@ def test_photographs_without_targets_are_one_line(open_page):
     )
 
 
-def test_a_name_from_right_to_left_exchanges_no_numbers(page_text, open_page):
-    """Seen once: a camera of 3280 × 2464 px looked like one of 2464 × 3280."""
-    page = open_page(page_text("calibration"), 1280)
-    places = page.evaluate("""() => {
-      const walk = document.createTreeWalker(document.querySelector('.device'), 4);
-      const left = {};
-      for (let node; (node = walk.nextNode());) for (const word of ['3280', '2464', 'px']) {
+@pytest.mark.parametrize(
+    ("name", "where", "words"),
+    [
+        ("calibration", ".device", ("3280", "2464", "px")),
+        ("fleet", "td", ("● ", NAMES[2], "/cam2")),
+    ],
+)
+def test_a_name_from_right_to_left_exchanges_nothing(name, where, words, page_text, open_page):
+    """A camera of 3280 × 2464 px looked like one of 2464 × 3280, station/camera like the camera's
+    station.
+    """
+    page = open_page(page_text(name), 1280)
+    places = page.evaluate(
+        """([where, words]) => {
+      const all = [...document.querySelectorAll(where)];
+      const found = all.find(e => words.every(w => e.textContent.includes(w)));
+      const walk = document.createTreeWalker(found, 4), left = {};
+      for (let node; (node = walk.nextNode());) for (const word of words) {
         const at = node.data.indexOf(word), range = document.createRange();
         if (at < 0) continue;
         range.setStart(node, at); range.setEnd(node, at + word.length);
         left[word] = range.getBoundingClientRect().left;
       }
-      return [left['3280'], left['2464'], left['px']]; }""")
+      return words.map(w => left[w]); }""",
+        [where, words],
+    )
     assert places == sorted(places)
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from tests.commands import succeed as run
 from thermocald.errors import UsageError
-from thermocald.output.series_export import style_of
 from thermocald.physics.presets import preset_simulation
 from thermocald.physics.testfields import corner_field
 from thermocald.store.database.store import Store
@@ -106,12 +105,13 @@ def test_unknown_columns_of_a_recording_are_extra(recording, tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("mm", "seconds", ",", "."), "--units mm: must be one of"),
-        (("", "local", ",", "."), "--time local"),
-        (("", "iso", "x", "."), "--separator x"),
-        (("", "iso", ",", ","), "needs another --separator"),
+        ("--units mm", "--units mm: must be one of"),
+        ("--time local", "--time local"),
+        ("--separator x", "--separator x"),
+        ("--decimal ,", "needs another --separator"),
+        ("--format json --time iso", "are for csv and parquet"),
     ],
 )
-def test_styles_that_there_are_not_are_refused(options, reason):
+def test_styles_that_there_are_not_are_refused(recording, options, reason):
     with pytest.raises(UsageError, match=reason):
-        style_of(*options)
+        run("export", recording, *options.split())

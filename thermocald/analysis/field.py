@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.numbers import parameter_label
+from thermocald.numbers import parameter_label, percent
 from thermocald.photogrammetry.camera.camera_model import (
     DEFAULT_FREE,
     EOP,
@@ -180,8 +180,8 @@ class FieldCheck:
             lines += [f"  because: {reason}" for reason in self.weak]
         lines.append(
             f"{len(self.visible)} of {len(self.field)} targets visible from ({X:.0f}, {Y:.0f}, "
-            f"{Z:.0f}) mm, {self.distance:.0f} mm away; they cover {self.coverage:.0%} of the "
-            f"image, depth relief {self.depth_relief:.0%} of the distance"
+            f"{Z:.0f}) mm, {self.distance:.0f} mm away; they cover {percent(self.coverage)} of the "
+            f"image, depth relief {percent(self.depth_relief)} of the distance"
         )
         lines += [f"  {reasons.count(reason)} {reason}" for reason in sorted(set(reasons))]
         lines.append(

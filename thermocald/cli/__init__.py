@@ -82,7 +82,8 @@ def _options(
 def main() -> None:
     """Run the command line; print every foreseen error in one line, without a traceback."""
     with contextlib.suppress(ValueError):  # raised outside the main thread
-        signal.signal(signal.SIGTERM, _end)  # an exception, so that half-written files are removed
+        # an exception, so that half-written files are removed
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     _prepare_process()
     try:
         status = application(_command_name())(prog_name="thermocald", standalone_mode=False)
@@ -112,8 +113,13 @@ def main() -> None:
             raise
         where = "its folder" if isinstance(error, FileNotFoundError) else "standard output"
         failed = cannot_write(str(error.filename or where), error)
-        what = error.strerror if isinstance(error.filename, str) and _is_read(error) else None
-        say(f"error: {error.filename}: cannot be read: {what}" if what else f"error: {failed}")
+        text = str(failed)
+        # outputs are tried before anything is computed: a file that is not there is an input
+        if isinstance(error.filename, str) and not os.path.lexists(error.filename):
+            closed = not os.access(os.path.dirname(error.filename) or ".", os.X_OK)
+            if error.strerror and (closed or isinstance(error, FileNotFoundError)):
+                text = f"{error.filename}: cannot be read: {error.strerror}"
+        say(f"error: {text}")
         with contextlib.suppress(OSError):
             sys.stdout.close()  # otherwise Python flushes it at exit, and fails again
         sys.exit(failed.exit_status)
@@ -151,17 +157,3 @@ def _prepare_process() -> None:
     sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
-
-
-def _end(*_: object) -> None:
-    sys.exit(128 + signal.SIGTERM)
-
-
-def _is_read(error: OSError) -> bool:
-    """Return whether the error concerns an input that is missing or in a closed folder.
-
-    An output is tried before anything is computed.
-    """
-    absent = not os.path.lexists(str(error.filename))
-    closed = not os.access(os.path.dirname(str(error.filename)) or ".", os.X_OK)
-    return absent and (isinstance(error, FileNotFoundError) or closed)

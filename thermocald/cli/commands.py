@@ -137,13 +137,20 @@ class Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Check numbers, options and outputs, then run the command."""
         for parameter in self.get_params(ctx):
-            given = ctx.params.get(parameter.name)
-            for value in given if isinstance(given, tuple | list) else (given,):
+            values = ctx.params.get(parameter.name)
+            for value in values if isinstance(values, tuple | list) else (values,):
                 if isinstance(value, float) and not math.isfinite(value):
                     raise UsageError(f"{parameter.opts[0]}: {value} is no finite number")
         if not ctx.params.get("dry_run"):
             _check_outputs(ctx)
-        _check_use(ctx)
+        # an option that does nothing without another, or beside it
+        options = {p.name: max(p.opts, key=len) for p in self.params}
+        given = {n for n in options if ctx.get_parameter_source(n).name == "COMMANDLINE"}
+        for table, here in ((_NEEDED, False), (_IDLE, True)):
+            for name, others in table.get(_words(ctx), {}).items():
+                for other in given.intersection(others.split()) if (name in given) is here else ():
+                    does = "does nothing with" if here else "needs"
+                    raise UsageError(f"{options[other]} {does} {options[name]}")
         return super().invoke(ctx)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -158,17 +165,6 @@ class Command(TyperCommand):
         for title in sorted(sections, key=["Arguments", "Options", ADVANCED].index):
             with formatter.section(title):
                 formatter.write_dl(sections[title])
-
-
-def _check_use(ctx: Any) -> None:
-    """Raise UsageError for an option that does nothing without another, or beside it."""
-    options = {p.name: max(p.opts, key=len) for p in ctx.command.params}
-    given = {n for n in options if ctx.get_parameter_source(n).name == "COMMANDLINE"}
-    for table, here in ((_NEEDED, False), (_IDLE, True)):
-        for name, others in table.get(_words(ctx), {}).items():
-            for other in given.intersection(others.split()) if (name in given) is here else ():
-                does = "does nothing with" if here else "needs"
-                raise UsageError(f"{options[other]} {does} {options[name]}")
 
 
 def _words(ctx: Any) -> str:

@@ -296,7 +296,11 @@ _OLD_S = 10.0
 
 def status_lines(document: dict[str, Any]) -> list[str]:
     """Return a `thermocald-status/1` document as lines; the first is the headline."""
-    lines = [_headline(document), ""]
+    running = duration(max(0.0, document["utc"] - document["started"]))
+    headline = f"thermocald {document['version']}, pid {document['pid']}, for {running}"
+    if (age := document["age_s"]) > _OLD_S:
+        headline += f"; this status is {duration(age)} old: the daemon does not answer"
+    lines = [headline, ""]
     for name, camera in document["cameras"].items():
         lines += _camera(name, camera)
     for one in document["sessions"].values():
@@ -321,14 +325,6 @@ def _wrapped(text: str, indent: int = 2) -> list[str]:
     ) or [""]  # fmt: skip
 
 
-def _headline(document: dict[str, Any]) -> str:
-    running = duration(max(0.0, document["utc"] - document["started"]))
-    text = f"thermocald {document['version']}, pid {document['pid']}, for {running}"
-    if document["age_s"] > _OLD_S:
-        text += f"; this status is {duration(document['age_s'])} old: the daemon does not answer"
-    return text
-
-
 def _camera(name: str, camera: dict[str, Any]) -> list[str]:
     last = camera.get("last") or {}
     title = f"{name}/{camera['series']}" if camera["series"] else f"{name}, idle"
@@ -339,8 +335,11 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
         lines[0] += f", epoch {last.get('epoch', '?')}{at}"
         if last.get("status") in WITH_VALUES:
             lines += _orientation(last)
-            lines += _wrapped(f"  {_movement(last)}")
-            if change := (last.get("online") or {}).get("orientation"):
+            online, sigma0 = last.get("online") or {}, last.get("sigma0")
+            fit = "" if sigma0 is None or not math.isfinite(sigma0) else f"σ₀ {sigma0:.2f}"
+            state = str(online.get("sentence") or last.get("state", ""))
+            lines += _wrapped(f"  {', '.join(part for part in (fit, state) if part)}")
+            if change := online.get("orientation"):
                 lines += _wrapped(f"  {change}")
         else:
             lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}".rstrip(": "))
@@ -362,14 +361,6 @@ def _orientation(last: dict[str, Any]) -> list[str]:
             line = f"{line:<34}moved {with_sd(drift, sd_drift, 'px')} since the start"
         lines.append(line)
     return lines
-
-
-def _movement(last: dict[str, Any]) -> str:
-    online = last.get("online") or {}
-    state = str(online.get("sentence") or last.get("state", ""))
-    sigma0 = last.get("sigma0")
-    fit = "" if sigma0 is None or not math.isfinite(sigma0) else f"σ₀ {sigma0:.2f}"
-    return ", ".join(part for part in (fit, state) if part)
 
 
 def _device(device: dict[str, Any]) -> str:

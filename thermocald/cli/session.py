@@ -102,7 +102,7 @@ def status(config: ConfigOption = None, json: JsonOption = None) -> None:
 
     Example: thermocald session status --config /etc/thermocald/config.yaml
     """
-    sessions = _ask(config, "session status")["sessions"]
+    sessions = _ask(_configuration(config), "session status")["sessions"]
     lines = map(session_line, sessions.values()) if sessions else ["no sessions"]
     show({"format": "thermocald-sessions/1", "sessions": sessions}, json, *lines)
 
@@ -114,12 +114,13 @@ def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
     """
     from thermocald.daemon.desk import only_camera
 
-    name = only_camera(_configuration(config, False), camera)
-    one = _ask(config, "session stop", camera=name)["session"]
+    read = _configuration(config)
+    name = only_camera(read, camera)
+    one = _ask(read, "session stop", camera=name)["session"]
     say(f"{name}/{one['series']}: {one['taken']} of {one['epochs']} epochs, stopped")
 
 
-def _configuration(config: Path | None, mock: bool) -> Config:
+def _configuration(config: Path | None, mock: bool = False) -> Config:
     from thermocald.config import load_config
     from thermocald.hal import load_driver
 
@@ -132,14 +133,13 @@ def _configuration(config: Path | None, mock: bool) -> Config:
     return load_config(require_config(config, "--config FILE, or --mock"), load_driver)
 
 
-def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:
+def _ask(config: Config, do: str, **values: Any) -> dict[str, Any]:
     from thermocald.daemon.control import ask
     from thermocald.daemon.live_state import find_state
 
-    read = _configuration(config, False)
-    answer = ask(find_state(read.store.path), do, **values)
+    answer = ask(find_state(config.store.path), do, **values)
     if answer is None:
-        raise DataError(f"no daemon runs for {read.store.path}; start it with `thermocald run`")
+        raise DataError(f"no daemon runs for {config.store.path}; start it with `thermocald run`")
     return answer
 
 

@@ -134,8 +134,8 @@ def export(
     exterior = exterior or ("auto" if folder else "stored")
     if format_ not in ("csv", "json", "parquet"):
         raise UsageError(f"--format {format_}: must be one of csv, json, parquet")
-    style = series_export.style_of(units, time_, separator, decimal)
-    plain = style == series_export.ExportStyle()
+    wanted, mark = series_export.check_style(units, time_, separator, decimal)
+    plain = not wanted and (time_, mark, decimal) == ("seconds", ",", ".")
     if format_ == "parquet" and output == "-":
         raise UsageError("--format parquet needs a file: -o FILE")
     if format_ == "json" and not plain:
@@ -147,13 +147,13 @@ def export(
     if extra or format_ == "parquet" or not plain:
         known = opened.besides(table.number, extra=extra)
     pitch = opened.head.camera.sensor.pixel_pitch
-    parts = series_export.column_parts(table, style, pitch, known)
+    parts = series_export.column_parts(table, wanted, time_ == "iso", pitch, known)
     if format_ == "parquet":
         write_parquet(Path(output), parts)
     elif format_ == "json":
         write_parts(series_export.as_json(parts), output)
     else:
-        write_parts(csv_text(parts, style.separator, style.decimal), output)
+        write_parts(csv_text(parts, mark, decimal), output)
     for sentence, count in sorted(table.without_result.items()):
         say(f"{counted(count, 'epoch')} without a result: {sentence}")
 

@@ -32,7 +32,7 @@ from thermocald.errors import (
 )
 from thermocald.files import read_yaml
 from thermocald.hal import SystemClock, open_device
-from thermocald.numbers import with_sd
+from thermocald.numbers import percent, with_sd
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -308,7 +308,7 @@ def _describe(found: list[Experiment], names: tuple[str, str]) -> str:
     hottest = best.temperature.max()
     lines = [
         f"# to separate {names[0]} and {names[1]}: {best.name}",
-        f"# expected: up to {hottest:.1f} °C, heat in {best.duty:.0%} of the time",
+        f"# expected: up to {hottest:.1f} °C, heat in {percent(best.duty)} of the time",
         f"# effects of 0.1 px differ by {best.sigmas:.0f} sd at the end",
         f"# sd of the other programmes: {others}",
         "programme:",

@@ -17,7 +17,7 @@ import numpy as np
 from thermocald.discovery.examination import examine_series
 from thermocald.discovery.search import list_candidates
 from thermocald.errors import UsageError
-from thermocald.numbers import counted
+from thermocald.numbers import counted, percent
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
 from thermocald.result import Result
@@ -80,7 +80,7 @@ class Plan(Result):
         out = [f"effects of {self.strength_px:g} px RMS, {each} each:"]
         for name, verdicts in self.found.items():
             counts = ", ".join(f"{k} × {n}" for k, n in sorted(verdicts.items()))
-            out.append(f"  {name:26s} found {self.power(name):4.0%}   verdicts: {counts}")
+            out.append(f"  {name:26s} found {percent(self.power(name)):>5}   verdicts: {counts}")
         out += [f"  ambiguous: {a} and {b}; {e}" for a, b, e in self.ambiguous()]
         return out
 

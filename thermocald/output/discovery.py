@@ -27,8 +27,9 @@ from thermocald.figures import (
     legend_above,
     new_drawing,
 )
-from thermocald.numbers import enumerated, parameter_label, shortened, with_sd
+from thermocald.numbers import enumerated, parameter_label, percent, shortened, with_sd
 from thermocald.photogrammetry.linalg import best_level
+from thermocald.physics import catalogue
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
 
@@ -51,11 +52,16 @@ _ADVICE = {
 
 def report_html(discovery: Discovery, title: str) -> str:
     """Return the report as HTML text."""
+    sources = [e.source for e in discovery.examination.fitter.series]
     return Chapter(
         f"Discovery: {title}",
         _answer(discovery),
         tuple(_sections(discovery)),
-        tuple(_origin(discovery)),
+        tuple(
+            f"{one.camera}, {one.sensor}; {name} measured {day(float(one.frame_times[0]))}, "
+            f"{int(one.per_row.sum())} epochs."
+            for name, one in zip(_names(discovery), sources, strict=True)
+        ),
         tuple(
             as_sentence(line)
             for line in (
@@ -69,7 +75,9 @@ def report_html(discovery: Discovery, title: str) -> str:
 
 def _answer(d: Discovery) -> Answer:
     before, after = d.stages[0], d.stages[-1]
-    temperatures, noise = _temperatures(d), d.examination.fitter.series[0].sigma_px
+    first = d.examination.fitter.series[0]
+    T, noise = first.averaged(first.history.temperature()), first.sigma_px
+    temperatures = f" between {np.nanmin(T):.0f} and {np.nanmax(T):.0f} °C"
     by_gap = sorted(d.effects_with_gaps(), key=lambda e: e[2].rms_px - e[1].rms_px)
     if closing := [e for e, _, _ in by_gap]:
         sentence = as_sentence(_statement(closing[0]))
@@ -91,40 +99,27 @@ def _answer(d: Discovery) -> Answer:
             f"{' and from '.join(changes)}{temperatures}; the noise of an image coordinate is "
             f"{noise:.3f} px."
         )
-    return Answer(sentence, _trajectory(d), tuple(more), _next_steps(d), _not_covered(d))
-
-
-def _statement(effect: EffectFound) -> str:
-    """Return an effect's statement without the full stop; an amplitude a_x0 is written as x₀."""
-    text = re.sub(r"\ba_(\w+)", lambda m: parameter_label(m[1]), effect.statement)
-    return text.rstrip(".")
-
-
-def _temperatures(d: Discovery) -> str:
-    e = d.examination.fitter.series[0]
-    T = e.averaged(e.history.temperature())
-    return f" between {np.nanmin(T):.0f} and {np.nanmax(T):.0f} °C"
-
-
-def _next_steps(d: Discovery) -> tuple[str, ...]:
     steps = [
         f"To distinguish {e.effect} from {a['effect']}: {a['experiment']}."
         for e in d.effects
         for a in e.alternatives
         if not a.get("resembles") and a.get("experiment")
     ]
-    if d.stages[0].verify is None:
+    uncovered = [
+        f"Temperatures other than those{temperatures}, and changes faster than those measured."
+    ]
+    if before.verify is None:
         steps.append("Record a second series (M2) and give it with --verify, as the proof.")
-    return (*steps, _ADVICE[d.verdict])
+        uncovered.append("Whether the constants hold on another day: no M2 was given.")
+    steps.append(_ADVICE[d.verdict])
+    uncovered.append("Effects that move the image by less than its noise: they are not detected.")
+    return Answer(sentence, _trajectory(d), tuple(more), tuple(steps), tuple(uncovered))
 
 
-def _not_covered(d: Discovery) -> tuple[str, ...]:
-    alone = "Whether the constants hold on another day: no M2 was given."
-    return (
-        f"Temperatures other than those{_temperatures(d)}, and changes faster than those measured.",
-        *([alone] if d.stages[0].verify is None else []),
-        "Effects that move the image by less than its noise: they are not detected.",
-    )
+def _statement(effect: EffectFound) -> str:
+    """Return an effect's statement without the full stop; an amplitude a_x0 is written as x₀."""
+    text = re.sub(r"\ba_(\w+)", lambda m: parameter_label(m[1]), effect.statement)
+    return text.rstrip(".")
 
 
 def _names(d: Discovery) -> list[str]:
@@ -135,15 +130,6 @@ def _names(d: Discovery) -> list[str]:
         own = [Path(s.name).name for s in sources]
     named = zip(roles, own, strict=True)
     return [role if name in ("", role) else f"{role} ({name})" for role, name in named]
-
-
-def _origin(d: Discovery) -> list[str]:
-    sources = [e.source for e in d.examination.fitter.series]
-    return [
-        f"{one.camera}, {one.sensor}; {name} measured {day(float(one.frame_times[0]))}, "
-        f"{int(one.per_row.sum())} epochs."
-        for name, one in zip(_names(d), sources, strict=True)
-    ]
 
 
 def _sections(d: Discovery) -> list[Section]:
@@ -191,7 +177,10 @@ def _trajectory(d: Discovery) -> Figure:
     e = d.examination.fitter.series[0]
     base, final = (fit.parameters(0) for fit in (d.base_fit, d.final_fit))
     rests = [_without_level(e, e.values - m) for m in (base, final)]
-    found = bool(np.abs(final - base).max() > 0)
+    # a defocus and displaced targets move no parameter
+    still = {n for n in catalogue.names() if catalogue.get(n).seen_in != "trajectory"}
+    moving = [effect.effect for effect in d.effects if effect.effect not in still]
+    found = bool(moving) and bool(np.abs(final - base).max() > 0)
     root = _root(e)
     model = _without_level(e, final - base) if found else rests[0]
     _, _, v = np.linalg.svd(model @ root, full_matrices=False)
@@ -200,8 +189,7 @@ def _trajectory(d: Discovery) -> Figure:
     along = root @ v[0] * noise
     measured, (before, after) = _without_level(e, e.values) @ along, (r @ along for r in rests)
     sd = float(np.hypot(noise, _of_readings(d) @ along))
-    name = " + ".join(effect.effect for effect in d.effects) if found else ""
-    label = f"with {name}" if len(d.effects) == 1 else "with all effects"
+    label = f"with {moving[0]}" if len(d.effects) == 1 and found else "with all effects"
     above, below = [], []
     for x, of in (
         (e.times / 60.0, "time in min"),
@@ -225,7 +213,7 @@ def _trajectory(d: Discovery) -> Figure:
         "trajectory",
         "Measured and modelled",
         "Movement of the image in the pattern of "
-        + (name if found else "the largest misfit")
+        + (" + ".join(moving) if found else "the largest misfit")
         + ", root mean square over the targets of M1, as measured and as modelled. Below: the "
         "residuals of each model; grey: 95 % of the noise of an epoch and of the readings.",
         (*above, *below),
@@ -362,10 +350,10 @@ def _effect(effect: EffectFound) -> Section:
         test = proposal["surrogates"]
         text.append(
             f"Formula {proposal['formula']}: with constants of M1 alone it explains "
-            f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of M2. Formulas on a grid of "
-            f"constants explain {test['explained']:.0%} of the misfit, but of {test['count']} "
-            "surrogates whose cause was not recorded at most "
-            f"{test['largest_of_surrogates']:.0%}: probability of a false formula "
+            f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of M2. Formulas on a "
+            f"grid of constants explain {percent(test['explained'])} of the misfit, but of "
+            f"{test['count']} surrogates whose cause was not recorded at most "
+            f"{percent(test['largest_of_surrogates'])}: probability of a false formula "
             f"{_p(proposal['false_alarm_probability'], test['count'])}."
         )
     excluded = [a for a in effect.alternatives if not a.get("resembles")]

@@ -24,19 +24,18 @@ import numpy as np
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError, UsageError
 from thermocald.files import write_text
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, ExteriorOrientation
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP
 from thermocald.photogrammetry.frame.templates import Templates
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import in_parts, jsonable
 from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.series.epochs import Epochs
-    from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.result import Columns
 
@@ -46,21 +45,8 @@ _IN_IMAGE, _ANGLES = ("c", "x0", "y0"), ("omega", "phi", "kappa")
 _PLACE = ("X0", "Y0", "Z0")
 
 
-@dataclass(frozen=True, slots=True)
-class ExportStyle:
-    """The style of an exported table.
-
-    units: a choice of UNITS, otherwise mm and rad; time: `seconds` or `iso`; separator and decimal.
-    """
-
-    units: frozenset[str] = frozenset()
-    time: str = "seconds"
-    separator: str = ","
-    decimal: str = "."
-
-
-def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle:
-    """Return the style that options describe; UsageError for unknown values."""
+def check_style(units: str, time: str, separator: str, decimal: str) -> tuple[list[str], str]:
+    """Return the units and the separator that options give; UsageError for unknown values."""
     wanted = [u.strip() for u in units.split(",") if u.strip()]
     for unit in wanted:
         if unit not in UNITS:
@@ -76,23 +62,24 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
         raise UsageError(f"--decimal {decimal}: must be . or ,")
     if decimal == mark:
         raise UsageError("--decimal , needs another --separator, such as ';'")
-    return ExportStyle(frozenset(wanted), time, mark, decimal)
+    return wanted, mark
 
 
 def column_parts(
-    table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns | None = None
+    table: Epochs, units: Sequence[str], iso_times: bool, pixel_pitch: float, others: Columns | None
 ) -> Iterator[Columns]:
-    """Yield the columns of a series in a style, then the other columns unchanged.
+    """Yield the columns of a series, then the other columns unchanged.
 
-    They come some thousand rows at a time, because of the memory for a year. pixel_pitch: mm.
+    They come some thousand rows at a time, because of the memory for a year. units: a choice of
+    UNITS, otherwise mm and rad; iso_times: times as text, otherwise s; pixel_pitch: mm.
     """
     done = 0
     for part in in_parts(table.columns()):
         columns: Columns = {}
         for name, values in part.items():
-            suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
+            suffix, factor = _unit(name.removeprefix("sd_"), units, pixel_pitch)
             columns[name + suffix] = values if not suffix else np.asarray(values) * factor
-        if style.time == "iso":
+        if iso_times:
             columns["frame_time"] = tuple(iso(float(t), "microseconds") for t in part["frame_time"])
         rows = slice(done, done + len(part["epoch"]))
         for name, column in (others or {}).items():
@@ -101,13 +88,13 @@ def column_parts(
         done = rows.stop
 
 
-def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float]:
+def _unit(name: str, units: Sequence[str], pixel_pitch: float) -> tuple[str, float]:
     """Return the suffix of a parameter's column, and the factor from mm or rad to its unit."""
-    if name in _IN_IMAGE and "px" in style.units:
+    if name in _IN_IMAGE and "px" in units:
         return "_px", 1.0 / pixel_pitch
-    if name in (*_IN_IMAGE, *_PLACE) and "um" in style.units:
+    if name in (*_IN_IMAGE, *_PLACE) and "um" in units:
         return "_um", 1000.0
-    if name in _ANGLES and "deg" in style.units:
+    if name in _ANGLES and "deg" in units:
         return "_deg", 180.0 / np.pi
     return "", 1.0
 
@@ -165,6 +152,8 @@ def renew_configuration(
     reference: the frame in which the points were clicked; frame: a frame of the video in which to
     measure them. Raises DataError if they give no pose.
     """
+    import cv2
+
     document = _document(path)
     control = ControlPoints.read(path, "m")
     if (frame is None) != (reference is None):
@@ -184,29 +173,19 @@ def renew_configuration(
     # pose and camera are correlated: write the camera that was estimated together with the pose
     now = replace(camera, values=pose.values[IOP], covariance=pose.covariance[IOP, IOP])
     K, distortion = now.opencv()
-    rvec, tvec = opencv_pose(pose.exterior, control.origin)
     # pyorc solves for the pose again when it reads the file: with the points as this camera
     # projects them it obtains this pose
     six = pose.exterior.as_array()
+    R, centre = _AXES @ pose.exterior.rotation.T, (control.origin + six[3:]) / 1000.0
     document["gcps"]["src"] = now.project(control.field.points, six).tolist()
     document |= {
         "camera_matrix": K.tolist(),
         "dist_coeffs": [[k] for k in distortion.tolist()],
-        "rvec": rvec.tolist(),
-        "tvec": tvec.tolist(),
-        "lens_position": ((control.origin + six[3:]) / 1000.0).tolist(),
+        "rvec": cv2.Rodrigues(R)[0].ravel().tolist(),
+        "tvec": (-R @ centre).tolist(),
+        "lens_position": centre.tolist(),
     }
     return RenewedConfiguration(document, now, control, pose)
-
-
-def opencv_pose(pose: ExteriorOrientation, origin: Array) -> tuple[Array, Array]:
-    """Return OpenCV's rotation vector and translation (m); origin: of the pose, mm."""
-    import cv2
-
-    R = _AXES @ pose.rotation.T
-    centre = (np.asarray(pose.as_array()[3:]) + origin) / 1000.0
-    rvec, _ = cv2.Rodrigues(R)
-    return np.asarray(rvec, dtype=float).ravel(), -R @ centre
 
 
 def _document(path: Path) -> dict[str, Any]:

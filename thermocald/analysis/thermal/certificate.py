@@ -10,7 +10,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from thermocald.figures import BAND, Curve, Figure, Panel
-from thermocald.numbers import UNITS, parameter_label, signed, with_sd
+from thermocald.numbers import UNITS, parameter_label, percent, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.formula import say_together
 from thermocald.physics.model import SURE
@@ -98,9 +98,9 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"  {name:>4}: {shown}")
     if hang := document.get("rates_hang_on_c"):
         lines.append(
-            f"  the field hardly determines c (to {hang['c_known_to']:.2%}), and the rates depend "
-            "on it: they may be wrong by several of their standard deviations; use a field with "
-            "depth, such as three walls that meet"
+            f"  the field hardly determines c (to {percent(hang['c_known_to'], 2)}), and the rates "
+            "depend on it: they may be wrong by several of their standard deviations; use a field "
+            "with depth, such as three walls that meet"
         )
     if seldom := document.get("read_seldom"):
         lines.append(

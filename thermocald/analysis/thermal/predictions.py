@@ -17,7 +17,7 @@ import numpy as np
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.errors import DataError
-from thermocald.numbers import plain
+from thermocald.numbers import percent, plain
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
 from thermocald.physics.device import CameraDevice, read_camera_device, read_programme
 from thermocald.physics.simulation import Simulation
@@ -217,7 +217,7 @@ def check_prediction(thermal: ThermalCamera, inputs: Sequence[SeriesInput]) -> P
         if thermal.validity.beyond(T):
             warnings.warn(f"{s.source.name}: {thermal.validity.place(T)}", stacklevel=3)
         found.append({**asdict(error), "in_fit": in_fit})
-        bands = f"{error.coverage:.1%} inside their 95 % bands"
+        bands = f"{percent(error.coverage, 1)} inside their 95 % bands"
         if thermal.model.misses_an_effect:
             bands = "no 95 % band is stated, as the model misses an effect"
         lines.append(

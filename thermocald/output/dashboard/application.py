@@ -105,13 +105,6 @@ def _families(status: Mapping[str, Any]) -> Iterator[GaugeMetricFamily]:
             yield family
 
 
-def _metrics(view: View, _: Request) -> Response:
-    """Return the status in the text format of Prometheus."""
-    status = view.status()
-    text = generate_latest(SimpleNamespace(collect=lambda: _families(status)))
-    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
-
-
 _STATIC = Path(__file__).parent / "static"
 _FILES = {
     "index.html": "text/html",
@@ -153,7 +146,11 @@ def build_application(
             Middleware(_Guard, token=token, names=HostNames(host, names)),
             Middleware(Limits),
         ],
-        exception_handlers={ThermocaldError: _refuse},
+        exception_handlers={
+            ThermocaldError: lambda _, error: JSONResponse(
+                {"error": str(error)}, 400 if isinstance(error, UsageError) else 404
+            )
+        },
     )
     application.state.view = View(store, live)
     application.state.ends = lambda: False  # whether the server is about to end
@@ -234,10 +231,6 @@ def _digest(token: str) -> str:
     return hashlib.sha256(token.encode(errors="replace")).hexdigest()
 
 
-def _refuse(_: Request, error: Exception) -> Response:
-    return JSONResponse({"error": str(error)}, 400 if isinstance(error, UsageError) else 404)
-
-
 def _static(request: Request) -> Response:
     name = request.path_params.get("name", "index.html")
     if name not in _FILES:
@@ -314,7 +307,10 @@ def _health(view: View, _: Request) -> Response:
 # path → function that returns an answer, or a document for one as JSON
 _ANSWERS: dict[str, Callable[[View, Request], Any]] = {
     "/healthz": _health,
-    "/metrics": _metrics,
+    "/metrics": lambda view, _: Response(
+        generate_latest(SimpleNamespace(collect=lambda: _families(view.status()))),
+        media_type="text/plain; version=0.0.4; charset=utf-8",
+    ),
     "/api/status": lambda view, _: view.shown(),
     "/api/series": lambda view, _: view.series(),
     "/api/series.csv": _csv,

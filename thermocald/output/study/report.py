@@ -60,16 +60,20 @@ _LEAD = (
 
 def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
     """Return the report as HTML text."""
-    chapters = [
-        Chapter(
-            camera.label,
-            _answer(camera),
-            tuple(_sections(camera, study.settings)),
-            (_device(camera),),
-            tuple(_notes(camera)),
+    chapters = []
+    for camera in study.cameras:
+        series = [one.series for one in camera.series]
+        names = ", ".join(dict.fromkeys(s.camera for s in series))
+        measured = "; ".join(f"{s.name} {day(s.start_utc)}" for s in series)
+        chapters.append(
+            Chapter(
+                camera.label,
+                _answer(camera),
+                tuple(_sections(camera, study.settings)),
+                (f"{names}, {series[0].sensor}. Measured: {measured}.",),
+                tuple(_notes(camera)),
+            )
         )
-        for camera in study.cameras
-    ]
     return render_report(title, chapters, _LEAD)
 
 
@@ -126,14 +130,6 @@ def _answer(camera: CameraStudy) -> Answer:
         tuple(steps),
         tuple(uncovered),
     )
-
-
-def _device(camera: CameraStudy) -> str:
-    """Describe the camera, its sensor, and when each series was measured."""
-    series = [study.series for study in camera.series]
-    names = ", ".join(dict.fromkeys(s.camera for s in series))
-    measured = "; ".join(f"{s.name} {day(s.start_utc)}" for s in series)
-    return f"{names}, {series[0].sensor}. Measured: {measured}."
 
 
 def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:

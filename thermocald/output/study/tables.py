@@ -21,12 +21,11 @@ from thermocald.output.study.figures import cluster_names
 from thermocald.report import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
 
     from thermocald.analysis.study.measured import StudySettings
     from thermocald.analysis.study.study import (
         CameraStudy,
-        ChannelStudy,
         Deviation,
         SeriesStudy,
     )
@@ -90,8 +89,8 @@ def deviation_table(camera: CameraStudy) -> Table:
     def change(name: str, value: float, sd: float | None = None) -> str:
         # Positions are given in mm, their changes in µm.
         factor, unit = _small_unit(UNITS.get(name, "K"))
-        if sd is None:
-            return plain(factor * value, unit, 3)
+        if sd is None:  # the unit stands with the difference: again it would take the columns' room
+            return plain(factor * value, digits=3)
         return with_sd(factor * value, factor * sd, unit)
 
     return Table.of(
@@ -111,7 +110,7 @@ def deviation_table(camera: CameraStudy) -> Table:
         "The standard deviation alongside a difference is that of the two adjustments (for "
         "temperatures: of the two readings). Largest is the greatest departure from the first "
         "epoch, range the largest minus the smallest value, noise included; sd over "
-        "time is what the simulation below draws from.",
+        "time is what the simulation below draws from. These three have the difference's unit.",
     )
 
 
@@ -160,43 +159,39 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
 
 def dependence_tables(camera: CameraStudy) -> list[Table]:
     """Return the table of correlation and slope on each thermometer (reference, section 4.3)."""
-    found = [(s, c) for s in camera.series for c in s.channels if c.dependences]
-    names = dict.fromkeys(channel.thermometer.name for _, channel in found)
-    return [
-        _dependence_table(name, [(s, c) for s, c in found if c.thermometer.name == name])
-        for name in names
-    ]
 
-
-def _dependence_table(
-    thermometer: str, channels: Sequence[tuple[SeriesStudy, ChannelStudy]]
-) -> Table:
     def slope(name: str, value: float, sd: float) -> str:
         factor, unit = _small_unit(UNITS[name])
         return with_sd(factor * value, factor * sd, f"{unit or 1}/K")
 
-    noise = ", ".join(f"{plain(c.thermometer.sd, 'K', 2)} in {s.series.name}" for s, c in channels)
-    return Table.of(
-        f"Dependence on {parameter_label(thermometer)}",
-        _by_parameter([(study, channel.dependences) for study, channel in channels]),
-        {
-            "parameter": lambda r: parameter_label(r[0]),
-            "series": lambda r: r[1].series.name,
-            "r": lambda r: coefficient(r[2].r),
-            "n": lambda r: f"{r[2].n}",
-            "n effective": lambda r: f"{r[2].n_effective:.0f}",
-            "p naive": lambda r: p_text(r[2].p_naive_holm),
-            "p": lambda r: p_text(r[2].p_holm),
-            "slope ± sd": lambda r: slope(r[0], r[2].slope, r[2].sd_slope),
-            "px/K": lambda r: _in_pixels(r[1], r[0], r[2].slope, r[2].sd_slope),
-            "scatter / noise": lambda r: f"{r[2].misfit:.1f}",
-        },
-        "r: Pearson's correlation. p naive treats every epoch as independent; p is valid for noise "
-        "correlated in time; both are corrected for the number of parameters (Holm). n effective: "
-        "number of independent epochs with the same information. The slope takes the thermometer's "
-        f"noise ({noise}) into account, its sd the correlation of the noise. Scatter / noise above "
-        "1: the straight line does not explain all changes.",
-    )
+    found = [(s, c) for s in camera.series for c in s.channels if c.dependences]
+    tables = []
+    for name in dict.fromkeys(c.thermometer.name for _, c in found):
+        channels = [(s, c) for s, c in found if c.thermometer.name == name]
+        sds = [f"{plain(c.thermometer.sd, 'K', 2)} in {s.series.name}" for s, c in channels]
+        table = Table.of(
+            f"Dependence on {parameter_label(name)}",
+            _by_parameter([(s, c.dependences) for s, c in channels]),
+            {
+                "parameter": lambda r: parameter_label(r[0]),
+                "series": lambda r: r[1].series.name,
+                "r": lambda r: coefficient(r[2].r),
+                "n": lambda r: f"{r[2].n}",
+                "n effective": lambda r: f"{r[2].n_effective:.0f}",
+                "p naive": lambda r: p_text(r[2].p_naive_holm),
+                "p": lambda r: p_text(r[2].p_holm),
+                "slope ± sd": lambda r: slope(r[0], r[2].slope, r[2].sd_slope),
+                "px/K": lambda r: _in_pixels(r[1], r[0], r[2].slope, r[2].sd_slope),
+                "scatter / noise": lambda r: f"{r[2].misfit:.1f}",
+            },
+            "r: Pearson's correlation. p naive treats every epoch as independent; p is valid for "
+            "noise correlated in time; both are corrected for the number of parameters (Holm). n "
+            "effective: number of independent epochs with the same information. The slope takes "
+            f"the thermometer's noise ({', '.join(sds)}) into account, its sd the correlation of "
+            "the noise. Scatter / noise above 1: the straight line does not explain all changes.",
+        )
+        tables.append(table)
+    return tables
 
 
 def object_space_tables(camera: CameraStudy) -> list[Table]:

@@ -103,17 +103,15 @@ def draw_marker(
             pen.fill(rectangle(left + a * cell, low, (b - a) * cell, cell + seam), "white")
 
 
-def crop_marks(pen: Pen, size: tuple[float, float]) -> None:
-    """Draw the crop marks, short lines outside the four corners."""
+def draw_margins(pen: Pen, size: tuple[float, float]) -> None:
+    """Draw the crop marks outside the four corners, and a ruler in each direction, because printers
+    scale the two differently.
+    """
     w, h = size
     for x, sx in ((0.0, -1.0), (w, 1.0)):
         for y, sy in ((0.0, -1.0), (h, 1.0)):
             pen.line([(x + sx * 1, y), (x + sx * (TRIM - 1.5), y)], "black", 0.1)
             pen.line([(x, y + sy * 1), (x, y + sy * (TRIM - 1.5))], "black", 0.1)
-
-
-def rulers(pen: Pen, size: tuple[float, float]) -> None:
-    """Draw a ruler in each direction, because printers scale the two differently."""
     for along, length in enumerate(size):
         total = min(_RULER, 10 * int((length - STRIP - 10) / 10))
 
@@ -221,6 +219,8 @@ def _seen(points: Array) -> Array:
 
 _TARGET_NAME = 0.7
 """Height of a target's name in radii of its disc."""
+_EDGE_LETTER = 3.0
+"""Height of the letter at an edge, mm."""
 
 
 def draw(sheet: Sheet) -> Any:
@@ -233,43 +233,33 @@ def draw(sheet: Sheet) -> Any:
         (x, y, _), code = field.points[row].tolist(), field.codes[row]
         pen.fill(Curve.circle((x, y), r), pen.colour)
         for begin, end in ring_code.segments(*ring_code.parse(code)) if code else ():
-            pen.fill(_ring_segment((x, y), r, begin, end), pen.colour)
+            # codes run clockwise but y is up: angles are negated
+            angles, width = (-360 * end, -360 * begin), outline.RING_OUTER - outline.RING_INNER
+            arc = Wedge((x, y), outline.RING_OUTER * r, *angles, width=width * r)
+            pen.fill(arc.get_path(), pen.colour)
         _label(pen, x, y - (outline.RING_OUTER if code else 1.0) * r, field.names[row], r)
     for name, (x, y), side, cells in markers_of(field):
         if sheet.design.light:  # a marker is always black on white
             pen.fill(square(x, y, side * (1 + 2 / len(cells))), "white")
         draw_marker(pen, (x, y), side, cells)
         _label(pen, x, y - side / 2, name, r)
-    crop_marks(pen, sheet.size)
-    rulers(pen, sheet.size)
+    draw_margins(pen, sheet.size)
     _legend(pen, sheet)
-    _edge_letters(pen, sheet)
-    return pen.figure
-
-
-def _edge_letters(pen: Pen, sheet: Sheet) -> None:
-    """Write the common letter at each edge that meets another sheet."""
-    (w, h), size = sheet.size, 3.0
+    w, h = sheet.size
     places = {
         "left": (1.5, 0.75 * h),
-        "right": (w - 1.5 - size, 0.75 * h),
+        "right": (w - 1.5 - _EDGE_LETTER, 0.75 * h),
         "lower": (0.75 * w, 1.5),
     }
-    for side, letter in sheet.edges.items():
-        pen.text(*places[side], letter, size, color=GREY)
+    for edge, letter in sheet.edges.items():  # the common letter of two edges that meet
+        pen.text(*places[edge], letter, _EDGE_LETTER, color=GREY)
+    return pen.figure
 
 
 def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
     """Write a target's name, grey and too small to be mistaken for a target."""
     height = min(_TARGET_NAME * r, 3.0)
     pen.text(x, below - 0.35 * r - height, name, height, ha="center", color=GREY)
-
-
-def _ring_segment(centre: tuple[float, float], r: float, begin: float, end: float) -> Any:
-    """Return an arc of the ring; codes run clockwise but y is up: angles are negated."""
-    width = (outline.RING_OUTER - outline.RING_INNER) * r
-    angles = -360 * end, -360 * begin
-    return Wedge(centre, outline.RING_OUTER * r, *angles, width=width).get_path()
 
 
 def _legend(pen: Pen, sheet: Sheet) -> None:
@@ -292,8 +282,7 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
     """Draw a board in the middle of a page (mm), with rulers and its name, as a Figure."""
     pen = Pen(page, light=False)
     size = (page[0] - 2 * TRIM, page[1] - 2 * TRIM)
-    crop_marks(pen, size)
-    rulers(pen, size)
+    draw_margins(pen, size)
     name = board.name.partition(" ")[2]
     pen.text(STRIP, STRIP - 4.6, f"{name}, {board.measures}", _LEGEND_HEIGHT)
     dx, dy = board.place(page)
@@ -304,16 +293,12 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
     return pen.figure
 
 
-def write_pdf(pages: Sequence[Any], path: Path) -> None:
-    """Write Figures as the pages of one PDF."""
-    about = {"Title": "thermocald test field", "Creator": "thermocald", "CreationDate": None}
-    with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as document:
-        for page in pages:
-            document.savefig(page)
-
-
-def write_svg(page: Any, path: Path) -> None:
-    """Write a Figure as SVG."""
-    about = {"Title": "thermocald test field", "Creator": "thermocald", "Date": None}
-    with rc_context({"svg.hashsalt": "thermocald"}):
-        page.savefig(path, format="svg", metadata=about)
+def write(pages: Sequence[Any], pdf: Path, svgs: Sequence[Path]) -> None:
+    """Write Figures as the pages of one PDF, and the first of them as SVG files."""
+    about = {"Title": "thermocald test field", "Creator": "thermocald"}
+    with rc_context({"pdf.fonttype": 42, "svg.hashsalt": "thermocald"}):
+        with PdfPages(pdf, metadata={**about, "CreationDate": None}) as document:
+            for page in pages:
+                document.savefig(page)
+        for page, path in zip(pages, svgs, strict=False):  # the plan is only in the PDF
+            page.savefig(path, format="svg", metadata={**about, "Date": None})

@@ -252,21 +252,17 @@ def _marker_codes(design: Design) -> Iterator[str]:
         raise UsageError(f"the field needs more than the {available} markers of {name}")
 
 
-def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
-    """Return a sheet's origin (3,) mm, and the directions of its x and y axes in space (2, 3)."""
-    if len(sheets) == 1 or k == 0:
-        return np.zeros(3), np.eye(3)[:2]
-    if k == 1:
-        return np.array([sheets[k].size[0], 0.0, 0.0]), np.array([[-1.0, 0, 0], [0, 0, 1.0]])
-    return np.zeros(3), np.eye(3)[1:]
-
-
 def field_of(sheets: Sequence[Sheet]) -> TestField:
     """Return the sheets' nominal test field with the standard deviations of an unsurveyed print."""
     points, sigmas = [], []
     mount = _SIGMA_MOUNT if len(sheets) > 1 else 0.0
-    for k, sheet in enumerate(sheets):
-        origin, axes = _placement(sheets, k)
+    # of floor, left and right wall: the origin, mm, and the directions of x and y in space (2, 3)
+    placements = (
+        (np.zeros(3), np.eye(3)[:2]),
+        (np.array([sheets[0].size[0], 0.0, 0.0]), np.array([[-1.0, 0, 0], [0, 0, 1.0]])),
+        (np.zeros(3), np.eye(3)[1:]),
+    )
+    for sheet, (origin, axes) in zip(sheets, placements, strict=False):
         xy = sheet.field.points[:, :2]
         local = xy - np.asarray(sheet.size) / 2
         in_plane = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local) @ np.abs(axes)
@@ -563,8 +559,6 @@ def _publish(
     names = ["testfield.pdf", *drawings, "testfield.csv"]
     with ExitStack() as opened:
         partial = {name: opened.enter_context(new_file(folder / name)) for name in names}
-        _drawing().write_pdf(pages, partial["testfield.pdf"])
-        for page, name in zip(pages, drawings, strict=False):  # the plan is only in the PDF
-            _drawing().write_svg(page, partial[name])
+        _drawing().write(pages, partial["testfield.pdf"], [partial[name] for name in drawings])
         partial["testfield.csv"].write_text(testfield_csv(field), encoding="utf-8")
     return tuple(folder / name for name in names)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import ConfigurationError, GeometryError
+from thermocald.numbers import percent
 from thermocald.photogrammetry.camera.camera_model import (
     DEFAULT_FREE,
     EOP,
@@ -126,8 +127,8 @@ def weaknesses(
         coverage = image_coverage(sensor, image_points)
         if coverage < bounds.coverage:
             reasons.append(
-                f"the targets cover {coverage:.1%} of the image (at least {bounds.coverage:.0%} "
-                "are needed)"
+                f"the targets cover {percent(coverage, 1)} of the image (at least "
+                f"{percent(bounds.coverage)} are needed)"
             )
     # only pairs with an IOP: correlated EOP do no harm to the camera
     scale = 1.0 / np.where(sd > 0, sd, np.inf)
@@ -152,8 +153,8 @@ def uncertain(
     reasons = []
     share = sd[0] / values[0]
     if "c" in free and share > bounds.relative_sd_c:
-        known = f"is known to {share:.1%} only" if share < 1 else "is not determined"
-        reasons.append(f"the principal distance {known} (bound {bounds.relative_sd_c:.1%})")
+        known = f"is known to {percent(share, 1)} only" if share < 1 else "is not determined"
+        reasons.append(f"the principal distance {known} (bound {percent(bounds.relative_sd_c, 1)})")
     for name, column in (("x0", 1), ("y0", 2)):
         size = sd[column] / sensor.pixel_pitch
         if name in free and size > bounds.sd_point_px:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
+from thermocald.numbers import percent
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -262,8 +263,8 @@ def _weaknesses(
     coverage = image_coverage(adjustment.sensor, adjustment.rays.points)
     if coverage < s.bounds.coverage:
         reasons.append(
-            f"the targets cover {coverage:.1%} of the image in all photographs together (at least "
-            f"{s.bounds.coverage:.0%} are needed)"
+            f"the targets cover {percent(coverage, 1)} of the image in all photographs together "
+            f"(at least {percent(s.bounds.coverage)} are needed)"
         )
     sd = np.zeros(16)
     sd[adjustment.free] = np.sqrt(np.diag(Q))

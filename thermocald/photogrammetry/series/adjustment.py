@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.numbers import percent
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     EOP_COLUMNS,
@@ -395,7 +396,7 @@ def judge_epochs(
     fail(
         np.sqrt(np.maximum(variance[:, 0], 0.0)) > bounds.relative_sd_c * c,
         "weak_geometry",
-        f"the principal distance is known to worse than {bounds.relative_sd_c:.1%}",
+        f"the principal distance is known to worse than {percent(bounds.relative_sd_c, 1)}",
     )
     fail(
         np.sqrt(variance[:, PRINCIPAL_POINT].max(axis=1).clip(0.0)) > bounds.sd_point_px * pitch,

@@ -260,10 +260,11 @@ function draw(columns, name) {
     }
   });
   Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
-  $("course-note").textContent = `${name}: ${counted(columns.epochs, "epoch")}` +
+  // isolated: a name from right to left would exchange it with the numbers
+  $("course-note").replaceChildren(element("bdi", name), `: ${counted(columns.epochs, "epoch")}` +
     (columns.per_point > 1 ? `, up to ${columns.per_point} averaged per point` : "") +
     (columns.unset ? `; ${counted(columns.unset, "epoch")} from before the clock was set not shown` : "") +
-    "; bands: 95 % uncertainty of a single epoch";
+    "; bands: 95 % uncertainty of a single epoch");
 }
 
 function listen() {

@@ -23,7 +23,7 @@ from thermocald.daemon.series_run import result_row
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice
 from thermocald.hal import Frame, Reading, VirtualClock, open_device
-from thermocald.names import channel_fault
+from thermocald.names import channel_fault, tell_apart
 from thermocald.output.dashboard.view import View
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -206,3 +206,20 @@ def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
     assert dict(zip(header, row, strict=True))[name] == "20.5"
     write_recording(folder / "M1", head, field, [epoch])
     assert read_recording(folder / "M1").columns.temperatures[name].tolist() == [20.5]
+
+
+@pytest.mark.parametrize(
+    ("names", "sources", "told"),
+    [
+        (["M1", "M2"], ["day1/M1", "day1/M2"], ["M1", "M2"]),
+        (["M1", "M1", "M2"], ["day1/M1", "day2/M1", "M2"], ["M1 in day1", "M1 in day2", "M2"]),
+        (
+            ["M1"] * 3,
+            ["a/x/M1", "a/y/M1", "b/x/M1"],
+            ["M1 in a/x/M1", "M1 in a/y/M1", "M1 in b/x/M1"],
+        ),
+        (["M1", "M1"], ["M1", "old/M1"], ["M1 in M1", "M1 in old/M1"]),
+    ],
+)
+def test_series_of_one_name_are_told_apart(names, sources, told):
+    assert tell_apart(names, sources) == told

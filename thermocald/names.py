@@ -62,6 +62,19 @@ _SEPARATORS = ",;=\"'\\"
 _LONGEST = 64
 
 
+def tell_apart(names: Sequence[str], sources: Sequence[str]) -> list[str]:
+    """Return the names of series, those that several have with where they are: `M1 in day2`."""
+    told = []
+    for name, source in zip(names, sources, strict=True):
+        same = [Path(s).parts for n, s in zip(names, sources, strict=True) if n == name]
+        # the last part of their paths in which all differ
+        levels = range(1, 1 + min(map(len, same)))
+        level = next((k for k in levels if len({parts[-k] for parts in same}) == len(same)), None)
+        place = source if level is None else Path(source).parts[-level]
+        told.append(name if len(same) == 1 else f"{name} in {place}")
+    return told
+
+
 def channel_fault(name: object) -> str:
     """Return why a channel cannot have a name; empty if it can."""
     if not isinstance(name, str) or not name or name != name.strip() or len(name) > _LONGEST:

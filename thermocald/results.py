@@ -19,6 +19,7 @@ from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
+from thermocald.names import tell_apart
 from thermocald.numbers import percent, typeset_powers, with_sd
 from thermocald.output.study.report import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
@@ -315,7 +316,8 @@ def discovery_lines(found: Discovery) -> list[str]:
             if not a.get("resembles")
         ]
     lines += [*mount_lines(found.examination), *field_lines(found.examination)]
-    names = [Path(e.source.name).name or e.source.name for e in found.examination.fitter.series]
+    sources = [e.source.name for e in found.examination.fitter.series]
+    names = tell_apart([Path(source).name or source for source in sources], sources)
     gaps = zip(first.gaps, last.gaps, strict=True)
     for name, (before, after) in zip(names, gaps, strict=True):
         lines.append(

@@ -114,13 +114,13 @@ def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
 
 
 def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
-    pair = [warm_up(seed=k)("M1", "cold", source=f"/data/{k}") for k in (1, 2)]
+    pair = [warm_up(seed=k)("M1", "cold", source=f"/data/day{k}/M1") for k in (1, 2)]
     drift = {"c": 0.003, "x0": 0.0097, "y0": -0.0056}
     warm_one = warm_up(seed=3, drift=drift)("M1", "warm")
     cold, warm = study([*pair, warm_one], StudySettings(sets=5000)).cameras
     assert (cold.label, warm.label) == ("cold", "warm")
     # series of one name are named by their places
-    assert [one.series.name for one in cold.series] == ["M1 in 1", "M1 in 2"]
+    assert [one.series.name for one in cold.series] == ["M1 in day1", "M1 in day2"]
     assert [one.series.name for one in warm.series] == ["M1"]
     assert cold.correlations.epochs == 300
     assert cold.sds[1] == pytest.approx(0.0194 * 0.2527, rel=0.01)

@@ -16,9 +16,7 @@ of confusion.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -48,6 +46,7 @@ from thermocald.analysis.study.montecarlo import (
     trajectories,
 )
 from thermocald.errors import GeometryError
+from thermocald.names import tell_apart
 from thermocald.numbers import parameter_label, percent
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
 
@@ -453,18 +452,13 @@ def study(
 ) -> Study:
     """Study every camera; `progress` receives the number of IOP sets simulated."""
     s = settings or StudySettings()
-    count = Counter((one.label, one.name) for one in series)
-    series = [
-        one
-        if count[one.label, one.name] == 1
-        else replace(one, name=f"{one.name} in {Path(one.source).name}")
-        for one in series
-    ]
     labels = dict.fromkeys(one.label for one in series)
-    cameras = [
-        study_camera(label, [one for one in series if one.label == label], s, progress)
-        for label in labels
-    ]
+    cameras = []
+    for label in labels:
+        own = [one for one in series if one.label == label]
+        names = tell_apart([one.name for one in own], [one.source for one in own])
+        own = [replace(one, name=name) for one, name in zip(own, names, strict=True)]
+        cameras.append(study_camera(label, own, s, progress))
     return Study(s, tuple(cameras))
 
 

@@ -26,6 +26,7 @@ from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step
 from thermocald.analysis.thermal.result import build_camera, with_covariance
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
+from thermocald.names import tell_apart
 from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
@@ -152,7 +153,12 @@ def fit_camera(
             rest, model.effects, model.T0, search=False, distortion=model.distortion
         )
         errors.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
-    return replace(camera, fitted={**fitted, "prediction_test": errors})
+    names = tell_apart(
+        [s.source.series or s.source.name for s in series], [s.source.name for s in series]
+    )
+    for key, found in (("series", fitted["series"]), ("prediction_test", errors)):
+        fitted = {**fitted, key: [replace(f, name=n) for f, n in zip(found, names, strict=False)]}
+    return replace(camera, fitted=fitted)
 
 
 def fit_type(

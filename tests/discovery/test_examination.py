@@ -79,6 +79,13 @@ def test_recordings_of_two_cameras_contradict_each_other(epochs):
     assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.06)
 
 
+def test_a_step_of_the_last_epoch_may_be_any_cause_that_begins_there(evidence_of):
+    """Regression: a large softening was named `slip` alone, with equal χ²."""
+    evidence, _ = evidence_of("softening", px=5.0, seed=7031, epochs=33, with_m2=False)
+
+    assert discover_series(evidence).headline == "effects_found: slip or softening"
+
+
 def test_epochs_with_few_targets_have_no_weight(evidence_of):
     """Three epochs show eight targets; the image moves so far that the projection is curved."""
     (series,), _ = evidence_of("permanent_set", px=8.0, seed=1, epochs=60, with_m2=False)

@@ -65,15 +65,6 @@ def list_candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
     return out
 
 
-def enrich_term(term: Term) -> Term | None:
-    """Return the term with the parameter set of one more coefficient, None if there is none."""
-    for parameters in term.kind.parameter_sets:
-        more = len(parameters) == len(term.parameters) + 1
-        if more and set(term.parameters) < set(parameters):
-            return replace(term, parameters=parameters)
-    return None
-
-
 def _varies(evidence: ReducedSeries, channel: str) -> bool:
     instrument = evidence.thermometers.get(channel)
     return instrument is not None and float(np.nanstd(instrument.trajectory)) > 3 * instrument.noise
@@ -204,7 +195,7 @@ class Search:
         return sorted(grown, key=by_score)
 
     def expand_all(
-        self, solutions: Sequence[Solution], width: int, most: int, below: float = np.inf
+        self, solutions: Sequence[Solution], width: int, most: int, below: float
     ) -> list[Solution]:
         """Find the best extensions of several solutions by one effect, at most `most` sets.
 
@@ -304,7 +295,7 @@ class Search:
                         solution, term = trial, moved
         return solution
 
-    def shrink(self, solution: Solution, kept: int = 0) -> Solution:
+    def shrink(self, solution: Solution, kept: int) -> Solution:
         """Drop effects that gain less than their penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:
             fewer = []

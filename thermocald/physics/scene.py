@@ -114,14 +114,6 @@ def average(cells: NDArray[np.float32], kernel: Array, axis: int) -> NDArray[np.
     return np.moveaxis(out, 0, axis)
 
 
-def _gaussian(sigma: float) -> Array:
-    """Return a normalised Gaussian (2n+1,) on the pixel grid, n = ⌈4 σ⌉; [1] if σ is 0."""
-    x = np.arange(-np.ceil(4.0 * sigma), np.ceil(4.0 * sigma) + 1.0)
-    kernel: Array = np.exp(-0.5 * (x / max(sigma, 1e-9)) ** 2)
-    kernel /= kernel.sum()
-    return kernel
-
-
 _FRACTION = 64  # fixed-point steps per DN
 
 
@@ -232,7 +224,10 @@ class Scene:
         projected = np.round(project(self.sensor, iop, eop, np.concatenate(vertices)), 9)
         images = np.split(projected, np.cumsum([len(v) for v in vertices])[:-1])
         zero, edge = np.zeros(1), np.array([self.sensor.width, self.sensor.height])
-        kernel = _gaussian(_FINER * self.look.blur_px * blur_factor)
+        sigma = _FINER * self.look.blur_px * blur_factor  # cells of a Gaussian's ± 4 sigma
+        x = np.arange(-np.ceil(4.0 * sigma), np.ceil(4.0 * sigma) + 1.0)
+        kernel: Array = np.exp(-0.5 * (x / max(sigma, 1e-9)) ** 2)
+        kernel /= kernel.sum()
         kernel = (np.concatenate([kernel, zero]) + np.concatenate([zero, kernel])) / _FINER
         margin = len(kernel) // (2 * _FINER) + 1
         depth = np.float32((self.look.paper_dn - self.look.ink_dn) * _FRACTION / 2)

@@ -1,16 +1,22 @@
-"""The generator's arrays as the program's input, without files."""
+"""Blind recordings as the program's input, without files."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tests.blind.case import CAMERAS
-from tests.blind.generator import Series
+from tests.blind.case import CAMERAS, Case
+from tests.blind.generator import Series, generate
 from tests.blind.world import corner_field
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.series import SeriesInput
+
+
+def generated(case: Case) -> tuple[list[SeriesInput], dict]:
+    """Generate a case; return its recordings and the truth."""
+    series, truth = generate(case)
+    return [series_input(s) for s in series], truth
 
 
 def series_input(series: Series) -> SeriesInput:

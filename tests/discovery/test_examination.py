@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import Case
-from tests.blind.generator import generate
 from tests.blind.score import discover_case, judge_discovery
 from tests.marks import mostly_slow
 from thermocald.discovery import examination
@@ -71,7 +70,7 @@ def test_recordings_of_two_cameras_contradict_each_other(epochs):
     """
     cases = (Case((), seed=n, epochs=epochs, camera="rpi-v2.1", with_m2=False) for n in (3, 5))
 
-    found = discover_series(reduce_together([series_input(generate(c)[0][0]) for c in cases]))
+    found = discover_series(reduce_together([generated(c)[0][0] for c in cases]))
 
     assert found.headline == "unexplained: unnamed"
     assert found.effects[0].statement.startswith("the recordings contradict each other: the model")

@@ -10,9 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import OUTSIDE, Case
-from tests.blind.generator import generate
 from tests.blind.outcome import excess_closed
 from tests.blind.outside import HUMID
 from thermocald.discovery.formulas import Library, condense
@@ -34,7 +33,7 @@ TEN = (
 
 def reduced(kind: str, seed: int):
     case = Case((OUTSIDE,), 0.3, seed, influence=kind, record_humidity=kind in HUMID)
-    return reduce_together([series_input(s) for s in generate(case)[0]])
+    return reduce_together(generated(case)[0])
 
 
 def examined(kind: str, seed: int):
@@ -86,11 +85,6 @@ def test_the_error_of_a_second_thermometer_is_part_of_the_noise(above):
     alone = fitter.fit((term,), start, 1)
     assert len(whole.weightings[0].errors) == len(alone.weightings[0].errors) + 1
     assert whole.covariance[-1, -1] > 1.05 * alone.covariance[-1, -1]
-
-
-def test_one_recording_gets_no_formula(above):
-    x = SimpleNamespace(**{**above.__dict__, "fitter": HypothesisFitter(above.fitter.series[:1])})
-    assert propose(x, BASE) is None
 
 
 def test_condensed_evidence_is_the_likelihood(above):

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import Case
-from tests.blind.generator import generate
 from tests.discovery.test_likelihood import of_images, products
 from tests.marks import mostly_slow
 from thermocald.discovery.result import discover_series, mount_lines
@@ -45,8 +44,7 @@ def test_slow_drifts_in_weak_directions_are_movement(evidence_of):
 
 def hidden_but(epochs: slice, targets: list[int]):
     """A camera with rates only, which sees some targets only in some epochs."""
-    series, _ = generate(Case((), 0.3, 7, epochs=40, with_m2=False))
-    source = series_input(series[0])
+    (source,), _ = generated(Case((), 0.3, 7, epochs=40, with_m2=False))
     never = np.zeros(source.grid.observed.shape, dtype=bool)
     never[:, targets] = True
     seldom = never.copy()
@@ -99,11 +97,10 @@ def trembling(effects, px, seed, epochs=180):
     """Both series of a blind case, with each epoch's image shifted independently by px."""
     rng = np.random.default_rng([seed, 5])
     out = []
-    for series in generate(Case(effects, 0.3, seed, epochs=epochs))[0]:
-        found = series_input(series)
-        grid = found.grid
+    for source in generated(Case(effects, 0.3, seed, epochs=epochs))[0]:
+        grid = source.grid
         shift = px * rng.normal(size=(len(grid.points), 1, 2))
-        out.append(replace(found, grid=ObservationGrid(grid.points + shift, grid.weights)))
+        out.append(replace(source, grid=ObservationGrid(grid.points + shift, grid.weights)))
     return reduce_together(out)
 
 

@@ -198,8 +198,8 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
             jumps[int(row)] = (int(first[row]), float(gain[row]))
         if len(jumps) > 0.2 * seen.sum():
             return [], evidence  # so many do not jump independently: the camera moved
-        whole = np.flatnonzero(np.isin(groups, groups[sorted(jumps)]))  # markers
-        cleaned = without_targets(evidence, whole)
+        # a marker is left out as a whole
+        cleaned = without_targets(evidence, np.flatnonzero(np.isin(groups, groups[sorted(jumps)])))
     if not jumps:
         return [], evidence
     jumped = {}

@@ -351,10 +351,12 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
 
 
 def _shows_once(term: Term, series: Sequence[ReducedSeries]) -> bool:
-    """Test whether an event leaves one epoch before or after it, in each series that it is in."""
-    known = [(e.times[e.n > 0], own) for e, own in zip(series, term.fresh, strict=False) if own]
-    after = [(len(times), int(np.sum(times >= own[0][1]))) for times, own in known]
-    return term.kind.is_event and all(min(n, count - n) <= 1 for count, n in after)
+    """Test whether an event has one epoch before or after it, in each series in which it occurs."""
+    if not term.kind.is_event:
+        return False
+    pairs = zip(series, term.fresh, strict=True)
+    later = [e.times[e.n > 0] >= own[0][1] for e, own in pairs if own]
+    return all(min(np.sum(after), np.sum(~after)) <= 1 for after in later)
 
 
 def _compare_ties(

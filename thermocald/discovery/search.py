@@ -191,7 +191,11 @@ class Search:
 
         least: gain beyond its penalty that a scan must promise, except for an event.
         """
-        grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
+        terms, penalties = solution.terms, solution.penalties
+        grown = [
+            self.refine((*terms, p.term), (*penalties, p.penalty))
+            for p in self._promises(solution, width, least)
+        ]
         return sorted(grown, key=by_score)
 
     def expand_all(
@@ -205,15 +209,11 @@ class Search:
         pairs = [(s, p) for s, p in every if s.score - p.net < below]
         pairs.sort(key=lambda pair: pair[0].score - pair[1].net)
         grown: dict[frozenset[str], Solution] = {}
-        for solution, promise in pairs:
-            names = frozenset((*solution.names, promise.term.effect))
+        for s, p in pairs:
+            names = frozenset((*s.names, p.term.effect))
             if len(grown) < most and names not in grown:
-                grown[names] = self._with(solution, promise)
+                grown[names] = self.refine((*s.terms, p.term), (*s.penalties, p.penalty))
         return sorted(grown.values(), key=by_score)
-
-    def _with(self, solution: Solution, promise: Scanned) -> Solution:
-        penalties = (*solution.penalties, promise.penalty)
-        return self.refine((*solution.terms, promise.term), penalties)
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
         """Return the `width` most promising effects beside a solution, best first.

@@ -397,7 +397,7 @@ class HypothesisFitter:
                     for (i, name), d in zip(searched, damping * step, strict=True):
                         old = dict(terms[i].nonlinear)[name]
                         parameter = terms[i].kind.nonlinear[name]
-                        value = parameter.bounded(old, old + float(d), slack=0.1)
+                        value = parameter.bounded(old, old + float(d))
                         if parameter.role == "period":
                             value = min(value, max(old, longest))
                         terms[i] = terms[i].with_value(name, value)

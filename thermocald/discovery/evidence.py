@@ -203,11 +203,11 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
     if not jumps:
         return [], evidence
     jumped = {}
-    for row, jump in jumps.items():
-        corners = np.flatnonzero((groups == groups[row]) & seen)
+    for corner, jump in jumps.items():
+        corners = np.flatnonzero((groups == groups[corner]) & seen)
         together = [r for r in corners.tolist() if r in jumps and abs(jumps[r][0] - jump[0]) <= 1]
         if 4 * len(together) >= 3 * len(corners):
-            jumped[row] = jump
+            jumped[corner] = jump
     return _group_steps(cleaned, jumped) if jumped else [], cleaned
 
 

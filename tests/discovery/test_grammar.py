@@ -87,6 +87,11 @@ def test_the_error_of_a_second_thermometer_is_part_of_the_noise(above):
     assert whole.covariance[-1, -1] > 1.05 * alone.covariance[-1, -1]
 
 
+def test_one_recording_gets_no_formula(above):
+    x = SimpleNamespace(**{**above.__dict__, "fitter": HypothesisFitter(above.fitter.series[:1])})
+    assert propose(x, BASE) is None
+
+
 def test_condensed_evidence_is_the_likelihood(above):
     """A trajectory gains the same in condensed rows as in the full normal equations."""
     few = condense(above.fitter, above.base.fit, BASE)

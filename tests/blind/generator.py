@@ -6,7 +6,8 @@ alone. Series are scored in memory, or written as recordings (CONVENTIONS §3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from tests.blind.outside import trajectories
 from tests.blind.world import climate, corner_field, image, smooth_unknown
 from tests.recordings import write_recording
 
+START = 1_600_000_000.0  # s UTC, of the first frame
 _PARAMETERS = (
     "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2",
     "omega", "phi", "kappa", "X0", "Y0", "Z0",
@@ -28,23 +30,24 @@ class Unseen(Exception):
     """The effect changes nothing with this seed's temperatures."""
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Series:
-    """One recording in memory: rows of observations and of epochs."""
+    """One recording in memory.
+
+    times, reading_times (E,) s UTC; temperatures {name: (E,)} °C; points (E, T, 2) px, NaN where
+    not seen; sigma px; interval s; columns {name: (E,)}: other recorded quantities.
+    """
 
     name: str
     camera: str
-    epoch: np.ndarray
-    frame_time: np.ndarray
-    temperature_time: np.ndarray
+    numbers: np.ndarray
+    times: np.ndarray
+    reading_times: np.ndarray
     temperatures: dict[str, np.ndarray]
-    row_epoch: np.ndarray  # index into `epoch`
-    row_target: np.ndarray
-    xy: np.ndarray
+    points: np.ndarray
     sigma: float
-    field_nominal: np.ndarray
     interval: float
-    columns: dict[str, np.ndarray] = field(default_factory=dict)  # other recorded quantities
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def generate(case: Case) -> tuple[list[Series], dict]:
@@ -93,12 +96,10 @@ def generate(case: Case) -> tuple[list[Series], dict]:
 
     def leftover(size: float, which: int) -> float:
         e = dict(per_series[0][which], size=size)
+        p, X, nf = true_parameters(camera, [e], climates[0], unknowns[0], frame_axis[0], nominal,
+                                   views[0], offsets[0])  # fmt: skip
         if e["effect"] == "defocus":
-            _, _, nf = true_parameters(camera, [e], climates[0], unknowns[0], frame_axis[0],
-                                       nominal, views[0], offsets[0])  # fmt: skip
             return float(np.sqrt(np.mean((case.noise_px * nf) ** 2 - case.noise_px**2)))
-        p, X, _ = true_parameters(camera, [e], climates[0], unknowns[0], frame_axis[0], nominal,
-                                  views[0], offsets[0])  # fmt: skip
         T = np.interp(frame_axis[0], np.arange(seconds), T1)
         return left_over(image(X, p, camera.sensor), camera, nominal, views[0], T)
 
@@ -136,13 +137,11 @@ def generate(case: Case) -> tuple[list[Series], dict]:
         if case.field_motion and s == 0:
             X = moved_field(np.random.default_rng([case.seed, 79]), case.field_motion, X, frames)
         uv = image(X, p, camera.sensor)
-        built.append(
-            _measure(rng, case, camera_name, f"M{s + 1}", frames, uv, noise, climates[s], nominal)
-        )
-    if case.record_humidity:
-        for series, values in zip(built, humidity, strict=False):
-            at = series.frame_time - 1_600_000_000.0
-            series.columns = {"humidity": np.interp(at, np.arange(seconds), values)}
+        one = _measure(rng, case, camera_name, f"M{s + 1}", frames, uv, noise, climates[s])
+        if case.record_humidity:
+            read = np.interp(one.times - START, np.arange(seconds), humidity[s])
+            one = replace(one, columns={"humidity": read})
+        built.append(one)
     truth = {
         "case": dict(case.__dict__.items()),
         "camera": camera_name,
@@ -187,7 +186,6 @@ def _measure(
     uv: np.ndarray,
     noise: np.ndarray,
     climate_: dict[str, np.ndarray],
-    nominal: np.ndarray,
 ) -> Series:
     """Measure the true image points and temperatures, with noise and gross errors."""
     E, n = uv.shape[:2]
@@ -236,12 +234,10 @@ def _measure(
                 seen[i] &= np.abs(uv[i, :, 0] - x) > wide
                 x += 0.06 * width
     rows = np.flatnonzero(keep)
-    row_epoch, row_target = np.nonzero(seen[rows])
-    start = 1_600_000_000.0
     return Series(
-        name, camera, rows + 1, frames[rows] + start, read_at[rows] + start,
-        {k: v[rows] for k, v in temperatures.items()}, row_epoch, row_target,
-        measured[rows][row_epoch, row_target], sigma, nominal, case.interval,
+        name, camera, rows + 1, frames[rows] + START, read_at[rows] + START,
+        {k: v[rows] for k, v in temperatures.items()},
+        np.where(seen[..., None], measured, np.nan)[rows], sigma, case.interval,
     )  # fmt: skip
 
 
@@ -255,17 +251,26 @@ def write(series: Series, folder: Path) -> None:
                    "principal_distance": c},
         "temperatures": {k: {"unit": "degC", "resolution": 0.0625} for k in series.temperatures},
     }  # fmt: skip
+    field = [
+        [j, *(f"{v:.4f}" for v in place), "12.0", 0.02, 0.02, 0.02]
+        for j, place in enumerate(corner_field(), 1)
+    ]
+    write_series(series, [row[0] for row in field], head, folder, field)
+
+
+def write_series(
+    series: Series, targets: Sequence, head: dict, folder: Path, field: Sequence = ()
+) -> None:
+    """Write a recording with names of the targets, a head, and rows of the test field."""
     epochs = []
-    for i, number in enumerate(series.epoch):
-        times = f"{series.frame_time[i]:.3f}", f"{series.temperature_time[i]:.3f}"
+    for i, number in enumerate(series.numbers):
+        times = f"{series.times[i]:.3f}", f"{series.reading_times[i]:.3f}"
         read = (values[i] for values in series.temperatures.values())
         epochs.append([number, *times, *("" if np.isnan(v) else f"{v:.4f}" for v in read), ""])
     observations = [
-        [series.epoch[i], j + 1, f"{x:.4f}", f"{y:.4f}", series.sigma, series.sigma]
-        for i, j, (x, y) in zip(series.row_epoch, series.row_target, series.xy, strict=True)
-    ]
-    field = [
-        [j, *(f"{v:.4f}" for v in place), "12.0", 0.02, 0.02, 0.02]
-        for j, place in enumerate(series.field_nominal, 1)
+        [number, name, f"{x:.4f}", f"{y:.4f}", series.sigma, series.sigma]
+        for number, points in zip(series.numbers, series.points, strict=True)
+        for name, (x, y) in zip(targets, points, strict=True)
+        if np.isfinite(x)
     ]
     write_recording(folder, head, epochs, observations, field)

@@ -88,32 +88,28 @@ def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> di
         e["vector"] = rng.normal(size=3)
     elif name == "defocus":
         e["coldest"] = truth["coldest"]  # the noise depends on temperature equally in both series
+    along = np.zeros(16)
     if name in ("nonlinear_expansion", "softening", "thermal_gradient", "permanent_set",
                 "self_heating", "creep", "slip", "cyclic_interference", "second_heat_source",
                 OUTSIDE):  # fmt: skip
-        e["along"] = _direction(rng, camera)
+        along = _direction(rng, camera)
     elif name == "housing_tilt":
-        e["along"] = np.zeros(16)
-        e["along"][10:13] = rng.normal(size=3) * 1e-5
+        along[10:13] = rng.normal(size=3) * 1e-5
     elif name == "mount_motion":  # a bracket of some decimetres that bends with or without a lag
         e["tau"] = float(rng.choice([1e-3, np.exp(rng.uniform(np.log(60), np.log(500)))]))
-        e["along"] = np.zeros(16)
-        e["along"][10:13] = rng.normal(size=3) * 1e-5
-        e["along"][13:16] = rng.normal(size=3) * 1e-2
+        along[10:13] = rng.normal(size=3) * 1e-5
+        along[13:16] = rng.normal(size=3) * 1e-2
     elif name == "radial_distortion_drift":
-        e["along"] = np.zeros(16)
-        e["along"][3] = 1e-5
+        along[3] = 1e-5
         if rng.random() < 0.4:
-            e["along"][4] = rng.normal() * 2e-6
+            along[4] = rng.normal() * 2e-6
     elif name == "decentering_drift":
-        e["along"] = np.zeros(16)
-        e["along"][6:8] = rng.normal(size=2) * 1e-5
+        along[6:8] = rng.normal(size=2) * 1e-5
     elif name == "affinity_drift":
-        e["along"] = np.zeros(16)
-        e["along"][8:10] = rng.normal(size=2) * 1e-5
+        along[8:10] = rng.normal(size=2) * 1e-5
     elif name == "test_field_expansion":
         e["axes"] = rng.uniform(0.2, 1.0, 3) * 1e-5
-    return e
+    return {**e, "along": along} if along.any() else e
 
 
 def fresh(rng: np.random.Generator, e: dict, first: bool, seconds: int) -> dict:
@@ -191,12 +187,11 @@ def true_parameters(
     p += np.stack(
         [at(extra[:, j]) if extra[:, j].any() else np.zeros(len(frames)) for j in range(16)], 1
     )
-    if any(e["effect"] == "slip" for e in effects):  # a step is not interpolated
-        for e in effects:
-            if e["effect"] == "slip":
-                s = e["size"] * e["happens"]
-                p -= s * at((t >= e["time"]).astype(float))[:, None] * e["along"]
-                p += s * (frames >= e["time"])[:, None] * e["along"]
+    for e in effects:
+        if e["effect"] == "slip":  # a step is not interpolated
+            s = e["size"] * e["happens"]
+            p -= s * at((t >= e["time"]).astype(float))[:, None] * e["along"]
+            p += s * (frames >= e["time"])[:, None] * e["along"]
     # the lens moves along its axis, so the rays keep their angles
     p[:, 3:10] *= (camera.base[0] / p[:, :1]) ** np.array([2, 4, 6, 1, 1, 0, 0])
     X = points[None] * (1 + np.stack([at(scale[:, k]) for k in range(3)], 1))[:, None, :]

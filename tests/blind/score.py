@@ -20,13 +20,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import OUTSIDE, SINGLE, Case
-from tests.blind.generator import generate
 from tests.blind.outcome import Outcome, compare
 from tests.blind.tables import row, write
 from thermocald.discovery.result import Discovery, discover_series
-from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.reduce import reduce_together
 
 NUMBERS = {
     "thermal_lag": ("tau",), "time_offset": ("d",), "hysteresis": ("half_width",),
@@ -37,11 +36,9 @@ NUMBERS = {
 
 def discover_case(case: Case) -> tuple[Discovery, dict, float]:
     """Run discovery on a case; return its result, the truth, and processor time, s."""
-    series, truth = generate(case)
+    inputs, truth = generated(case)
     begin = time.process_time()
-    first = reduce_series(series_input(series[0]))
-    rest = [reduce_series(series_input(s), first.T0, first.scale) for s in series[1:]]
-    discovery = discover_series([first, *rest])
+    discovery = discover_series(reduce_together(inputs))
     return discovery, truth, time.process_time() - begin
 
 
@@ -84,10 +81,8 @@ def cases(part: str, seeds: Iterable[int]) -> Iterator[Case]:
     kind, _, px = part.partition("-")
     strength = float(px) if px else 0.3
     for seed in seeds:
-        if kind == "single":
-            yield from (Case((e,), strength, seed) for e in SINGLE)
-        elif kind == "hard":
-            yield from (Case((e,), strength, seed, hard=True) for e in SINGLE)
+        if kind in ("single", "hard"):
+            yield from (Case((e,), strength, seed, hard=kind == "hard") for e in SINGLE)
         elif kind == "pair":
             rng = np.random.default_rng(seed)
             every = list(combinations(SINGLE, 2))
@@ -95,12 +90,8 @@ def cases(part: str, seeds: Iterable[int]) -> Iterator[Case]:
                 yield Case(every[i], strength, seed * 1000 + int(i))
         elif kind == "outside":
             yield from (Case((OUTSIDE,), strength, seed * 10 + k) for k in range(10))
-        elif kind == "none":
-            yield from (Case((), 0.3, seed * 20 + k) for k in range(20))
-        elif kind == "none2":
-            yield from (Case((), 0.3, seed * 20 + k, thermometer_k=0.08) for k in range(20))
-        elif kind == "nonehard":
-            yield from (Case((), 0.3, seed * 20 + k, hard=True) for k in range(20))
+        elif kind in NONE:
+            yield from (Case((), 0.3, seed * 20 + k, **NONE[kind]) for k in range(20))
         else:
             raise SystemExit(f"no such part: {part}")
 
@@ -111,6 +102,7 @@ PARTS = (
 )  # fmt: skip
 
 
+NONE: dict[str, dict] = {"none": {}, "none2": {"thermometer_k": 0.08}, "nonehard": {"hard": True}}
 # more recordings without an effect, to show that fewer than one in a hundred has a name
 MORE_SEEDS = {"none": 5, "none2": 5}
 

@@ -9,9 +9,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import Case
-from tests.blind.generator import generate
 from thermocald.thermal.reduce import reduce_together
 
 
@@ -21,7 +20,7 @@ def evidence_of():
 
     @cache
     def build(*effects: str, px: float = 0.3, seed: int = 1, **more):
-        series, truth = generate(Case(effects, px, seed, **more))
-        return reduce_together([series_input(s) for s in series]), truth
+        inputs, truth = generated(Case(effects, px, seed, **more))
+        return reduce_together(inputs), truth
 
     return build

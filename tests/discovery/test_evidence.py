@@ -7,23 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.blind import bridge
+from tests.blind.bridge import generated
 from tests.blind.case import Case
-from tests.blind.generator import generate
 from tests.real_corners.generator import CAMERAS
 from thermocald.discovery.result import discover_series
 from thermocald.errors import DataError
 from thermocald.store.recording.reader import read_recording
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
-from thermocald.thermal.reduce import reduce_series
+from thermocald.thermal.reduce import find_spikes, reduce_series
 from thermocald.thermal.series import in_blocks
 from thermocald.thermal.source import series_input
 
 
 @pytest.fixture(scope="module")
 def source():
-    return bridge.series_input(generate(Case(("creep",), 0.3, 4, with_m2=False))[0][0])
+    return generated(Case(("creep",), 0.3, 4, with_m2=False))[0][0]
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +33,22 @@ def e(source):
 def test_noise_is_found(e):
     assert np.sqrt(e.variance) * 0.04 == pytest.approx(0.04, rel=0.02)
     assert np.median(e.sigma0) == pytest.approx(1.0, abs=0.02)
+
+
+def test_turning_points_of_a_drift_are_no_gross_errors_and_jumps_are():
+    """At turning points only, an epoch differs from the median of its neighbours."""
+    rng, every = np.random.default_rng(3), np.ones((300, 20), dtype=bool)
+    arm = rng.uniform(0.5, 1.5, (20, 2))  # a drift of a pixel, noise of 0.004 px
+    way = np.sin(2 * np.pi * np.arange(300) / 40.0)
+    misclosure = way[:, None, None] * arm + rng.normal(0, 0.004, (300, 20, 2))
+    assert find_spikes(misclosure, every).sum() == 0
+    jumps = [50, 121, 250], [3, 7, 3]
+    misclosure[jumps] += 0.5
+    found = find_spikes(misclosure, every)
+    assert found[jumps].all()
+    # neighbouring epochs may also be suspected before an adjustment
+    near = (np.argwhere(found)[:, None] - np.transpose(jumps)) * [1, 3]  # of the same target
+    assert (np.abs(near).max(axis=2).min(axis=1) <= 2).all()
 
 
 def test_gross_errors_are_taken_out(e):
@@ -96,9 +111,9 @@ def test_blocks_keep_the_slow_courses(e):
 
 def test_the_place_of_linearisation_has_all_parameters():
     """If C1 = 4e-3 were held at 0, y0 and B2 would absorb it, and the drifts would be biased."""
-    series, _ = generate(Case(("affinity_drift",), 0.3, 210, with_m2=False))
+    (series,), _ = generated(Case(("affinity_drift",), 0.3, 210, with_m2=False))
 
-    at = reduce_series(bridge.series_input(series[0])).at
+    at = reduce_series(series).at
 
     assert at.iop[8] == pytest.approx(1.6e-3, abs=4e-4)  # C1 of the base and of the mean T
     assert abs(at.iop[7]) < 2e-4  # B2, drawn with 1e-4

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import Case
-from tests.blind.generator import generate
 from tests.blind.score import discover_case, judge_discovery
 from tests.marks import mostly_slow
 from thermocald.discovery import examination
@@ -71,12 +70,19 @@ def test_recordings_of_two_cameras_contradict_each_other(epochs):
     """
     cases = (Case((), seed=n, epochs=epochs, camera="rpi-v2.1", with_m2=False) for n in (3, 5))
 
-    found = discover_series(reduce_together([series_input(generate(c)[0][0]) for c in cases]))
+    found = discover_series(reduce_together([generated(c)[0][0] for c in cases]))
 
     assert found.headline == "unexplained: unnamed"
     assert found.effects[0].statement.startswith("the recordings contradict each other: the model")
     assert "bridge" not in found.effects[0].evidence
     assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.06)
+
+
+def test_a_step_of_the_last_epoch_may_be_any_cause_that_begins_there(evidence_of):
+    """Regression: a large softening was named `slip` alone, with equal χ²."""
+    evidence, _ = evidence_of("softening", px=5.0, seed=7031, epochs=33, with_m2=False)
+
+    assert discover_series(evidence).headline == "effects_found: slip or softening"
 
 
 def test_epochs_with_few_targets_have_no_weight(evidence_of):

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import Case
 from tests.blind.field_motion import BOARD, MOVED_MM, TARGET
-from tests.blind.generator import generate
 from tests.blind.outcome import excess_closed
 from thermocald.discovery.result import discover_series
 from thermocald.photogrammetry.field.testfield import TestField
@@ -78,9 +77,9 @@ def few_tags(source, wandering, course):
 @pytest.mark.parametrize("effect", ["slip", "thermal_gradient"])
 def test_an_effect_is_named_where_corners_of_a_few_tags_wander(effect):
     """They are so few that three of them bend the cameras until none stands out."""
-    series, _ = generate(Case((effect,), 0.25, 901, epochs=60))
+    series, _ = generated(Case((effect,), 0.25, 901, epochs=60))
     inputs = [
-        few_tags(series_input(s), rows, lambda u, k: np.cos(np.pi * (k + 1) * u + k))
+        few_tags(s, rows, lambda u, k: np.cos(np.pi * (k + 1) * u + k))
         for s, rows in zip(series, WANDERING, strict=True)
     ]
 
@@ -95,9 +94,9 @@ def test_an_effect_is_named_where_corners_of_a_few_tags_wander(effect):
 @pytest.mark.slow
 def test_a_knock_that_may_be_a_slip_is_listed_as_both():
     """So many corners jump that none is left out, and the mount is assumed to move."""
-    series, _ = generate(Case(("slip",), 0.25, 901, epochs=60))
+    series, _ = generated(Case(("slip",), 0.25, 901, epochs=60))
     inputs = [
-        few_tags(series_input(s), range(at, 24, 3), lambda u, k: 0.4 * (u > 0.2 + 0.07 * k))
+        few_tags(s, range(at, 24, 3), lambda u, k: 0.4 * (u > 0.2 + 0.07 * k))
         for at, s in enumerate(series)
     ]
 

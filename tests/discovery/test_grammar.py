@@ -10,9 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.blind.bridge import series_input
+from tests.blind.bridge import generated
 from tests.blind.case import OUTSIDE, Case
-from tests.blind.generator import generate
 from tests.blind.outcome import excess_closed
 from tests.blind.outside import HUMID
 from thermocald.discovery.formulas import Library, condense
@@ -34,7 +33,7 @@ TEN = (
 
 def reduced(kind: str, seed: int):
     case = Case((OUTSIDE,), 0.3, seed, influence=kind, record_humidity=kind in HUMID)
-    return reduce_together([series_input(s) for s in generate(case)[0]])
+    return reduce_together(generated(case)[0])
 
 
 def examined(kind: str, seed: int):

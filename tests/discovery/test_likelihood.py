@@ -81,15 +81,6 @@ def test_effect_free_recordings_are_at_the_floor(evidence_of):
     assert fitter.fit(()).chi2 / free > 2.0
 
 
-def test_the_cause_predicts_every_block(evidence_of):
-    lab = HypothesisFitter(evidence_of("nonlinear_expansion", px=0.2, seed=91, epochs=90)[0])
-    fit = lab.refine(lab.fit([Term("nonlinear_expansion")]))
-
-    (gain,) = measure_block_gains(lab, fit)
-
-    assert is_confirmed(gain)
-
-
 @pytest.mark.parametrize(
     ("gain", "expected"),
     [

@@ -100,12 +100,17 @@ def test_the_noise_of_twenty_readings_with_two_kinks():
     assert np.mean(np.array(found) > 0.2) < 0.1
 
 
+def read_seldom(noise):
+    """Return times, readings every 30 s of a warm-up, and their thermometer."""
+    t = 30.0 * np.arange(15)
+    y = trajectory(t + 300.0) + np.random.default_rng(5).normal(0, noise, 15)
+    return t, y, thermometers(t, {"T": y}, {"T": None})[1]["T"]
+
+
 def test_between_sparse_readings_the_temperature_follows_its_curve():
     """Straight lines between readings every 30 s of a warm-up are too low by h²/12 T''."""
     # the sharpest intervals, at the beginning, have unknowns of their own
-    t, fine = 30.0 * np.arange(15), np.arange(120.0, 420.0, 2.0)
-    y = trajectory(t + 300.0) + np.random.default_rng(5).normal(0, 0.001, 15)
-    c = thermometers(t, {"T": y}, {"T": None})[1]["T"]
+    (t, y, c), fine = read_seldom(0.001), np.arange(120.0, 420.0, 2.0)
     straight = np.interp(fine, t, y) - trajectory(fine + 300.0)
     curved = np.interp(fine, c.times, c.trajectory) - trajectory(fine + 300.0)
     assert np.mean(straight) < -0.005
@@ -113,9 +118,7 @@ def test_between_sparse_readings_the_temperature_follows_its_curve():
 
 
 def test_on_a_curve_nothing_is_unknown_but_the_readings():
-    t = 30.0 * np.arange(15)
-    y = trajectory(t + 300.0) + np.random.default_rng(5).normal(0, 0.02, 15)
-    c = thermometers(t, {"T": y}, {"T": None})[1]["T"]
+    _, _, c = read_seldom(0.02)
     on_curve = c.mixing.diagonal() == 0
     weights = c.mixing.toarray()[on_curve]
     assert on_curve.sum() >= 3 * 9  # the sharpest intervals have unknowns of their own

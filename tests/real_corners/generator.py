@@ -17,9 +17,10 @@ import numpy as np
 import yaml
 
 from tests.blind.case import PROGRAMMES
+from tests.blind.generator import Series, write_series
 from tests.blind.hidden import Camera, bisected, fresh, hide, left_over, true_parameters
 from tests.blind.world import climate, image, smooth_unknown
-from tests.recordings import read_rows, write_recording
+from tests.recordings import read_rows
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 NINE = (
@@ -29,6 +30,7 @@ NINE = (
 OTHERS = ("slip", "cyclic_interference", "second_heat_source", "radial_distortion_drift",
           "decentering_drift", "test_field_expansion")  # fmt: skip
 INTERVAL = 30.0
+SIGMA = 0.1
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 # Interior and exterior orientation (CONVENTIONS §2) of the four cameras, from an adjustment of
@@ -63,18 +65,6 @@ class RealCase:
     strength_px: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class RealSeries:
-    """One half: points (E, T, 2) px or NaN, times (E,) s, temperatures {name: (E,)} °C."""
-
-    name: str
-    camera: str
-    numbers: np.ndarray
-    times: np.ndarray
-    temperatures: dict[str, np.ndarray]
-    points: np.ndarray
-
-
 @cache
 def corners(camera: str) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the targets' names and points (T, 3) mm, and image points (E, T, 2) px or NaN."""
@@ -90,7 +80,7 @@ def corners(camera: str) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     return names, place, points
 
 
-def generate(case: RealCase) -> tuple[list[RealSeries], dict]:
+def generate(case: RealCase) -> tuple[list[Series], dict]:
     """Generate M1 and M2; return them and the truth."""
     rng = np.random.default_rng([case.seed, 4711, CAMERAS.index(case.camera)])
     _, place, points = corners(case.camera)
@@ -140,12 +130,11 @@ def generate(case: RealCase) -> tuple[list[RealSeries], dict]:
             name: np.interp(times, np.arange(seconds), course) + rng.normal(0, 0.04, len(times))
             for name, course in climates[k].items()
         }
-        built.append(
-            RealSeries(
-                f"M{k + 1}", head["name"], np.arange(len(times)) + 1 + k * half,
-                times + 1.6e9 + 1e5 * k, read, corner + moved(own[k], k) - at_rest,
-            )
-        )  # fmt: skip
+        at = times + 1.6e9 + 1e5 * k
+        points = corner + moved(own[k], k) - at_rest
+        numbers = np.arange(len(times)) + 1 + k * half
+        name = f"M{k + 1}"
+        built.append(Series(name, head["name"], numbers, at, at, read, points, SIGMA, INTERVAL))
     truth = {
         "case": dict(case.__dict__.items()), "strength_px": strength, "programmes": programmes,
         "effects": [
@@ -174,21 +163,10 @@ def _size(left, e: dict, camera: Camera, strength: float) -> float:
     return float(size)
 
 
-def write(series: RealSeries, source: str, folder: Path) -> None:
+def write(series: Series, source: str, folder: Path) -> None:
     """Write the series as a recording (CONVENTIONS §3)."""
     head = yaml.safe_load((SHARED / source / "recording.yaml").read_text())
     head |= {"name": f"{source}-{series.name}", "series": series.name, "interval": INTERVAL}
     head["temperatures"] = {name: {"unit": "degC"} for name in series.temperatures}
-    epochs = []
-    for k, number in enumerate(series.numbers):
-        read = (f"{v[k]:.4f}" for v in series.temperatures.values())
-        epochs.append([number, *[f"{series.times[k]:.3f}"] * 2, *read, ""])
-    names, _, _ = corners(source)
-    observations = [
-        [number, name, f"{x:.4f}", f"{y:.4f}", 0.1, 0.1]
-        for number, points in zip(series.numbers, series.points, strict=True)
-        for name, (x, y) in zip(names, points, strict=True)
-        if np.isfinite(x)
-    ]
-    write_recording(folder, head, epochs, observations)
+    write_series(series, corners(source)[0], head, folder)
     (folder / "testfield.csv").write_text((SHARED / source / "testfield.csv").read_text())

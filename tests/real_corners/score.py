@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from tests.blind.generator import Series
 from tests.blind.outcome import Outcome, compare
 from tests.real_corners.generator import (
     CAMERAS,
@@ -26,7 +27,6 @@ from tests.real_corners.generator import (
     OTHERS,
     SHARED,
     RealCase,
-    RealSeries,
     generate,
 )
 from thermocald.discovery.result import Discovery, discover_series
@@ -42,15 +42,15 @@ GAP_CLOSED = 0.8
 """Least share of the excess on M2 over the camera's noise that correct names explain."""
 
 
-def input_of(series: RealSeries, source: str) -> SeriesInput:
+def input_of(series: Series, source: str) -> SeriesInput:
     """Return the series as the program reads it, without files."""
     recorded = series_input(read_recording(SHARED / source))
     grid = recorded.grid
     weights = np.zeros((len(series.times), len(recorded.field), 3))
-    weights[..., :2] = np.isfinite(series.points[..., :1]) / 0.1**2
+    weights[..., :2] = np.isfinite(series.points[..., :1]) / series.sigma**2
     return SeriesInput(
         series.name, series.camera, recorded.sensor, recorded.field, recorded.principal_distance,
-        series.times, series.times, series.temperatures, dict.fromkeys(series.temperatures),
+        series.times, series.reading_times, series.temperatures, dict.fromkeys(series.temperatures),
         type(grid)(np.round(series.points, 4), weights), series.numbers,
     )  # fmt: skip
 

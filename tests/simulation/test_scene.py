@@ -20,8 +20,7 @@ from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import write_model
-from thermocald.physics.scene import Look, Scene
-from thermocald.physics.shapes import surface_normals
+from thermocald.physics.scene import Look, Scene, surface_normals
 from thermocald.physics.testfields import (
     corner_field,
     corner_view,

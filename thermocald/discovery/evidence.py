@@ -69,20 +69,15 @@ def replace_moved_boards(evidence: ReducedSeries) -> tuple[list[FieldMovement], 
     movements = board_movements(series, wandering_targets(series))
     if not movements:
         return [], evidence
-    still = _put_boards_back(evidence, movements)
-    for _ in range(_PASSES):
-        movements = [refined(_field_series(still), m) for m in movements]
-        still = _put_boards_back(evidence, movements)
+    grid, still = evidence.source.grid, evidence
+    for turn in range(1 + _PASSES):
+        if turn:
+            movements = [refined(_field_series(still), m) for m in movements]
+        points = np.array(grid.points)
+        for m in movements:
+            points[:, m.rows] -= m.trajectory[:, None, None] * m.image
+        still = with_points(evidence, ObservationGrid(points, grid.weights))
     return movements, still
-
-
-def _put_boards_back(evidence: ReducedSeries, movements: list[FieldMovement]) -> ReducedSeries:
-    """Reduce the series again with the boards in their places."""
-    grid = evidence.source.grid
-    points = np.array(grid.points)
-    for m in movements:
-        points[:, m.rows] -= m.trajectory[:, None, None] * m.image
-    return with_points(evidence, ObservationGrid(points, grid.weights))
 
 
 def drop_wandering_targets(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
@@ -179,7 +174,8 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
     """
     jumps: dict[int, tuple[int, float]] = {}
     limit = criteria.STEP_CHI2 * evidence.correlation
-    cleaned = evidence
+    cleaned, groups = evidence, evidence.source.field.groups
+    seen = evidence.source.grid.observed.any(axis=0)
     for _ in range(8):
         gain, first, share = _find_steps(cleaned)
         w = cleaned.weights[..., 0]
@@ -200,30 +196,19 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
             break
         for row in chosen:
             jumps[int(row)] = (int(first[row]), float(gain[row]))
-        if len(jumps) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
+        if len(jumps) > 0.2 * seen.sum():
             return [], evidence  # so many do not jump independently: the camera moved
-        groups = evidence.source.field.groups  # a marker is left out as a whole
-        whole = np.flatnonzero(np.isin(groups, groups[sorted(jumps)]))
-        cleaned = without_targets(evidence, whole)
+        # a marker is left out as a whole
+        cleaned = without_targets(evidence, np.flatnonzero(np.isin(groups, groups[sorted(jumps)])))
     if not jumps:
         return [], evidence
-    jumped = _keep_whole_markers(evidence, jumps)
-    return _group_steps(cleaned, jumped) if jumped else [], cleaned
-
-
-def _keep_whole_markers(
-    evidence: ReducedSeries, jumps: dict[int, tuple[int, float]]
-) -> dict[int, tuple[int, float]]:
-    """Drop the jumps that most corners of their marker did not make together."""
-    groups = evidence.source.field.groups
-    seen = evidence.source.grid.observed.any(axis=0)
-    out = {}
-    for row, (first, gain) in jumps.items():
-        corners = np.flatnonzero((groups == groups[row]) & seen)
-        together = [r for r in corners.tolist() if r in jumps and abs(jumps[r][0] - first) <= 1]
+    jumped = {}
+    for corner, jump in jumps.items():
+        corners = np.flatnonzero((groups == groups[corner]) & seen)
+        together = [r for r in corners.tolist() if r in jumps and abs(jumps[r][0] - jump[0]) <= 1]
         if 4 * len(together) >= 3 * len(corners):
-            out[row] = (first, gain)
-    return out
+            jumped[corner] = jump
+    return _group_steps(cleaned, jumped) if jumped else [], cleaned
 
 
 _GROSS_CHI2 = 25.0  # the most that one point says about the time of a step

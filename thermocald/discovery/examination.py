@@ -332,13 +332,15 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
     for s in sorted(seen, key=by_score):
         mine = [t for t in best.terms if t.effect not in s.names]
         theirs = [t for t in s.terms if t.effect not in best.names]
+        worse, band = s.score - best.score, criteria.BAND
         # one drive in place of another is compared by the fit alone
-        swapped = len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive
-        close = (
-            s.fit.chi2 < best.fit.chi2 + criteria.DRIVES_BAND
-            if swapped
-            else s.score < best.score + criteria.BAND
-        )
+        if len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive:
+            worse, band = s.fit.chi2 - best.fit.chi2, criteria.DRIVES_BAND
+        # and so is a step that one epoch shows: any cause that begins there fits it as well, and
+        # the determinant counts only how much the readings' errors blur this epoch
+        elif any(_shows_once(t, best.fitter.series) for t in mine):
+            worse = s.fit.chi2 - best.fit.chi2
+        close = worse < band
         different = sorted(s.names) != sorted(best.names)
         if different and close and s.names not in [r.names for r in out]:
             out.append(s)
@@ -346,6 +348,15 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
     more = [s for s in out if len(s.terms) > len(best.terms)]
     said = [s for s in more if any(set(r.names) < set(s.names) for r in (best, *out))]
     return tuple(s for s in out if s not in said)
+
+
+def _shows_once(term: Term, series: Sequence[ReducedSeries]) -> bool:
+    """Test whether an event has one epoch before or after it, in each series in which it occurs."""
+    if not term.kind.is_event:
+        return False
+    pairs = zip(series, term.fresh, strict=True)
+    later = [e.times[e.n > 0] >= own[0][1] for e, own in pairs if own]
+    return all(min(np.sum(after), np.sum(~after)) <= 1 for after in later)
 
 
 def _compare_ties(

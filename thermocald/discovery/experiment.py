@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from thermocald.arrays import Array
-    from thermocald.discovery.search import Solution
     from thermocald.physics.effect import Parameter
     from thermocald.thermal.series import ReducedSeries
 
@@ -86,25 +85,21 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
     search = Search(HypothesisFitter(ready))
     base = search.base()
     drives = all(catalogue.get(name).is_drive for name in (first, second))
-    better, worse = sorted(
-        (_find_best(search, base, name) for name in (first, second)), key=by_score
-    )
+    found = []
+    for name in (first, second):
+        own = [c for c in search.candidates if c.effect == name]
+        promises = [search.promise(c, search.scanner.scan(c, base.fit)) for c in own]
+        if not promises:
+            raise UsageError(
+                f"{name} cannot be tested in this series: it needs a quantity that was not recorded"
+            )
+        best = max(promises, key=lambda p: p.net)  # of the sets of parameters that it can act on
+        found.append(search.refine((*base.terms, best.term), (*base.penalties, best.penalty)))
+    better, worse = sorted(found, key=by_score)
     return Separation(
         better.names[-1], worse.names[-1], worse.score - better.score,
         criteria.DRIVES_BAND if drives else criteria.BAND, better.score < base.score,
     )  # fmt: skip
-
-
-def _find_best(search: Search, base: Solution, name: str) -> Solution:
-    """Find the best solution with one effect, over the sets of parameters that it can act on."""
-    own = [c for c in search.candidates if c.effect == name]
-    promises = [search.promise(c, search.scanner.scan(c, base.fit)) for c in own]
-    if not promises:
-        raise UsageError(
-            f"{name} cannot be tested in this series: it needs a quantity that was not recorded"
-        )
-    best = max(promises, key=lambda p: p.net)
-    return search.refine((*base.terms, best.term), (*base.penalties, best.penalty))
 
 
 _STEP_S = 60.0  # steps by which a thermostat follows a ramp
@@ -215,7 +210,16 @@ def rank_experiments(
             f"{_LEAST_S / 60:.0f} min or more to separate effects: take more epochs"
         )
     times = interval * np.arange(epochs, dtype=np.float64)
-    runs = {name: _limit_programme(name, limits, body, times, highest) for name in _KINDS}
+    runs = {}
+    for name in _KINDS:  # the hottest programme of each kind within the duty
+        most = highest
+        while True:
+            steps = tuple(_steps(name, limits, body, float(times[-1]), most))
+            temperature, duty = _simulate(steps, body, times)
+            if duty <= limits.max_duty or most - body.ambient < _LEAST_K + 1.0:
+                break
+            most -= 1.0
+        runs[name] = steps, temperature, duty
     usual = runs["two equal cycles"]
     history = _history(times, usual[1], body)
     sizes = {n: _measure_left(n, None, history) / strength_px for n in (first, second)}
@@ -232,18 +236,6 @@ def rank_experiments(
 
 
 # -- heating -----------------------------------------------------------------------------------
-
-
-def _limit_programme(
-    name: str, limits: Limits, body: Body, times: Array, highest: float
-) -> tuple[tuple[tuple[float, float | None], ...], Array, float]:
-    """Return a kind's hottest programme within the duty: steps, temperature (E,) °C, duty."""
-    while True:
-        steps = tuple(_steps(name, limits, body, float(times[-1]), highest))
-        temperature, duty = _simulate(steps, body, times)
-        if duty <= limits.max_duty or highest - body.ambient < _LEAST_K + 1.0:
-            return steps, temperature, duty
-        highest -= 1.0
 
 
 def _steps(

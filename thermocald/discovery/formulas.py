@@ -344,7 +344,7 @@ class FormulaSearch:
             good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
         return [n for n, ok in zip(nodes, good, strict=True) if ok], stack[:, good]
 
-    def best(self, further: bool = True) -> list[Found]:
+    def best(self, further: bool) -> list[Found]:
         """Rank formulas, best first, each structure once; further: also extend them."""
         ranking = self._fit_structures(self.nodes, self.gains, _WIDTH)
         for _ in range(_STEPS if further else 0):

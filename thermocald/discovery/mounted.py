@@ -47,7 +47,7 @@ _SETTLED = 0.1
 def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
-    given: Sequence[ModelEffect] = (),
+    given: Sequence[ModelEffect],
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks one by one while the penalised likelihood improves.
 

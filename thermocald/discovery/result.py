@@ -27,7 +27,6 @@ from thermocald.discovery.entries import (
 from thermocald.discovery.examination import Examination, examine_series
 from thermocald.discovery.gap import Gap, Stage, fit_first, measure_gap, measure_stage
 from thermocald.discovery.proposal import propose
-from thermocald.discovery.search import enrich_term
 from thermocald.discovery.unnamed import (
     NO_PROPOSAL,
     describe_misfit,
@@ -328,10 +327,11 @@ def _widen_estimates(
     That a drift of a lens's A2 is too small to show does not make A1 as certain as if A2 were
     constant.
     """
-    richer = enrich_term(fit.terms[k])
-    if richer is None:
+    term, own = fit.terms[k], set(fit.terms[k].parameters)
+    richer = [p for p in term.kind.parameter_sets if len(p) == len(own) + 1 and own < set(p)]
+    if not richer:
         return estimates
-    terms = (*fit.terms[:k], richer, *fit.terms[k + 1 :])
+    terms = (*fit.terms[:k], replace(term, parameters=richer[0]), *fit.terms[k + 1 :])
     other = estimate_term(estimate_first(x, terms)[1], k, x.fitter.series[0])
     return {
         name: {**e, "sd": max(e["sd"], other[name]["sd"])} if e["sd"] is not None else e

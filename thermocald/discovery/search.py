@@ -65,15 +65,6 @@ def list_candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
     return out
 
 
-def enrich_term(term: Term) -> Term | None:
-    """Return the term with the parameter set of one more coefficient, None if there is none."""
-    for parameters in term.kind.parameter_sets:
-        more = len(parameters) == len(term.parameters) + 1
-        if more and set(term.parameters) < set(parameters):
-            return replace(term, parameters=parameters)
-    return None
-
-
 def _varies(evidence: ReducedSeries, channel: str) -> bool:
     instrument = evidence.thermometers.get(channel)
     return instrument is not None and float(np.nanstd(instrument.trajectory)) > 3 * instrument.noise
@@ -200,11 +191,15 @@ class Search:
 
         least: gain beyond its penalty that a scan must promise, except for an event.
         """
-        grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
+        terms, penalties = solution.terms, solution.penalties
+        grown = [
+            self.refine((*terms, p.term), (*penalties, p.penalty))
+            for p in self._promises(solution, width, least)
+        ]
         return sorted(grown, key=by_score)
 
     def expand_all(
-        self, solutions: Sequence[Solution], width: int, most: int, below: float = np.inf
+        self, solutions: Sequence[Solution], width: int, most: int, below: float
     ) -> list[Solution]:
         """Find the best extensions of several solutions by one effect, at most `most` sets.
 
@@ -214,15 +209,11 @@ class Search:
         pairs = [(s, p) for s, p in every if s.score - p.net < below]
         pairs.sort(key=lambda pair: pair[0].score - pair[1].net)
         grown: dict[frozenset[str], Solution] = {}
-        for solution, promise in pairs:
-            names = frozenset((*solution.names, promise.term.effect))
+        for s, p in pairs:
+            names = frozenset((*s.names, p.term.effect))
             if len(grown) < most and names not in grown:
-                grown[names] = self._with(solution, promise)
+                grown[names] = self.refine((*s.terms, p.term), (*s.penalties, p.penalty))
         return sorted(grown.values(), key=by_score)
-
-    def _with(self, solution: Solution, promise: Scanned) -> Solution:
-        penalties = (*solution.penalties, promise.penalty)
-        return self.refine((*solution.terms, promise.term), penalties)
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
         """Return the `width` most promising effects beside a solution, best first.
@@ -304,7 +295,7 @@ class Search:
                         solution, term = trial, moved
         return solution
 
-    def shrink(self, solution: Solution, kept: int = 0) -> Solution:
+    def shrink(self, solution: Solution, kept: int) -> Solution:
         """Drop effects that gain less than their penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:
             fewer = []

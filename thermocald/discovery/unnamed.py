@@ -256,7 +256,13 @@ def describe_misfit(x: Examination) -> dict[str, Any]:
         add(name, (trajectory - trajectory.mean())[:, None], total.directions)
     for column in COLUMNS:
         add(f"{column}, slow trajectories", total.trajectories.T, unit_directions((column,)))
-    rows.append(("noise level (sigma0)", *_test_noise(e.sigma0, e.n.astype(float), e.N.shape[1])))
+    # the spread of sigma0 in the series, and its significance against constant noise
+    ok = e.n > 0
+    degrees = 2.0 * e.n[ok] - e.N.shape[1]
+    off = e.sigma0[ok] - np.average(e.sigma0[ok], weights=degrees)
+    z, count = float(np.sum(degrees * off**2)) * 2, float(ok.sum() - 1)
+    spread = float(np.std(e.sigma0[ok]))
+    rows.append(("noise level (sigma0)", spread, (z - count) / np.sqrt(2 * count)))
     names = e.source.field.names
     return {
         "against": [
@@ -266,15 +272,6 @@ def describe_misfit(x: Examination) -> dict[str, Any]:
         "targets": [names[r] for g in x.displaced[0] for r in g.rows],
         "image_regions": _measure_regions(e),
     }
-
-
-def _test_noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
-    """Return the spread of sigma0 in the series, and its significance against constant noise."""
-    ok = n > 0
-    free = 2.0 * n[ok] - columns
-    z = float(np.sum(free * (sigma0[ok] - np.average(sigma0[ok], weights=free)) ** 2)) * 2
-    count = float(ok.sum() - 1)
-    return float(np.std(sigma0[ok])), (z - count) / np.sqrt(2 * count)
 
 
 def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:

@@ -131,14 +131,14 @@ class Parameter:
             return 0.02
         return 0.05 if self.role == "delay" else 1e-3
 
-    def bounded(self, old: float, new: float, slack: float = 1.0) -> float:
+    def bounded(self, old: float, new: float) -> float:
         """Limit an iteration's new value to the range and, if `log`, to a factor of 2 from the old.
 
-        slack: factor on the lower bound, as data may call for less than a simulation can use.
+        Data may then call for a tenth of the lower bound, which a simulation cannot use.
         """
         low = self.low
         if self.log:
-            new, low = np.clip(new, old / 2.0, old * 2.0), slack * low
+            new, low = np.clip(new, old / 2.0, old * 2.0), 0.1 * low
         return float(np.clip(new, low, self.high))
 
 

@@ -103,9 +103,9 @@ class History:
         """Return the temperature (E,) °C of a channel at the frames' times."""
         return self.polygon(channel).at(self.times)
 
-    def temperature_matrix(self, channel: str | None = None) -> csr_array:
-        """Return ∂ temperature / ∂ readings (E, R)."""
-        p = self.polygon(channel)
+    def temperature_matrix(self) -> csr_array:
+        """Return ∂ temperature / ∂ readings (E, R) of the reference."""
+        p = self.polygon()
         return interpolation_matrix(p.times, self.times) @ p.matrix
 
 

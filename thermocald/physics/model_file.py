@@ -131,18 +131,14 @@ _KEYS = (
 )  # fmt: skip
 
 
-def read_model(path: Path) -> ThermalModel:
-    """Read a model file; ConfigurationError names the file and the key."""
-    return parse_model(read_yaml(path), path)
-
-
 def write_model(path: Path, model: ThermalModel) -> None:
     """Write a model file, completely or not at all."""
     write_text(path, dump_yaml(model_document(model)))
 
 
-def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> ThermalModel:
-    """Read a model from a file's mapping; `path` is for messages."""
+def read_model(path: Path) -> ThermalModel:
+    """Read a model file; ConfigurationError names the file and the key."""
+    document = read_yaml(path)
     top = QuantityReader(path, document)
     top.require_format(MODEL_FORMAT)
     top.only(_KEYS)

@@ -22,11 +22,7 @@ from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive, drive_matrix, driven_history
 from thermocald.physics.model import BASES, Distortion, choose_basis
 from thermocald.thermal.hypothesis import BASE, Block, Fit, Term
-from thermocald.thermal.likelihood import (
-    ReadingErrorTerm,
-    Weighting,
-    prepare,
-)
+from thermocald.thermal.likelihood import Weighting, prepare
 from thermocald.thermal.series import ReducedSeries, cosines, unit_directions
 
 if TYPE_CHECKING:
@@ -193,12 +189,12 @@ class HypothesisFitter:
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
         """Return the weighting of a series with the covariance for some coefficients."""
-        carried: list[ReadingErrorTerm] = []
+        carried: list[tuple[Array, Array, str]] = []
         unresolved: dict[int, tuple[Array, Array]] = {}
         for block, operator, channel in self.list_operators(terms, blocks, series):
             (d,) = block.directions(x)
             if d.any():
-                carried.append(ReadingErrorTerm(d, operator, channel))
+                carried.append((d, operator, channel))
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
         bends = list(unresolved.values())
         return prepare(self.series[series], carried, bends, self.thermometer_factor)
@@ -401,7 +397,7 @@ class HypothesisFitter:
                     for (i, name), d in zip(searched, damping * step, strict=True):
                         old = dict(terms[i].nonlinear)[name]
                         parameter = terms[i].kind.nonlinear[name]
-                        value = parameter.bounded(old, old + float(d), slack=0.1)
+                        value = parameter.bounded(old, old + float(d))
                         if parameter.role == "period":
                             value = min(value, max(old, longest))
                         terms[i] = terms[i].with_value(name, value)

@@ -121,7 +121,7 @@ class Weighting:
     level_normal: Array  # normal matrix (P, P) of the constants, with the thermometers' errors
     level_b: Array
     level_factor: Array
-    kept: dict[bytes, Array] = field(default_factory=dict)  # the cache of `by_epoch`
+    kept: dict[bytes, Array] = field(default_factory=dict)  # {direction: see `carried_stack`}
 
     def left(self, parameters: Array) -> Array:
         """Return the right-hand sides (E, P) after a movement (E, P) of the parameters."""
@@ -143,19 +143,17 @@ class Weighting:
         if G < _MANY * E:
             columns = np.repeat(s, directions.shape[1], axis=1)
             return self.carried(columns, np.tile(directions, G))
-        parts = [self.by_epoch(d) @ s for d in directions.T]
+        parts = []
+        for direction in directions.T:
+            key = direction.tobytes()
+            if key not in self.kept:  # L⁻¹ Jᵀ (states, E) of shifts of single epochs
+                total = np.zeros((len(self.factor), E))
+                for operator, at, _, dN in self.errors:
+                    total[at] += (operator * (dN @ direction)[:, None]).T
+                total[: len(self.cross)] = self.cross @ direction
+                self.kept[key] = whiten(self.factor, total)
+            parts.append(self.kept[key] @ s)
         return np.stack(parts, axis=2).reshape(len(parts[0]), -1)
-
-    def by_epoch(self, direction: Array) -> Array:
-        """Return L⁻¹ Jᵀ (states, E), cached, of shifts of single epochs along a direction (P,)."""
-        key = direction.tobytes()
-        if key not in self.kept:
-            total = np.zeros((len(self.factor), len(self.N)))
-            for operator, at, _, dN in self.errors:
-                total[at] += (operator * (dN @ direction)[:, None]).T
-            total[: len(self.cross)] = self.cross @ direction
-            self.kept[key] = whiten(self.factor, total)
-        return self.kept[key]
 
     def weighted(self, parameters: Array) -> Array:
         """Return S⁻¹ times movements (E, P, R) of all parameters, after the levels, (E, P, R).
@@ -243,30 +241,18 @@ class Weighting:
         return A, c, B
 
 
-@dataclass(frozen=True, eq=False)
-class ReadingErrorTerm:
-    """The effect of a thermometer's error on the camera.
-
-    direction (P,): px per unit of the trajectory; operator (E, R): ∂ trajectory / ∂ independent
-    errors of the channel (`ReducedSeries.states`).
-    """
-
-    direction: Array
-    operator: Array
-    channel: str
-
-
 def prepare(
     evidence: ReducedSeries,
-    carried: list[ReadingErrorTerm],
+    carried: list[tuple[Array, Array, str]],
     bends: list[tuple[Array, Array]],
     thermometer_factor: float,
 ) -> Weighting:
     """Return the weighting of a series by image noise, movement, and thermometers' errors.
 
-    carried: the propagation of the thermometers' errors; bends: of each trajectory its direction
-    (P,) and its sd (E,), in its unit, where the temperature bends between two readings;
-    thermometer_factor: multiplies the standard deviations of the readings.
+    carried: of each trajectory that a thermometer's error reaches its direction (P,), px per unit,
+    ∂ trajectory / ∂ independent errors (E, R) (`ReducedSeries.states`), and the channel; bends: of
+    each trajectory its direction (P,) and its sd (E,), in its unit, where the temperature bends
+    between two readings; thermometer_factor: multiplies the standard deviations of the readings.
     """
     from scipy.linalg import cholesky
 
@@ -287,7 +273,7 @@ def prepare(
     moving = slice(S, start)
     places: dict[str, slice] = {}
     sds = [np.ones(start - S)]
-    for name in dict.fromkeys(c.channel for c in carried):
+    for name in dict.fromkeys(channel for _, _, channel in carried):
         sd = evidence.state_sd(name) * thermometer_factor
         places[name] = slice(start, start + len(sd))
         sds.append(sd)
@@ -295,11 +281,9 @@ def prepare(
     whole = np.concatenate(sds)
     # the readings' deviation from the smooth trajectory, propagated to the camera
     shift = np.zeros((E, P))
-    for item in carried:
-        deviation = item.operator @ evidence.state_deviation(item.channel)
-        shift += np.outer(deviation, item.direction)
-        dN = sums.N @ item.direction
-        errors.append((item.operator, places[item.channel], item.direction, dN))
+    for direction, operator, channel in carried:
+        shift += np.outer(operator @ evidence.state_deviation(channel), direction)
+        errors.append((operator, places[channel], direction, sums.N @ direction))
     moved = np.einsum("epq,eq->ep", sums.N, shift)
     yy = sums.yy - 2 * float(np.sum(shift * sums.b)) + float(np.sum(shift * moved))
     b = sums.b - moved

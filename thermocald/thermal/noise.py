@@ -322,22 +322,15 @@ def _estimate_clipped_sd(values: Array) -> float:
 
 
 def weight_slow_noise(evidence: ReducedSeries) -> ReducedSeries:
-    """Return the series with weights that are correct for slow trajectories."""
+    """Return the series with weights that are correct for slow trajectories.
+
+    Their variance over white noise is that of the common residuals of clusters of neighbouring
+    targets, in combinations that are orthonormal in the mean normal matrix, corrected for the part
+    that the fit absorbs, so that white noise gives 1.
+    """
     k = evidence.correlation
     if k <= 1.0:
         return evidence
-    factors, W = measure_slow_noise(evidence)
-    e = evidence.weighted(1.0 / k)
-    return weight_jumps_down(e, factors / k, W) or e
-
-
-def measure_slow_noise(evidence: ReducedSeries) -> tuple[Array, Array]:
-    """Return the variance of slow trajectories over white noise (P,), in combinations W (P, P).
-
-    The combinations are orthonormal in the mean normal matrix. The variances are those of the
-    common residuals of clusters of neighbouring targets in slow trajectories, corrected for the
-    part that the fit absorbs, so that white noise gives 1.
-    """
     M = evidence.N.mean(axis=0)
     W, good = orthonormal_combinations(M)
     trajectories = cosines(evidence.history.times, ORDERS)
@@ -356,7 +349,8 @@ def measure_slow_noise(evidence: ReducedSeries) -> tuple[Array, Array]:
     total[~good] = 0.0
     total[:, ~good] = 0.0
     factors, turn = np.linalg.eigh(total)
-    return factors, W @ turn
+    e = evidence.weighted(1.0 / k)
+    return weight_jumps_down(e, factors / k, W @ turn) or e
 
 
 def _group_targets(evidence: ReducedSeries) -> list[NDArray[np.int64]]:

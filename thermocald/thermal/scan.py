@@ -33,6 +33,7 @@ from thermocald.photogrammetry.linalg import (
     scaled_solve,
 )
 from thermocald.physics import catalogue
+from thermocald.physics.model import follow_angle
 from thermocald.thermal import criteria
 from thermocald.thermal.hypothesis import BASE, Candidate, Fit, Term, make_candidate
 from thermocald.thermal.series import ReducedSeries, cosines, solve, unit_directions
@@ -381,8 +382,9 @@ def relinearise(
     step = moved + np.linalg.lstsq(e.N.sum(axis=0), rest, rcond=1e-6)[0]
     parameters = step / e.scale
     points = e.source.field.points * (1.0 + parameters[:, None, 16:])
-    seen = project(e.source.sensor, e.orientations(parameters),
-                   e.at.eop + parameters[:, 10:16], points)  # fmt: skip
+    linear = e.at.iop + parameters[:, :10]
+    iop = follow_angle(linear, e.at.iop[0]) if e.distortion == "angle" else linear
+    seen = project(e.source.sensor, iop, e.at.eop + parameters[:, 10:16], points)
     straight = e.at.predicted + np.einsum("tik,ek->eti", e.columns, step)
     there = e.weights[..., :1] > 0
     bend = np.where(there, np.nan_to_num(seen - straight), 0.0)

@@ -26,7 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.linalg import best_level, explained, scaled_solve
 from thermocald.physics.history import History
-from thermocald.physics.model import Distortion, distortion_along, follow_angle
+from thermocald.physics.model import Distortion, distortion_along
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -134,10 +134,6 @@ class HiddenTargets:
     def normal(self) -> Array:
         """The diagonal (S,) of the offsets' own normal matrix."""
         return np.asarray(self.patterns.sum(axis=1)[self.group] + _LOOSE)
-
-    def scaled(self, factor: Array | float) -> HiddenTargets:
-        """Multiply the weights by a factor, or by a factor (E,) for each epoch."""
-        return replace(self, patterns=self.patterns * factor, right=self.right * factor)
 
     def in_blocks(self, starts: NDArray[np.int64]) -> HiddenTargets:
         """Sum over blocks of neighbouring epochs, which begin at the rows `starts`."""
@@ -344,18 +340,14 @@ class ReducedSeries:
         M = np.asarray(np.linalg.solve(self.along, new), dtype=float)
         return self._in_columns(M, distortion=distortion)
 
-    def orientations(self, parameters: Array) -> Array:
-        """Return the interior orientations (E, 10) for movements (E, 19) in the columns' units."""
-        linear = self.at.iop + parameters[:, :10]
-        return follow_angle(linear, self.at.iop[0]) if self.distortion == "angle" else linear
-
     def weighted(self, factor: Array | float) -> ReducedSeries:
         """Return the series with the epochs' weights multiplied by a factor, or by factors (E,).
 
         The image points' weights are unchanged.
         """
         f: Array = np.broadcast_to(factor, self.yy.shape)
-        hidden = self.hidden.scaled(f) if self.hidden else None
+        h = self.hidden
+        hidden = replace(h, patterns=h.patterns * f, right=h.right * f) if h else None
         N, b = self.N * f[:, None, None], self.b * f[:, None]
         return replace(self, N=N, b=b, yy=self.yy * f, hidden=hidden)
 

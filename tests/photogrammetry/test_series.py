@@ -258,6 +258,15 @@ def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
     assert abs(r.values.mean(axis=0)[moved] - truth[moved]) < 0.1 * off[moved]
 
 
+def test_a_field_that_cannot_show_an_affinity_has_an_infinite_sd():
+    """Regression: four targets of a wall gave NumPy's warning, which is an error here."""
+    wall = np.random.default_rng([31, 6]).choice(49, 6, replace=False)  # two are out of view
+    field = scene.corner_field().subset(wall)
+    observations = [scene.observe(field, np.random.default_rng(k)) for k in range(3)]
+    r = scene.adjusted_series(field, observations, exterior="series", free=())
+    assert np.isinf(r.affinity.sds).all()
+
+
 @pytest.mark.parametrize("free", [(), ("c",)])
 @pytest.mark.parametrize(("turn", "exterior"), [(0.0, "series"), (1e-4, "mount"), (1e-3, "mount")])
 def test_a_slow_movement_that_no_free_parameter_follows_is_the_mounts(free, turn, exterior):

@@ -11,7 +11,7 @@ import pytest
 from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, PRINCIPAL_POINT, project
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.mount import Movement, components, drift_period
-from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
+from thermocald.photogrammetry.series.normals import linearise
 
 
 def simulate(
@@ -23,11 +23,9 @@ def simulate(
     px, memory: the mount's tremble in the image, and the correlation of neighbouring epochs; grows:
     by how much the noise in the middle is larger than at both ends, where it is 0.4 of the usual.
     """
-    truth = np.tile(scene.TRUTH, (epochs, 1))
-    at = linearise(scene.SENSOR, field, truth[0, :10], truth[0, 10:])
+    truth = scene.warming_up(warm_px * (1 - np.exp(-np.arange(epochs) / 25)))
+    at = linearise(scene.SENSOR, field, scene.TRUTH[:10], scene.TRUTH[10:])
     per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
-    warm = warm_px * (1 - np.exp(-np.arange(epochs) / 25))
-    truth[:, PRINCIPAL] += warm[:, None] * np.array([1e-4, 5e-4, -4e-4])
     move = rng.normal(size=(epochs, 3))
     for e in range(1, epochs):
         move[e] = memory * move[e - 1] + np.sqrt(1 - memory**2) * move[e]
@@ -35,10 +33,7 @@ def simulate(
     points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], field.points)
     noise = 0.4 + grows * np.sin(np.pi * np.arange(epochs) / epochs) ** 2 if grows else 1.0
     points += rng.normal(0, scene.SIGMA_PX, points.shape) * np.reshape(noise, (-1, 1, 1))
-    weights = np.full((*points.shape[:2], 3), [scene.SIGMA_PX**-2, scene.SIGMA_PX**-2, 0.0])
-    weights[rng.random(weights.shape[:2]) < 0.03] = 0.0
-    points[weights[..., 0] == 0] = np.nan
-    return ObservationGrid(points, weights), truth
+    return scene.grid_of(points, rng.random(points.shape[:2]) >= 0.03), truth
 
 
 def standardised(seed: int, count: int, epochs: int, tremble, exterior: str = "auto"):

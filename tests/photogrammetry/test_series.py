@@ -29,11 +29,7 @@ def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_s
     true = TestField.build(
         known.names, known.points + rng.normal(0, coordinate_error, known.points.shape)
     )
-    truth = np.tile(scene.TRUTH, (epochs, 1))
-    warm = 20 * (1 - np.exp(-np.arange(epochs) / 25))
-    truth[:, 0] += warm * 1e-4
-    truth[:, 1] += warm * 5e-4
-    truth[:, 2] -= warm * 4e-4
+    truth = scene.warming_up(20 * (1 - np.exp(-np.arange(epochs) / 25)))
     if moved is not None:
         truth[moved, 13] += 0.5
     observations = []

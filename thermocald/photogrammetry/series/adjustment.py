@@ -95,7 +95,7 @@ def choose_exterior(
         s = replace(series.s, exterior="per_epoch")
         return replace(series, s=s, bound=None, choice=why)
     movement, A = estimate_mount_movement(series, estimate), estimate.system.design.at.A
-    if not movement.still and asked == "auto":
+    if asked == "auto" and not movement.still and not movement.jumps:
         # The noise of a camera that warms up and defocuses changes. Only the choice depends on it.
         unit = series.noise(estimate)[0] / series.variance(estimate)
         mean = neighbours_variance(unit, estimate.solved)[estimate.system.good].mean()

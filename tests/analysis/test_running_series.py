@@ -77,11 +77,14 @@ def refined(scene, calibrator, running, k, exterior=None):
     return *running.refine(calibrator.calibrate(epoch), epoch.observations), now
 
 
-def take(scene, epochs, exterior="auto", settings=None, offsets=True):
-    """Return the running series, its results with columns, the single epochs, and the truth."""
-    calibrator, running = begun(scene.sensor, scene.field, 3.04, exterior, settings, offsets)
+def take(scene, epochs, going=None, **options):
+    """Return the running series, its results with columns, the single epochs, and the truth.
+
+    going: the calibrator and the series of earlier epochs.
+    """
+    calibrator, running = going or begun(scene.sensor, scene.field, **options)
     results, alone, truth = [], [], []
-    for k in range(epochs):
+    for k in range(running.epochs, running.epochs + epochs):
         epoch, now = scene.epoch(k)
         alone.append(calibrator.calibrate(epoch))
         results.append(running.refine(alone[-1], epoch.observations))
@@ -193,14 +196,11 @@ def test_the_first_epochs_have_the_stated_noise():
 def still():
     """Return a scene, its running series after 12 epochs and 27, the results, and the epochs."""
     scene = Scene(5)
-    calibrator, running = begun(scene.sensor, scene.field)
-    results, alone, early = [], [], None
-    for k in range(27):
-        early = running.report()["orientation"] if k == 12 else early
-        epoch, _ = scene.epoch(k)
-        alone.append(calibrator.calibrate(epoch))
-        results.append(running.refine(alone[-1], epoch.observations))
-    return scene, running, early, results, alone
+    going = begun(scene.sensor, scene.field)
+    running, first, singles, _ = take(scene, 12, going)
+    early = running.report()["orientation"]
+    _, later, others, _ = take(scene, 15, going)
+    return scene, running, early, first + later, singles + others
 
 
 @pytest.fixture

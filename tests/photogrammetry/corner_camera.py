@@ -9,6 +9,7 @@ from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, S
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.adjustment import adjust_series
+from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 
 SENSOR = Sensor(3280, 2464, 0.00112)
@@ -27,6 +28,20 @@ def corner_field(sigma_mm: float = 0.0, per_side: int = 7) -> TestField:
 
 EXTERIOR = look_at([950, 900, 800], [150, 180, 160])
 TRUTH = np.concatenate([INTERIOR.as_array(), EXTERIOR.as_array()])
+
+
+def warming_up(px) -> np.ndarray:
+    """Return true parameters (E, 16) of a camera whose x0 has moved by about px (E,) / 2."""
+    truth = np.tile(TRUTH, (len(px), 1))
+    truth[:, :3] += px[:, None] * np.array([1e-4, 5e-4, -4e-4])
+    return truth
+
+
+def grid_of(points, seen) -> ObservationGrid:
+    """Return the grid of image points (E, T, 2) px where seen (E, T), with the usual sigmas."""
+    weights = np.zeros((*seen.shape, 3))
+    weights[seen, :2] = SIGMA_PX**-2
+    return ObservationGrid(np.where(seen[..., None], points, np.nan), weights)
 
 
 def true_points(field: TestField, interior=INTERIOR, exterior=EXTERIOR):

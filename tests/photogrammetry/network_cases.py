@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.photogrammetry.exact_rendering import look_at
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Distance, Observations
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(
@@ -57,6 +57,11 @@ def photographs(field, stations, sigma, rng, camera=CAMERA, loss=0.03, gross=0.0
         wrong += [(f"photo{i}", int(t)) for t in rows[bad]]
         photos[f"photo{i}"] = Observations(rows, points, np.full((len(rows), 2), sigma))
     return photos, wrong
+
+
+def distance(field, a, b, sd, error=0.0):
+    """Return a measured distance between two targets of a field, mm."""
+    return Distance(f"t{a}", f"t{b}", float(np.linalg.norm(field[b] - field[a])) + error, sd)
 
 
 def onto(points, truth):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import corner_camera as scene
@@ -9,6 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+import thermocald as tc
+from tests.recordings import read_rows, write_rows
+from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -179,6 +183,17 @@ def test_targets_in_one_corner_too_few_and_of_another_field_are_reported():
     assert "8 targets for 14 unknowns" in few.reason
     assert not wrong.ok
     assert wrong.reason
+
+
+@pytest.mark.parametrize("few", ["12.3 23.3 24.0 94.3", "15.3 19.0 20.3 21.0 24.0"])
+def test_too_few_targets_of_a_real_camera_are_not_said_to_have_no_orientation(
+    shared, tmp_path, few
+):
+    shutil.copytree(shared / "data" / "aviary-cam0", own := tmp_path / "few")
+    table = read_rows(own / "observations.csv")
+    write_rows(own / "observations.csv", [r for r in table if r["target"] in few.split()])
+    with pytest.raises(DataError, match="targets for 14 unknowns leave a redundancy of -"):
+        tc.open(own).calibrate()
 
 
 @pytest.mark.slow

@@ -64,6 +64,11 @@ def photographs(
     return known, measured
 
 
+def adjusted(field, measured, stations=STATIONS, c=3.0, sensor=scene.SENSOR):
+    """Adjust photographs together, from the true poses and a principal distance c, mm."""
+    return adjust_common_interior(sensor, field, measured, InteriorOrientation(c), stations)
+
+
 def errors(draws: int, seed: int, **drawn):
     """Yield each draw's result, its stations, and error over sd of c, x0, y0."""
     for k in range(draws):
@@ -123,8 +128,7 @@ def test_a_photograph_of_another_zoom_is_left_out():
     """With it, steps made the distortion fold back and ended in a singular matrix."""
     rng = np.random.default_rng(4)
     seen = [_of_board(rng.uniform(0.3, 0.6), 3.3 if k == 3 else 2.8, rng) for k in range(8)]
-    measured, stations = zip(*seen, strict=True)
-    r = adjust_common_interior(SENSOR, BOARD, measured, InteriorOrientation(2.9), stations)
+    r = adjusted(BOARD, *zip(*seen, strict=True), 2.9, SENSOR)
     assert list(r.left_out) == [3]
     assert "another camera" in r.left_out[3]
     assert len(r.exteriors) == 7
@@ -134,8 +138,7 @@ def test_a_photograph_of_another_zoom_is_left_out():
 def test_frontal_photographs_do_not_determine_the_principal_distance():
     rng = np.random.default_rng(5)
     seen = [_of_board(rng.uniform(0, 0.1), 2.8, rng) for _ in range(8)]
-    measured, stations = zip(*seen, strict=True)
-    r = adjust_common_interior(SENSOR, BOARD, measured, InteriorOrientation(2.0), stations)
+    r = adjusted(BOARD, *zip(*seen, strict=True), 2.0, SENSOR)
     assert "within 5° of frontal (some at 20° and more are needed)" in r.reasons[0]
 
 
@@ -148,8 +151,7 @@ def test_large_residuals_do_not_make_the_steps_overshoot():
         lift = np.stack([u * u, v * v, u * v], axis=1) @ rng.normal(0, 20, 3)
         bent = BOARD.points + lift[:, None] * np.eye(3)[2]
         seen.append(_of_board(rng.uniform(0.1, 0.7), 2.8, rng, bent, 0.1))
-    measured, stations = zip(*seen, strict=True)
-    r = adjust_common_interior(SENSOR, BOARD, measured, InteriorOrientation(2.8), stations)
+    r = adjusted(BOARD, *zip(*seen, strict=True), 2.8, SENSOR)
     assert r.sigma0 > 3
 
 
@@ -174,7 +176,7 @@ def test_few_points_of_an_uncertain_field_are_not_rejected_by_turns(shared, tmp_
 
 def test_gross_errors_are_rejected():
     known, measured = photographs(np.random.default_rng(8), 0.05, gross=2)
-    r = adjust_common_interior(scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS)
+    r = adjusted(known, measured)
     assert sum(int((~m).sum()) for m in r.used) == pytest.approx(8, abs=2)
     assert r.sigma0 == pytest.approx(1.0, abs=0.15)
 
@@ -186,7 +188,7 @@ def test_a_moved_target_is_left_out_of_all_photographs():
     stations = [look_at(c.tolist(), [150, 180, 160], k * np.pi / 2) for k, c in enumerate(centres)]
     known, measured = photographs(rng, 0.02, stations=stations)
     moved = replace(known, points=known.points + 2.0 * (np.arange(len(known)) == 10)[:, None])
-    r = adjust_common_interior(scene.SENSOR, moved, measured, InteriorOrientation(3.0), stations)
+    r = adjusted(moved, measured, stations)
     rejected = np.concatenate([o.targets[~m] for o, m in zip(measured, r.used, strict=True)])
     assert np.count_nonzero(rejected == 10) == sum(10 in o.targets for o in measured) > 15
     assert len(rejected) < 30
@@ -196,6 +198,6 @@ def test_a_moved_target_is_left_out_of_all_photographs():
 def test_a_field_without_sigmas_is_held():
     known, measured = photographs(np.random.default_rng(9), 0.02)
     exact = TestField.build(known.names, known.points)
-    r = adjust_common_interior(scene.SENSOR, exact, measured, InteriorOrientation(3.0), STATIONS)
-    s = adjust_common_interior(scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS)
+    r = adjusted(exact, measured)
+    s = adjusted(known, measured)
     assert r.sigma0 > 1.2 * s.sigma0

@@ -10,7 +10,7 @@ from tests.blocks import InBlocks
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.long_series import adjust_long_series
-from thermocald.photogrammetry.series.normals import ObservationGrid, spread_windows
+from thermocald.photogrammetry.series.normals import spread_windows
 from thermocald.photogrammetry.series.result import SeriesSettings
 
 OWN = np.arange(8)
@@ -24,20 +24,13 @@ def case():
     whole = scene.corner_field(0.02)
     known = whole.subset(np.arange(0, len(whole), 3))
     true = TestField.build(known.names, known.points + rng.normal(0, 0.02, known.points.shape))
-    truth = np.tile(scene.TRUTH, (EPOCHS, 1))
-    warm = 20 * np.sin(np.arange(EPOCHS) / EPOCHS * 9.0)
-    truth[:, 0] += warm * 1e-4
-    truth[:, 1] += warm * 5e-4
-    truth[:, 2] -= warm * 4e-4
-    shape = (EPOCHS, len(known))
+    truth = scene.warming_up(20 * np.sin(np.arange(EPOCHS) / EPOCHS * 9.0))
     points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], true.points)
     points += rng.normal(0, scene.SIGMA_PX, points.shape)
-    see = np.ones(shape, dtype=bool)
+    see = np.ones(points.shape[:2], dtype=bool)
     see[EPOCHS // 3 : EPOCHS // 2, : len(known) // 5] = False
     points[200, 20] += 40.0  # a gross error outside the sample
-    rows, targets = np.nonzero(see)
-    sigmas = np.full((len(rows), 2), scene.SIGMA_PX)
-    return known, truth, ObservationGrid.from_rows(shape, rows, targets, points[see], sigmas)
+    return known, truth, scene.grid_of(points, see)
 
 
 def blocked(case, size, exterior="series", jobs=1, together=120, **other):
@@ -111,9 +104,8 @@ def test_a_knock_between_the_sampled_epochs_is_the_mounts():
     truth[530:, 10:13] += np.array([2e-4, -1e-4, 1e-4])
     points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], field.points)
     points += rng.normal(0, scene.SIGMA_PX, points.shape)
-    weights = np.zeros((*points.shape[:2], 3))
-    weights[..., :2] = scene.SIGMA_PX**-2
-    found = blocked((field, truth, ObservationGrid(points, weights)), 400, "auto", together=300)
+    grid = scene.grid_of(points, np.ones(points.shape[:2], dtype=bool))
+    found = blocked((field, truth, grid), 400, "auto", together=300)
     assert "with jumps in a sample of the epochs" in found.sample.choice
     error = (found.rows.values - truth)[:, 1:3]
     ratio = (error - error.mean(axis=0)) / found.rows.sd[:, 1:3]

@@ -11,29 +11,29 @@ import pytest
 from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, PRINCIPAL_POINT, project
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.mount import Movement, components, drift_period
-from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
+from thermocald.photogrammetry.series.normals import linearise
 
 
-def simulate(rng, field: TestField, epochs: int, px: float, memory: float, warm_px: float = 8.0):
+def simulate(
+    rng, field: TestField, epochs: int, px: float, memory: float, grows: float = 0.0,
+    warm_px: float = 8.0,
+):  # fmt: skip
     """Return observations and true values (E, 16) of a camera that warms up on a moving mount.
 
-    px, memory: the mount's tremble in the image, and the correlation of neighbouring epochs.
+    px, memory: the mount's tremble in the image, and the correlation of neighbouring epochs; grows:
+    by how much the noise in the middle is larger than at both ends, where it is 0.4 of the usual.
     """
-    truth = np.tile(scene.TRUTH, (epochs, 1))
-    at = linearise(scene.SENSOR, field, truth[0, :10], truth[0, 10:])
+    truth = scene.warming_up(warm_px * (1 - np.exp(-np.arange(epochs) / 25)))
+    at = linearise(scene.SENSOR, field, scene.TRUTH[:10], scene.TRUTH[10:])
     per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
-    warm = warm_px * (1 - np.exp(-np.arange(epochs) / 25))
-    truth[:, PRINCIPAL] += warm[:, None] * np.array([1e-4, 5e-4, -4e-4])
     move = rng.normal(size=(epochs, 3))
     for e in range(1, epochs):
         move[e] = memory * move[e - 1] + np.sqrt(1 - memory**2) * move[e]
     truth[:, 10:13] += px * move * per_px[:3]
     points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], field.points)
-    points += rng.normal(0, scene.SIGMA_PX, points.shape)
-    weights = np.full((*points.shape[:2], 3), [scene.SIGMA_PX**-2, scene.SIGMA_PX**-2, 0.0])
-    weights[rng.random(weights.shape[:2]) < 0.03] = 0.0
-    points[weights[..., 0] == 0] = np.nan
-    return ObservationGrid(points, weights), truth
+    noise = 0.4 + grows * np.sin(np.pi * np.arange(epochs) / epochs) ** 2 if grows else 1.0
+    points += rng.normal(0, scene.SIGMA_PX, points.shape) * np.reshape(noise, (-1, 1, 1))
+    return scene.grid_of(points, rng.random(points.shape[:2]) >= 0.03), truth
 
 
 def standardised(seed: int, count: int, epochs: int, tremble, exterior: str = "auto"):
@@ -94,6 +94,7 @@ def test_poses_of_a_held_camera_are_as_good_as_stated(tremble):
         ((44,), 12, STILL, "per_epoch"),
         ((44,), 60, TREMBLES, "mount"),
         (range(4), 80, STILL, "series"),
+        ((46,), 100, (*STILL, 1.8), "series"),  # it warms up and defocuses
     ],
 )
 def test_auto_reports_its_choice_with_a_reason(seeds, epochs, tremble, exterior):

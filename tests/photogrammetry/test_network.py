@@ -16,10 +16,9 @@ def _survey(field, stations, sigma, seed, distances=None, loss=0.03, **options):
     """Survey a simulated field; return the network and its targets' true points."""
     rng = np.random.default_rng(seed)
     photos, _ = cases.photographs(field, stations, sigma, rng, loss=loss)
-    last = int(np.argmax(np.linalg.norm(field - field[0], axis=1)))
     if distances is None:
-        length = float(np.linalg.norm(field[last] - field[0]))
-        distances = [Distance("t0", f"t{last}", length + rng.normal(0, 0.01), 0.01)]
+        last = int(np.argmax(np.linalg.norm(field - field[0], axis=1)))
+        distances = [cases.distance(field, 0, last, 0.01, rng.normal(0, 0.01))]
     names = [f"t{i}" for i in range(len(field))]
     network = adjust_network(cases.SENSOR, photos, names, distances, **options)
     return network, field[[int(name[1:]) for name in network.names]]
@@ -68,7 +67,7 @@ def test_inner_constraints_give_the_smallest_trace():
     field = cases.bent_sheet(6, 5)
     network, _ = _survey(
         field, cases.convergent_stations(field, 8), 0.05, 3, interior=cases.INTERIOR,
-        distances=[Distance("t0", "t29", float(np.linalg.norm(field[29] - field[0])), 1e-6)],
+        distances=[cases.distance(field, 0, 29, 1e-6)],
     )  # fmt: skip
     points, Q = network.points, network.covariance
     m = len(points)
@@ -85,18 +84,16 @@ def test_inner_constraints_give_the_smallest_trace():
 def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     field = cases.bent_sheet(6, 5)
     stations = cases.convergent_stations(field, 8)
-    lengths = [float(np.linalg.norm(field[b] - field[a])) for a, b in ((0, 29), (5, 24))]
-    one = _survey(field, stations, 0.05, 3, [Distance("t0", "t29", lengths[0], 0.1)])[0]
+    first = cases.distance(field, 0, 29, 0.1)
+    one = _survey(field, stations, 0.05, 3, [first])[0]
     # the second is 1 mm too long, but has ten times the sd: a hundredth of 1 mm remains at most
-    two = _survey(
-        field, stations, 0.05, 3,
-        [Distance("t0", "t29", lengths[0], 0.1), Distance("t5", "t24", lengths[1] + 1.0, 1.0)],
-    )[0]  # fmt: skip
+    both = [first, cases.distance(field, 5, 24, 1.0, 1.0)]
+    two = _survey(field, stations, 0.05, 3, both)[0]
     assert two.sd_scale < one.sd_scale
     assert two.extent == pytest.approx(one.extent, rel=0.02 / 900)
     assert two.extent > one.extent
     # mostly the distance's own sd
-    assert 1.0 < one.sd_scale / (0.1 / lengths[0]) < 1.1
+    assert 1.0 < one.sd_scale / (0.1 / first.length) < 1.1
 
 
 def _parallel(field, steps_x, steps_y):
@@ -115,7 +112,7 @@ _SPOT = _BENT.mean(axis=0)
 
 def _adjust(photos, **options):
     """Adjust photographs of the bent sheet, scaled by one distance."""
-    scale = Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)
+    scale = cases.distance(_BENT, 0, 47, 0.01)
     return adjust_network(cases.SENSOR, photos, [f"t{i}" for i in range(48)], [scale], **options)
 
 
@@ -167,8 +164,7 @@ def test_coordinates_are_as_accurate_as_stated_if_the_focus_moves_between_photog
             photos[f"photo{i}"] = one["photo0"]
         network = adjust_network(
             cases.SENSOR, photos, [f"t{i}" for i in range(30)],
-            [Distance("t0", "t29", float(np.linalg.norm(field[29] - field[0])), 0.05)],
-            interior=cases.INTERIOR, nominal=field,
+            [cases.distance(field, 0, 29, 0.05)], interior=cases.INTERIOR, nominal=field,
         )  # fmt: skip
         assert network.disagreement > 1.5
         assert any("photographs disagree" in note for note in advice(network))
@@ -221,7 +217,7 @@ def test_bad_photographs_in_a_small_network_are_refused():
         for shown in photos.values():
             wrong = rng.random(len(shown)) < 0.08
             shown.points[wrong] += rng.normal(size=(wrong.sum(), 2)) * 200
-        distances = [Distance("t0", "t19", float(np.linalg.norm(field[19] - field[0])), 0.01)]
+        distances = [cases.distance(field, 0, 19, 0.01)]
         with pytest.raises(GeometryError, match="contradict each other"):
             adjust_network(cases.SENSOR, photos, names, distances, interior=cases.INTERIOR)
 

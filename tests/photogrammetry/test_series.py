@@ -29,11 +29,7 @@ def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_s
     true = TestField.build(
         known.names, known.points + rng.normal(0, coordinate_error, known.points.shape)
     )
-    truth = np.tile(scene.TRUTH, (epochs, 1))
-    warm = 20 * (1 - np.exp(-np.arange(epochs) / 25))
-    truth[:, 0] += warm * 1e-4
-    truth[:, 1] += warm * 5e-4
-    truth[:, 2] -= warm * 4e-4
+    truth = scene.warming_up(20 * (1 - np.exp(-np.arange(epochs) / 25)))
     if moved is not None:
         truth[moved, 13] += 0.5
     observations = []
@@ -256,6 +252,15 @@ def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
     r = scene.adjusted_series(field, observations, free=(*DEFAULT_FREE, "C1", "C2"), **plain)
     assert not r.affinity.names
     assert abs(r.values.mean(axis=0)[moved] - truth[moved]) < 0.1 * off[moved]
+
+
+def test_a_field_that_cannot_show_an_affinity_has_an_infinite_sd():
+    """Regression: four targets of a wall gave NumPy's warning, which is an error here."""
+    wall = np.random.default_rng([31, 6]).choice(49, 6, replace=False)  # two are out of view
+    field = scene.corner_field().subset(wall)
+    observations = [scene.observe(field, np.random.default_rng(k)) for k in range(3)]
+    r = scene.adjusted_series(field, observations, exterior="series", free=())
+    assert np.isinf(r.affinity.sds).all()
 
 
 @pytest.mark.parametrize("free", [(), ("c",)])

@@ -135,10 +135,6 @@ class EquilibriumWatch:
         # of weights, of weights times values, and of weights times gains
         self._past: deque[tuple[float, int, float, Array]] = deque()
 
-    def clear(self) -> None:
-        """Start again after a knock."""
-        self._past.clear()
-
     def add(self, time: float, values: Array, gain: Array, sds: Array) -> None:
         """Add (c, x0, y0) of an epoch as a function of the assumed exterior orientation.
 
@@ -259,7 +255,7 @@ class OnlineObserver:
         event = innovation.change if innovation.change in _SENTENCES else ""
         if event:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
-            self.watch.clear()
+            self.watch = EquilibriumWatch()
         if innovation.change != "outlier":
             given = condition_on_exterior(adjustment.values, errors[0], self._pitch)
             self.watch.add(epoch.frame_time, *given)

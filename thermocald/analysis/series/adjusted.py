@@ -125,7 +125,7 @@ def table_of_series(
     while True:  # a single pass, unless misplaced targets biased the initial values
         used = WithoutTargets(source, np.flatnonzero(far)) if far.any() else source
         grid = used if in_blocks else gathered(used, [slice(0, len(source))])
-        found = _adjust(testfield, apart, start, grid, settings, in_blocks, jobs, advance)
+        found = _adjust(testfield, apart, start, grid, settings, jobs, advance)
         assert found.adjustment is not None
         drawn = find_misplaced(found.adjustment.offsets, c_px)
         if not drawn.any():
@@ -147,8 +147,7 @@ def table_of_series(
 
 def _adjust(
     testfield: TestField, apart: Epochs, start: Array, source: ObservationBlocks,
-    settings: SeriesSettings, in_blocks: bool = False, jobs: int = 1,
-    advance: Callable[[int], None] | None = None,
+    settings: SeriesSettings, jobs: int = 1, advance: Callable[[int], None] | None = None,
 ) -> Epochs:  # fmt: skip
     """Adjust all epochs once, in a single grid or in blocks."""
     assert apart.head is not None
@@ -157,7 +156,7 @@ def _adjust(
         InteriorOrientation.from_array(start[IOP]), ExteriorOrientation.from_array(start[EOP])
     )  # fmt: skip
     whole: SeriesAdjustment | LongAdjustment
-    if in_blocks:
+    if len(source) > together_at_most(len(testfield)):
         whole = adjust_long_series(
             sensor, testfield, source, *camera, settings, jobs=jobs, advance=advance
         )
@@ -171,7 +170,7 @@ def _adjust(
     def without(targets: NDArray[np.int64], quick: bool) -> Epochs:
         rough, fewer = replace(settings, exterior=sample.exterior), WithoutTargets(source, targets)
         if not quick:
-            return _adjust(testfield, apart, start, fewer, rough, in_blocks, jobs)
+            return _adjust(testfield, apart, start, fewer, rough, jobs)
         rough = replace(rough, snooping_alpha=0.0, target_noise=False)
         windows, some = whole_series, apart
         if sampled is not None:

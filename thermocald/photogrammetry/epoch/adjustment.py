@@ -279,17 +279,9 @@ def adjust(
     s = settings or _USUAL
     unknowns = s.unknowns
     n = len(observations)
-    # priors of held parameters are no observations
-    priors = len(s.priors.keys() & {*s.free, *EOP_NAMES}) if known is None else len(s.free)
-    if 2 * n + priors - len(unknowns) < s.bounds.minimum_redundancy:
-        return failed(
-            "too_few_targets",
-            f"{n} targets for {len(unknowns)} unknowns leave a redundancy of "
-            f"{2 * n + priors - len(unknowns)}; at least {s.bounds.minimum_redundancy} "
-            "is needed: show more targets or hold parameters fixed",
-            observations,
-            s.free,
-        )
+    redundancy = _redundancy(n, s, known is not None)
+    if redundancy < s.bounds.minimum_redundancy:
+        return _refuse_few(observations, s, redundancy)
     start = np.concatenate([interior.as_array(), exterior.as_array()])
     before = None
     if known is not None or s.priors:
@@ -325,14 +317,33 @@ def adjust(
         return failed("weak_geometry", str(error), observations, s.free)
     except NoConvergenceError as error:
         return failed("no_convergence", str(error), observations, s.free)
-    return _result(problem, solution, s, use, priors)
+    return _result(problem, solution, s, use, redundancy)
+
+
+def _redundancy(n: int, s: AdjustmentSettings, known: bool = False) -> int:
+    """Return the redundancy of n targets; known: whether `adjust` is given the covariance."""
+    # priors of held parameters are no observations
+    priors = len(s.free) if known else len(s.priors.keys() & {*s.free, *EOP_NAMES})
+    return 2 * n + priors - len(free_columns(s.free)) - len(EOP_NAMES)
+
+
+def _refuse_few(observations: Observations, s: AdjustmentSettings, redundancy: int) -> Adjustment:
+    return failed(
+        "too_few_targets",
+        f"{len(observations)} targets for {len(s.unknowns)} unknowns leave a redundancy of "
+        f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed: show more targets or "
+        "hold parameters fixed",
+        observations,
+        s.free,
+    )
 
 
 def _result(
-    problem: Problem, solution: Solution, s: AdjustmentSettings, use: Mask, priors: int
+    problem: Problem, solution: Solution, s: AdjustmentSettings, use: Mask, redundancy: int
 ) -> Adjustment:
+    """Return the result of a solution; redundancy: of all targets, rejected ones included."""
     u, n = problem.unknowns, int(np.count_nonzero(use))
-    redundancy = 2 * n + priors - len(u)
+    redundancy -= 2 * (len(use) - n)
     v, points, observed = solution.whitened[-1], problem.points, problem.observations.points
     rejected: tuple[int, ...] = ()
     if n < len(use):
@@ -402,6 +413,9 @@ def cold_start(
     s = settings or AdjustmentSettings()
     if len(observations) == 0:
         return failed("no_observations", "no target was measured", observations, s.free)
+    redundancy = _redundancy(len(observations), s)
+    if redundancy < s.bounds.minimum_redundancy:  # few targets may have no orientation either
+        return _refuse_few(observations, s, redundancy)
     points = testfield.points[observations.targets]
     try:
         start_interior, start_exterior, fits = approximate_orientation(

@@ -127,20 +127,17 @@ class Problem:
         """
         weight, value = np.zeros((len(unknowns), len(unknowns))), np.zeros(len(unknowns))
         if known is not None:
-            value = known[0][unknowns]
-            weight = _weight_of(known[1][np.ix_(unknowns, unknowns)])
-        variances = None
-        if field.sigmas.any():
-            variances = field.sigmas[observations.targets] ** 2
-        return cls(
-            sensor,
-            field.points[observations.targets],
-            observations,
-            variances,
-            unknowns,
-            weight,
-            value,
-        )
+            value, variances = known[0][unknowns], known[1].diagonal()[unknowns]
+            some = np.flatnonzero(variances > 0)
+            # a combination with almost no variance gets an sd of 1e-4 of its parameters' sds
+            scale, among = np.sqrt(variances[some]), unknowns[some]
+            covariance = known[1][np.ix_(among, among)]
+            share, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+            rows = (vectors / np.sqrt(np.maximum(share, _SINGULAR))) / scale[:, None]
+            weight[np.ix_(some, some)] = rows @ rows.T
+        targets = observations.targets
+        of_targets = field.sigmas[targets] ** 2 if field.sigmas.any() else None
+        return cls(sensor, field.points[targets], observations, of_targets, unknowns, weight, value)
 
     def sums(self, whitened: Array, use: Mask, values: Array) -> tuple[Array, Array, float]:
         """Return the normal matrix (u, u), gradient (u,) and sum of squares of the points in use.
@@ -164,20 +161,6 @@ class Problem:
         """
         flat, difference = v.ravel(), values[self.unknowns] - self.prior_value
         return float(flat @ flat + difference @ self.prior_weight @ difference)
-
-
-def _weight_of(covariance: Array) -> Array:
-    """Invert a covariance (u, u) to a weight, 0 for parameters without a variance.
-
-    A combination of parameters with almost no variance gets an sd of 1e-4 of the parameters' sds.
-    """
-    weight = np.zeros(covariance.shape)
-    some = np.flatnonzero(covariance.diagonal() > 0)
-    scale = np.sqrt(covariance.diagonal()[some])
-    share, vectors = np.linalg.eigh(covariance[np.ix_(some, some)] / np.outer(scale, scale))
-    rows = (vectors / np.sqrt(np.maximum(share, _SINGULAR))) / scale[:, None]
-    weight[np.ix_(some, some)] = rows @ rows.T
-    return weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,6 +96,12 @@ def choose_exterior(
         s = replace(series.s, exterior="per_epoch")
         return replace(series, s=s, bound=None, choice=why)
     movement, A = estimate_mount_movement(series, estimate), estimate.system.design.at.A
+    if asked == "auto" and not movement.still and not movement.jumps:
+        # The noise of a camera that warms up and defocuses changes. Only the choice depends on it.
+        unit = series.noise(estimate)[0] / series.variance(estimate)
+        mean = neighbours_variance(unit, estimate.solved)[estimate.system.good].mean()
+        noisier = estimate_mount_movement(series, estimate, float(mean))
+        movement = noisier if noisier.still else movement
     px = image_px(movement.covariance, A)
     doubt = ""
     if movement.hidden.any():
@@ -118,9 +124,14 @@ def choose_exterior(
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
 
-def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
-    """Estimate the variance components of the mount's movements from an estimate of the series."""
-    system, variance = estimate.system, series.variance(estimate)
+def estimate_mount_movement(
+    series: SeriesEstimator, estimate: Estimate, noisier: float = 1.0
+) -> Movement:
+    """Estimate the variance components of the mount's movements from an estimate of the series.
+
+    noisier: factor of the series' variance of unit weight.
+    """
+    system, variance = estimate.system, noisier * series.variance(estimate)
     at, N = system.design.at, system.N
     before = np.concatenate([at.iop, at.eop])
     b = system.gradient(estimate.residuals)

@@ -228,9 +228,10 @@ def estimate_held_affinity(
         state = state.copy()
         state[both] += Q @ b
     redundancy = 2 * int(seen.sum()) - len(both)
-    rest = float(np.einsum("tk,tkl,tl->", left, W, left) - b @ Q @ b)
-    scale = max(rest / redundancy, 1.0) if redundancy > 0 else np.inf
-    sds = np.sqrt(scale * np.diag(Q)[len(free) :])
+    sds = np.full(len(held), np.inf)
+    if redundancy > 0:
+        rest = float(np.einsum("tk,tkl,tl->", left, W, left) - b @ Q @ b)
+        sds = np.sqrt(max(rest / redundancy, 1.0) * np.diag(Q)[len(free) :])
     names = tuple(PARAMETER_NAMES[k] for k in held)
     return HeldAffinity(names, (state - start)[held], sds, moves)
 

@@ -128,5 +128,5 @@ def test_a_name_from_right_to_left_has_a_cell_of_its_own(server, tmp_path):
         add_camera(connection, replace(BASE, station="محطة-2", epochs=300, end=time.time()))
     run("fleet", server.address(name="thermocald"), "--report", tmp_path / "fleet.html")
     row = re.search(r"<tbody><tr>(.*?)</tr>", (tmp_path / "fleet.html").read_text())[1]
-    cells = re.findall('<td dir="auto"[^>]*>([^<]*)</td>', row)
+    cells = re.findall("<td[^>]*>([^<]*)</td>", row)
     assert cells[:2] == ["\u2068محطة\u2069-2", "cam"]

@@ -382,7 +382,7 @@ def test_photographs_without_targets_are_one_line(open_page):
     ("name", "where", "words"),
     [
         ("calibration", ".device", ("3280", "2464", "px")),
-        ("fleet", "td", ("● ", NAMES[2], "/cam2")),
+        ("fleet", "tr", (NAMES[2], "cam2")),
     ],
 )
 def test_a_name_from_right_to_left_exchanges_nothing(name, where, words, page_text, open_page):

@@ -191,11 +191,7 @@ class Search:
 
         least: gain beyond its penalty that a scan must promise, except for an event.
         """
-        terms, penalties = solution.terms, solution.penalties
-        grown = [
-            self.refine((*terms, p.term), (*penalties, p.penalty))
-            for p in self._promises(solution, width, least)
-        ]
+        grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
         return sorted(grown, key=by_score)
 
     def expand_all(
@@ -212,8 +208,12 @@ class Search:
         for s, p in pairs:
             names = frozenset((*s.names, p.term.effect))
             if len(grown) < most and names not in grown:
-                grown[names] = self.refine((*s.terms, p.term), (*s.penalties, p.penalty))
+                grown[names] = self._with(s, p)
         return sorted(grown.values(), key=by_score)
+
+    def _with(self, solution: Solution, promise: Scanned) -> Solution:
+        penalties = (*solution.penalties, promise.penalty)
+        return self.refine((*solution.terms, promise.term), penalties)
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
         """Return the `width` most promising effects beside a solution, best first.

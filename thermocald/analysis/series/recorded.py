@@ -110,7 +110,7 @@ def _start(
         statuses = [r.status for r in results]
         common = max(statuses, key=statuses.count, default="")
         why = next((r.reason for r in results if r.status == common), "no target was measured")
-        raise DataError(f"{source.head.name}: no epoch has a result; most often: {why}")
+        raise DataError(f"{source.title}: no epoch has a result; most often: {why}")
     return np.median(found, axis=0)
 
 

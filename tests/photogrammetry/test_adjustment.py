@@ -192,7 +192,7 @@ def test_too_few_targets_of_a_real_camera_are_not_said_to_have_no_orientation(
     shutil.copytree(shared / "data" / "aviary-cam0", own := tmp_path / "few")
     table = read_rows(own / "observations.csv")
     write_rows(own / "observations.csv", [r for r in table if r["target"] in few.split()])
-    with pytest.raises(DataError, match="/few: no epoch .* targets for 14 unknowns leave a redundancy of -"):
+    with pytest.raises(DataError, match=r"/few: no epoch .* leave a redundancy of -"):
         tc.open(own).calibrate()
 
 

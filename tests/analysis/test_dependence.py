@@ -6,13 +6,13 @@ from scipy.special import betainc, fdtrc
 
 from tests.analysis.test_drift_test import HEATED, TIME_S, WARM_UP, N, noise
 from thermocald.analysis.statistics.dependence import (
-    correlation_matrix,
     correlations_of,
     dependence,
     fit_straight_line,
     holm,
     median_correlations,
     moving_f_test,
+    pearson_matrix,
     slope_noise,
     unbroken_windows,
 )
@@ -38,10 +38,10 @@ def test_holm():
 def test_the_correlation_matrix_equals_numpys_and_is_nan_for_constants():
     rng = np.random.default_rng(3)
     columns = list(rng.standard_normal((4, 50)))
-    np.testing.assert_allclose(correlation_matrix(columns), np.corrcoef(columns), atol=1e-12)
+    np.testing.assert_allclose(pearson_matrix(columns), np.corrcoef(columns), atol=1e-12)
     columns[2] = np.full(50, 3.97)
     columns[3] = np.where(np.arange(50) == 7, np.nan, columns[3])
-    matrix = correlation_matrix(columns)
+    matrix = pearson_matrix(columns)
     assert np.isnan(matrix[2]).all()
     keep = np.arange(50) != 7
     assert matrix[0, 3] == pytest.approx(np.corrcoef(columns[0][keep], columns[3][keep])[0, 1])

@@ -301,7 +301,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return list(map(float, corrected))
 
 
-def correlation_matrix(columns: Sequence[Array]) -> Array:
+def pearson_matrix(columns: Sequence[Array]) -> Array:
     """Return Pearson's r (k, k) of all pairs of columns (n,); NaN for constant columns.
 
     For each pair, epochs with a NaN in either column are left out.

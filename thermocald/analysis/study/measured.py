@@ -122,6 +122,11 @@ class MeasuredSeries:
         """The mean interior orientation (10,) of the epochs."""
         return np.array([np.mean(self.column(name)[0]) for name in IOP_NAMES])
 
+    @property
+    def rms_sigma0(self) -> float:
+        """The root mean square of the epochs' sigma0."""
+        return float(np.sqrt(np.mean(np.square(self.sigma0))))
+
     def column(self, name: str) -> tuple[Array, Array]:
         """Return the values and standard deviations (E,) of one IOP; do not write to them."""
         k = IOP_NAMES.index(name)

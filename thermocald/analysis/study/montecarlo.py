@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import ideal_points, image_grid, solve_distortion
-from thermocald.analysis.statistics.dependence import correlation_matrix
+from thermocald.analysis.statistics.dependence import pearson_matrix
 from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -293,4 +293,4 @@ def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
             one.column(name)[0] if name in one.free else np.full(len(one), np.nan) for one in series
         ]
         columns.append(np.concatenate([values - values.mean() for values in known]))
-    return correlation_matrix(columns)
+    return pearson_matrix(columns)

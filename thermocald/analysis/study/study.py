@@ -25,11 +25,11 @@ from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.statistics.dependence import (
     Dependence,
     IopCorrelations,
-    correlation_matrix,
     dependence,
     holm,
     median_correlations,
     moving_f_test,
+    pearson_matrix,
     unbroken_windows,
 )
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
@@ -254,7 +254,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     noise_ratio = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
     return SeriesStudy(
         series, deviations, focus, grid, displacement, covariance, significance, channels,
-        tuple(series.columns), correlation_matrix([v for v, _ in series.columns.values()]),
+        tuple(series.columns), pearson_matrix([v for v, _ in series.columns.values()]),
         tuple(notes), noise_ratio,
     )  # fmt: skip
 

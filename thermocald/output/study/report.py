@@ -411,10 +411,9 @@ def _noise(study: SeriesStudy) -> str:
     ratio = study.noise_ratio
     if not np.isfinite(ratio) or 1 / _NOISE_AGREES <= ratio <= _NOISE_AGREES:
         return ""
-    sigma0 = float(np.sqrt(np.mean(np.square(study.series.sigma0))))
     return (
         f"{study.series.name}: neighbouring epochs scatter {ratio:.2f} times as much as the "
-        f"standard deviations state (σ₀ {sigma0:.2f})."
+        f"standard deviations state (σ₀ {study.series.rms_sigma0:.2f})."
     )
 
 
@@ -479,7 +478,7 @@ def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     return {name: getattr(s, name) for name in _OF_SERIES} | {
         **{name: getattr(study, name) for name in _OF_STUDY},
         "epochs": len(s),
-        "sigma0": float(np.sqrt(np.mean(np.square(s.sigma0)))),
+        "sigma0": s.rms_sigma0,
         "exterior_choice": s.choice or None,
         "depth_of_field": study.focus,
         "image_displacement_px": None if study.displacement is None else moved,

@@ -49,7 +49,7 @@ def overview_table(camera: CameraStudy) -> Table:
 
     def noise(study: SeriesStudy) -> str:
         ratio = f"{study.noise_ratio:.2f}" if np.isfinite(study.noise_ratio) else "–"
-        return f"{np.sqrt(np.mean(np.square(study.series.sigma0))):.2f}; {ratio}"
+        return f"{study.series.rms_sigma0:.2f}; {ratio}"
 
     return Table.of(
         "Series",

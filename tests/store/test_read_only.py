@@ -36,7 +36,7 @@ def read_only(with_wal):
     command = [tool or "mount", "--bind", folder, folder]
     done = tool and subprocess.run(command, capture_output=True, check=False)
     if not done or done.returncode:
-        pytest.skip("nothing can be mounted here")
+        pytest.skip("root, whom modes do not stop, cannot mount here")
     subprocess.run([tool, "-o", "remount,ro,bind", folder], check=True)
     yield with_wal
     subprocess.run(["umount", "-l", folder], check=False)
@@ -48,7 +48,9 @@ def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_
     (tmp_path / "link.db").symlink_to(read_only)
     for path in (read_only, tmp_path / "link.db"):
         assert numbers(path) == list(range(1, 15))
-        with pytest.raises(StoreError, match="cannot be written"):
+        with pytest.raises(
+            StoreError, match=r"cannot be written: (Read-only file system|Permission denied)"
+        ):
             Store.open(path, "append")
     assert set(Path(tempfile.gettempdir()).glob("thermocald-*")) == before
 

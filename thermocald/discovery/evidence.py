@@ -69,15 +69,20 @@ def replace_moved_boards(evidence: ReducedSeries) -> tuple[list[FieldMovement], 
     movements = board_movements(series, wandering_targets(series))
     if not movements:
         return [], evidence
-    grid, still = evidence.source.grid, evidence
-    for turn in range(1 + _PASSES):
-        if turn:
-            movements = [refined(_field_series(still), m) for m in movements]
-        points = np.array(grid.points)
-        for m in movements:
-            points[:, m.rows] -= m.trajectory[:, None, None] * m.image
-        still = with_points(evidence, ObservationGrid(points, grid.weights))
+    still = _put_boards_back(evidence, movements)
+    for _ in range(_PASSES):
+        movements = [refined(_field_series(still), m) for m in movements]
+        still = _put_boards_back(evidence, movements)
     return movements, still
+
+
+def _put_boards_back(evidence: ReducedSeries, movements: list[FieldMovement]) -> ReducedSeries:
+    """Reduce the series again with the boards in their places."""
+    grid = evidence.source.grid
+    points = np.array(grid.points)
+    for m in movements:
+        points[:, m.rows] -= m.trajectory[:, None, None] * m.image
+    return with_points(evidence, ObservationGrid(points, grid.weights))
 
 
 def drop_wandering_targets(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:

@@ -496,15 +496,15 @@ def study_camera(
         sensor, correlation = series[0].sensor, correlations.median
         try:
             montecarlo = simulate_errors(sensor, iop, sds, correlation, settings, progress)
-            root = draw_root(sds, correlation)
             jacobian = plane_jacobian(sensor, iop, montecarlo.image_points, settings.distance_mm)
-            covariance = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
+            covariance, by_noise = (
+                jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
+                for root in (draw_root(sds, correlation), draw_root(noise, correlation))
+            )
             axes = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
             below = np.mean(shares_within(axes, settings.clusters_mm), axis=0)
             shares = np.diff(below, prepend=0.0, append=1.0)
             first_order = FirstOrder(covariance, *mean_and_largest(axes, settings.sets), shares)
-            root = draw_root(noise, correlation)
-            by_noise = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
             share = np.trace(by_noise.sum(axis=0)) / np.trace(covariance.sum(axis=0))
             if share > _MOSTLY_NOISE:
                 notes.append(

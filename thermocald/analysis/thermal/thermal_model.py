@@ -153,9 +153,7 @@ def fit_camera(
             rest, model.effects, model.T0, search=False, distortion=model.distortion
         )
         errors.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
-    names = tell_apart(
-        [s.source.series or s.source.name for s in series], [s.source.name for s in series]
-    )
+    names = tell_apart([one.name for one in fitted["series"]], [s.source.name for s in series])
     for key, found in (("series", fitted["series"]), ("prediction_test", errors)):
         fitted = {**fitted, key: [replace(f, name=n) for f, n in zip(found, names, strict=False)]}
     return replace(camera, fitted=fitted)

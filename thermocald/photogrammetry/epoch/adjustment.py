@@ -324,7 +324,7 @@ def _redundancy(n: int, s: AdjustmentSettings, known: bool = False) -> int:
     """Return the redundancy of n targets; known: whether `adjust` is given the covariance."""
     # priors of held parameters are no observations
     priors = len(s.free) if known else len(s.priors.keys() & {*s.free, *EOP_NAMES})
-    return 2 * n + priors - len(free_columns(s.free)) - len(EOP_NAMES)
+    return 2 * n + priors - len(s.unknowns)
 
 
 def _refuse_few(observations: Observations, s: AdjustmentSettings, redundancy: int) -> Adjustment:

@@ -16,7 +16,7 @@ Source: blur, vignetting and noise as in Luhmann, T. et al. (2014): Close-Range 
 The area coverage is the share of each half pixel, a cell, inside polygons. Every edge is cut at the
 cells' borders. A piece inside a cell adds the area to its right to this cell, and its height to all
 cells further right, which one running sum along the rows turns into coverage. Nothing is sampled.
-Each shape is filled in a window of its own.
+Shapes are filled in windows of their own, several small ones at once.
 
 Source: the signed-area accumulation of scan converters, e.g. FreeType's smooth rasteriser.
 
@@ -179,6 +179,7 @@ def outlines(field: TestField, normals: Array) -> Iterator[Shape]:
 
 
 _FINER = 2  # cells in a pixel, along both axes
+_AT_ONCE = 20_000  # px of the windows that are filled at once
 
 
 def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, Integers]:
@@ -197,27 +198,6 @@ def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, I
     leaves = (np.where(rising, cell + 1, cell) - begin[:, axis]) / length
     first, last = np.where(j > 0, enters, 0.0), np.where(j < pieces[edge] - 1, leaves, 1.0)
     return begin + first[:, None] * along, begin + last[:, None] * along, cell, edge
-
-
-def coverage_steps(a: Array, b: Array, sign: Array, width: int, height: int) -> Array:
-    """Return the signed coverage of the cell to the left minus that of each cell (2 h, 2 w).
-
-    The cells are half pixels of a window of width × height px. a, b (e, 2) px from its corner: the
-    polygons' edges; sign (e,): +1 for polygons to be added, which run clockwise in the image (y
-    down).
-    """
-    a1, b1, cy, edge1 = _cut_edges(_FINER * a, _FINER * b, 1)
-    a2, b2, cx, edge2 = _cut_edges(a1, b1, 0)
-    dy = (b2[:, 1] - a2[:, 1]) * sign[edge1[edge2]]
-    right = 0.5 * (a2[:, 0] + b2[:, 0]) - cx
-    # the row is that of the first cut: rounding in the second one cannot change it
-    rows, columns = _FINER * height, _FINER * width
-    cell = cy[edge2] * columns + cx
-    area = (
-        np.bincount(cell, dy * (1.0 - right), rows * columns)
-        + np.bincount(cell + 1, dy * right, rows * columns + 1)[:-1]
-    )
-    return area.reshape(rows, columns).astype(np.float64, copy=False)
 
 
 def average(cells: NDArray[np.float32], kernel: Array, axis: int) -> NDArray[np.float32]:
@@ -240,6 +220,34 @@ def average(cells: NDArray[np.float32], kernel: Array, axis: int) -> NDArray[np.
         inner *= k[n + d]
         out[reach:end] += inner
     return np.moveaxis(out, 0, axis)
+
+
+def cover(
+    shapes: Sequence[Shape], vertices: Sequence[Array], kernel: Array, width: int, height: int
+) -> NDArray[np.float32]:
+    """Return the blurred coverage (k, height, width) by shapes, each in its own window.
+
+    vertices: of each shape (v, 2) px from its window's corner, running clockwise in the image (y
+    down) where ink is added; kernel: of `average`.
+    """
+    a = np.concatenate(vertices)
+    b = np.concatenate([v[s.following] for s, v in zip(shapes, vertices, strict=True)])
+    a1, b1, cy, edge1 = _cut_edges(_FINER * a, _FINER * b, 1)
+    a2, b2, cx, edge2 = _cut_edges(a1, b1, 0)
+    edge, own = edge1[edge2], np.repeat(np.arange(len(shapes)), list(map(len, vertices)))
+    dy = (b2[:, 1] - a2[:, 1]) * np.concatenate([s.sign for s in shapes])[edge]
+    right = 0.5 * (a2[:, 0] + b2[:, 0]) - cx
+    rows, columns = _FINER * height, _FINER * width
+    size = len(shapes) * rows * columns
+    # the row is that of the first cut: rounding in the second one cannot change it
+    cell = (own[edge] * rows + cy[edge2]) * columns + cx
+    # the signed coverage of the cell to the left minus that of each cell
+    steps = np.bincount(cell, dy * (1.0 - right), size)
+    steps += np.bincount(cell + 1, dy * right, size + 1)[:-1]
+    cells = average(steps.reshape(-1, rows, columns).astype(np.float32), kernel, 1)
+    # each row sums to 0: a running sum over all rows is a running sum over each
+    inked = -np.cumsum(cells.reshape(len(shapes), -1), axis=1, dtype=np.float64)
+    return average(inked.reshape(cells.shape).astype(np.float32), kernel, 2)
 
 
 _FRACTION = 64  # fixed-point steps per DN
@@ -348,9 +356,11 @@ class Scene:
         shapes = self._shapes(eop[3:6])
         if not shapes:
             return
-        vertices = [shape.vertices(points) for shape in shapes]
-        projected = np.round(project(self.sensor, iop, eop, np.concatenate(vertices)), 9)
-        images = np.split(projected, np.cumsum([len(v) for v in vertices])[:-1])
+        placed = [shape.vertices(points) for shape in shapes]
+        projected = np.round(project(self.sensor, iop, eop, np.concatenate(placed)), 9)
+        begins = np.cumsum([0, *map(len, placed[:-1])])
+        images = np.split(projected, begins[1:])
+        low, high = (f.reduceat(projected, begins) for f in (np.minimum, np.maximum))
         zero, edge = np.zeros(1), np.array([self.sensor.width, self.sensor.height])
         sigma = _FINER * self.look.blur_px * blur_factor  # cells of a Gaussian's ± 4 sigma
         x = np.arange(-np.ceil(4.0 * sigma), np.ceil(4.0 * sigma) + 1.0)
@@ -360,23 +370,24 @@ class Scene:
         margin = len(kernel) // (2 * _FINER) + 1
         depth = np.float32((self.look.paper_dn - self.look.ink_dn) * _FRACTION / 2)
         gain = _compute_gain(self.sensor, self.look.vignetting)
-        for shape, image in zip(shapes, images, strict=True):
-            low, high = image.min(axis=0), image.max(axis=0)
-            in_front = np.sum((eop[3:6] - points[shape.targets[0]]) * shape.normal) > 0
-            inside = np.all((high > -0.5) & (low < edge - 0.5))
-            # a shape larger than the image, behind or beside the camera, would need a huge window
-            if not (in_front and inside and np.all(high - low < edge)):
-                continue
-            corner = np.floor(low + 0.5).astype(np.int64) - margin
-            size = np.floor(high + 0.5).astype(np.int64) + margin + 2 - corner
-            a = image - (corner - 0.5)  # a pixel is [i, i+1) after the shift by half a pixel
-            steps = coverage_steps(a, a[shape.following], shape.sign, *size.tolist())
-            cells = average(steps.astype(np.float32), kernel, 0)
-            # each row sums to 0: a running sum over all rows is a running sum over each
-            inked = -np.cumsum(cells, dtype=np.float64).reshape(cells.shape).astype(np.float32)
-            covered = average(inked, kernel, 1)
-            (left, top), (x0, y0) = corner.tolist(), np.maximum(corner, 0).tolist()
-            x1, y1 = np.minimum(corner + size, edge).tolist()
-            ink = covered[y0 - top : y1 - top, x0 - left : x1 - left]
-            taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
-            canvas[y0:y1, x0:x1] -= taken + taken
+        towards = eop[3:6] - points[[shape.targets[0] for shape in shapes]]
+        seen = np.sum(towards * [shape.normal for shape in shapes], axis=1) > 0
+        # a shape larger than the image, behind or beside the camera, would need a huge window
+        seen &= np.all((high > -0.5) & (low < edge - 0.5) & (high - low < edge), axis=1)
+        corners = np.floor(low[seen] + 0.5).astype(np.int64) - margin
+        sizes = np.floor(high[seen] + 0.5).astype(np.int64) + margin + 2 - corners
+        number, area = np.flatnonzero(seen), sizes.prod(axis=1)
+        order = np.argsort(area)
+        while len(order):  # the largest first, with others of about its size
+            count = max(1, _AT_ONCE // int(area[order[-1]]))
+            some, order = order[-count:], order[:-count]
+            # a pixel is [i, i+1) after the shift by half a pixel
+            vertices = [images[number[k]] - (corners[k] - 0.5) for k in some]
+            own = [shapes[k] for k in number[some]]
+            covered = cover(own, vertices, kernel, *sizes[some].max(axis=0).tolist())
+            for corner, size, inked in zip(corners[some], sizes[some], covered, strict=True):
+                (left, top), (x0, y0) = corner.tolist(), np.maximum(corner, 0).tolist()
+                x1, y1 = np.minimum(corner + size, edge).tolist()
+                ink = inked[y0 - top : y1 - top, x0 - left : x1 - left]
+                taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
+                canvas[y0:y1, x0:x1] -= taken + taken

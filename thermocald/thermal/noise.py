@@ -250,14 +250,15 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
         old = e.thermometers[name]
         precision = np.einsum("p,epq,q->e", direction, e.N, direction)
         left = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(s))
-        operator, sd = fitter.drive(fit.terms, s)[1], old.sd
+        operator, sd = fitter.drive(fit.terms, s)[1], e.state_sd(name)
         # normal equations of the states and one level
         A = np.column_stack([operator, np.ones(len(operator))])
         normal = A.T @ (precision[:, None] * A)
         normal[:-1, :-1] += np.diag(1.0 / sd**2)
         right = A.T @ (left @ direction)
-        right[:-1] += old.deviation / sd**2
-        state = scaled_solve(normal, right, 1e-12)[:-1]
+        right[:-1] += e.state_deviation(name) / sd**2
+        state = np.zeros(len(old.sd))
+        state[old.erring] = scaled_solve(normal, right, 1e-12)[:-1]
         trajectory = old.trajectory + old.mixing @ state
         new = replace(old, trajectory=trajectory, deviation=old.deviation - state)
         history = replace(e.history, readings={**e.history.readings, name: trajectory})

@@ -256,7 +256,7 @@ def reduce_series(
         noises = {name: source.noises[name][usable] for name in present}
     knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
     # without the knots on curves between readings
-    trajectory = instruments[reference].trajectory[instruments[reference].mixing.diagonal() > 0]
+    trajectory = instruments[reference].trajectory[instruments[reference].erring]
     trajectory = trajectory[np.isfinite(trajectory)]
     history = History(
         times,

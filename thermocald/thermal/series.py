@@ -374,24 +374,27 @@ class ReducedSeries:
 
     def states(self, channel: str, operator: csr_array) -> Array:
         """Return ∂ trajectory / ∂ independent errors, dense, from ∂ trajectory / ∂ knots (E, K)."""
-        result = operator @ self.thermometers[channel].mixing
-        if self.blocks is not None:
-            result = self.blocks.average @ result @ self.blocks.pool
-        return np.asarray(result.toarray())
+        instrument = self.thermometers[channel]
+        result = operator @ instrument.mixing
+        if self.blocks is None:
+            return np.asarray(result[:, instrument.erring].toarray())
+        return np.asarray((self.blocks.average @ result @ self.blocks.pool).toarray())
 
     def state_sd(self, channel: str) -> Array:
         """Return the standard deviations of the independent errors, K."""
-        sd = self.thermometers[channel].sd
+        instrument = self.thermometers[channel]
+        sd = instrument.sd
         if self.blocks is None:
-            return sd
+            return sd[instrument.erring]
         pool = self.blocks.pool  # a state's sd is that of the mean over its knots
         return np.asarray(np.sqrt(pool.T @ sd**2) / pool.sum(axis=0))
 
     def state_deviation(self, channel: str) -> Array:
         """Return the independent errors' part of readings minus smooth trajectory, K."""
-        deviation = self.thermometers[channel].deviation
+        instrument = self.thermometers[channel]
+        deviation = instrument.deviation
         if self.blocks is None:
-            return deviation
+            return deviation[instrument.erring]
         pool = self.blocks.pool
         return np.asarray((pool.T @ deviation) / pool.sum(axis=0))
 

@@ -56,6 +56,11 @@ class Thermometer:
     coarse: bool = False
 
     @property
+    def erring(self) -> Index:
+        """The knots with an error of their own (S,); curves have only that of their readings."""
+        return np.flatnonzero(self.mixing.diagonal() > 0)
+
+    @property
     def bulge(self) -> float:
         """The lead of the curves between readings over straight lines, in intervals of readings.
 
@@ -142,14 +147,14 @@ def find_passages(times: Array, readings: Array, resolution: float | None) -> Pa
     That is one error per run of equal readings, however many there are. Passages that follow each
     other after equal times, or to and fro, have much of their error in common.
     """
-    from scipy.interpolate import PchipInterpolator
-
     step = find_step(readings, resolution)
     rows = np.flatnonzero(np.isfinite(readings) & np.isfinite(times))
     y, t = readings[rows], times[rows]
     first = np.flatnonzero(np.diff(y, prepend=np.inf) != 0.0)
     if len(first) < 3 or len(y) < _STEADY * len(first):
         return None
+    from scipy.interpolate import PchipInterpolator
+
     size = np.diff(first, append=len(y))
     before = first[1:] - 1
     at, values = 0.5 * (t[before] + t[before + 1]), 0.5 * (y[before] + y[before + 1])

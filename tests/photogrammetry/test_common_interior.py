@@ -135,9 +135,10 @@ def test_a_photograph_of_another_zoom_is_left_out():
     assert r.interior.c == pytest.approx(2.8, abs=4 * np.sqrt(r.covariance[0, 0]))
 
 
-def test_frontal_photographs_do_not_determine_the_principal_distance():
+@pytest.mark.parametrize("sigma", [0.02, 0.4])
+def test_frontal_photographs_do_not_determine_the_principal_distance(sigma):
     rng = np.random.default_rng(5)
-    seen = [_of_board(rng.uniform(0, 0.1), 2.8, rng) for _ in range(8)]
+    seen = [_of_board(rng.uniform(0, 0.1), 2.8, rng, sigma=sigma) for _ in range(8)]
     r = adjusted(BOARD, *zip(*seen, strict=True), 2.0, SENSOR)
     assert "within 5° of frontal (some at 20° and more are needed)" in r.reasons[0]
 

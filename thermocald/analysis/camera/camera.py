@@ -123,8 +123,7 @@ class Camera(Result):
         """Return the covariance (n, 2, 2) px² of a fixed direction's image point from the IOP's."""
         seen = directions(self.sensor, self.values, _numbers(image_points, 2))
         J = partials(self.sensor, self.values, np.zeros(6), seen)[1][..., :10]
-        result: Array = np.einsum("ncp,pq,ndq->ncd", J, self.covariance, J)
-        return result
+        return J @ self.covariance @ J.swapaxes(1, 2)
 
     def object_error(self, distance_mm: float, image_points: ArrayLike | None = None) -> Array:
         """Return the standard deviation (n,) mm of points on a plane at a distance.

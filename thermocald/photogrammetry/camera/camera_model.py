@@ -174,11 +174,7 @@ class ExteriorOrientation(_Parameters):
     @classmethod
     def from_rotation(cls, R: ArrayLike, centre: ArrayLike) -> ExteriorOrientation:
         """Build from R (3, 3), camera to object, and the projection centre (3,) mm."""
-        r = np.asarray(R, dtype=float)
-        phi = np.arcsin(np.clip(r[0, 2], -1.0, 1.0))
-        omega = np.arctan2(-r[1, 2], r[2, 2])
-        kappa = np.arctan2(-r[0, 1], r[0, 0])
-        return cls(float(omega), float(phi), float(kappa), *(float(v) for v in np.asarray(centre)))
+        return cls(*rotation_angles(np.asarray(R, dtype=float)).tolist(), *np.asarray(centre, float).tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,6 +241,14 @@ def rotation(angles: ArrayLike) -> Array:
     if a.ndim > 1:
         r = np.ascontiguousarray(np.moveaxis(r, 0, -1))
     return r.reshape(*a.shape[:-1], 3, 3)
+
+
+def rotation_angles(R: Array) -> Array:
+    """Return omega, phi, kappa (..., 3) of rotations (..., 3, 3), camera to object."""
+    phi = np.arcsin(np.clip(R[..., 0, 2], -1.0, 1.0))
+    omega = np.arctan2(-R[..., 1, 2], R[..., 2, 2])
+    kappa = np.arctan2(-R[..., 0, 1], R[..., 0, 0])
+    return np.stack([omega, phi, kappa], axis=-1)
 
 
 def _turned(R: Array, eop: Array, points: Array) -> Array:

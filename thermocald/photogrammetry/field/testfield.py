@@ -288,6 +288,9 @@ FEWEST_ON_A_SHEET = 6
 
 _SEED = 12  # nearest targets, for a first plane
 _FLATNESS = 0.05  # of the distance between neighbours
+_CREASE = 0.01  # of the distance between neighbours: targets this far out may be another board's
+_FARTHER = 6.0  # times the median distance of a board's targets from its plane
+_ITERATIONS = 20
 _SIGMAS = 4.0  # tolerance, in standard deviations of the coordinates
 _APART = 2.5  # times the distance between neighbours; farther is another board
 _SEEDS = 60
@@ -421,12 +424,14 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
     near, spacing = _neighbours(points)
     tolerance = max(_FLATNESS * spacing, least)
     left = np.ones(len(points), dtype=bool)
-    count = 0
+    count, whole = 0, []
     while left.sum() >= FEWEST_ON_A_SHEET:
         rest = np.flatnonzero(left)
         seeds = rest[:: max(len(rest) // _SEEDS, 1)]
         planes = [_plane(points, near[s], left, tolerance) for s in seeds]
         best = max(planes, key=len, default=np.zeros(0, dtype=np.int64))
+        whole.append(best)
+        best = _of_one_plane(points, best, max(_CREASE * spacing, least))
         if len(best) < FEWEST_ON_A_SHEET:
             break
         left[best] = False
@@ -434,6 +439,12 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
             if len(board) >= FEWEST_ON_A_SHEET:
                 labels[board] = count
                 count += 1
+    for plane in whole:  # what no other board has is back on its own
+        for row in plane[labels[plane] < 0]:
+            away = np.linalg.norm(points[plane] - points[row], axis=1)
+            away[labels[plane] < 0] = np.inf
+            if away.min() <= _APART * spacing:
+                labels[row] = labels[plane[away.argmin()]]
     return labels
 
 
@@ -478,6 +489,18 @@ def _plane(
         if len(found) < 3:
             return np.zeros(0, dtype=np.int64)
     return found
+
+
+def _of_one_plane(points: Array, rows: NDArray[np.int64], least: float) -> NDArray[np.int64]:
+    """Return the rows without those of a board that begins near an edge of theirs: by a fit of
+    least absolute distances, from which they are farther than `least` mm and than others.
+    """
+    off = np.ones(len(rows))
+    for _ in range(_ITERATIONS if len(rows) else 0):
+        root = np.sqrt(1.0 / np.maximum(off, 0.1 * least))[:, None]
+        reduced = points[rows] - (root**2 * points[rows]).sum(axis=0) / (root**2).sum()
+        off = np.abs(reduced @ np.linalg.svd(root * reduced, full_matrices=False)[2][2])
+    return rows[off <= max(_FARTHER * float(np.median(off)), least)] if len(rows) else rows
 
 
 def _apart(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDArray[np.int64]]:

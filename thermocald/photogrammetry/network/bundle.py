@@ -29,10 +29,10 @@ import numpy as np
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
-    ExteriorOrientation,
     Sensor,
     partials,
     project,
+    rotation_angles,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import (
@@ -139,8 +139,7 @@ class Bundle:
 
     def exteriors(self) -> Array:
         """Return the exterior orientations (k, 6) in the order of `EOP_NAMES`."""
-        pairs = zip(self.rotations, self.centres, strict=True)
-        return np.array([ExteriorOrientation.from_rotation(R, X).as_array() for R, X in pairs])
+        return np.concatenate([rotation_angles(self.rotations), self.centres], axis=1)
 
     def apply(self, cameras: Array, targets: Array, free: Index) -> Bundle:
         """Return the bundle after a step of cameras (u,) and targets (m, 3)."""

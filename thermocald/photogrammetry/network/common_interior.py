@@ -250,7 +250,9 @@ def _weaknesses(
     Q: covariance of the free parameters from the noise of the image points.
     """
     reasons: list[str] = []
-    _, axes, flat = plane_fit(bundle.points[np.unique(adjustment.rays.target)])
+    assert adjustment.known is not None
+    # as it is given, since adjusted targets may leave its plane as far as their sigmas allow
+    _, axes, flat = plane_fit(adjustment.known.places)
     if flat and "c" in s.free:
         angles = [obliqueness_deg(eop, axes[2]) for eop in bundle.exteriors()]
         if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:

@@ -134,9 +134,12 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
         )
     # averaged, so that the noise of a dark frame does not count as contrast
     sample = image[::4]
-    if min(sample.shape) >= 4:
-        sample = cv2.resize(sample, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(sample, _PERCENTILES, method="inverted_cdf").astype(int)
+    for _ in range(2):  # half the time of one step by 4
+        if min(sample.shape) >= 2:
+            sample = cv2.resize(sample, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    levels = int(np.iinfo(image.dtype).max) + 1  # counted, since sorting takes twice as long
+    count = np.cumsum(cv2.calcHist([sample], [0], None, [levels], [0, levels]), dtype=float)
+    low, high = np.searchsorted(count / sample.size, np.array(_PERCENTILES) / 100)
     top = 255 if image.dtype == np.uint8 else max(int(sample.max()), 1023)
     if high - low < _LEAST_CONTRAST / 255 * top:
         if high < 0.12 * top:

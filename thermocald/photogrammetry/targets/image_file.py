@@ -216,7 +216,7 @@ class EncodedImage:
         self._is_jpeg = data[:2] == _JPEG
         # phones append a video after the end; a preview among the metadata has an end of its own
         scan = max((end for *_, end in _segments(data)), default=2) if self._is_jpeg else 0
-        if self._is_jpeg and data.find(bytes((0xFF, _EOI)), scan) < 0:
+        if self._is_jpeg and data.rfind(bytes((0xFF, _EOI)), scan) < 0:
             raise ImageError(f"{self.name}: the JPEG is cut off, its end is missing")
 
     def whole(self) -> NDArray[Any]:

@@ -329,25 +329,28 @@ def _ellipses(contours: Sequence[Any], longest: float) -> Array:
     An ellipse has the contour's moments; it must fit to the raster of pixels and 3 %. longest:
     most pixels of a contour.
     """
-    used = [c for c in contours if _FEWEST_CONTOUR_POINTS <= len(c) <= longest]
+    used = [
+        c
+        for c in contours
+        if _FEWEST_CONTOUR_POINTS <= len(c) <= longest
+        # compact; the area is positive for outlines, negative for holes
+        and -4 * np.pi * cv2.contourArea(c, oriented=True)
+        >= _COMPACTNESS * cv2.arcLength(c, closed=True) ** 2
+    ]
     if not used:
         return np.zeros((0, 5))
     count = np.array([len(c) for c in used])
     which = np.repeat(np.arange(len(used)), count)
     points = np.concatenate(used)[:, 0].T.astype(float)
-    # the area is positive for outlines, negative for holes
-    area = -np.array([cv2.contourArea(c, oriented=True) for c in used])
-    length = np.array([cv2.arcLength(c, closed=True) for c in used])
-    moments = np.array([itemgetter(*_MOMENTS)(cv2.moments(c)) for c in used]).T
-    *centre, xx, xy, yy = moments[1:] / np.maximum(moments[0], 1e-9)
+    area, *moments = np.array([itemgetter(*_MOMENTS)(cv2.moments(c)) for c in used]).T
+    *centre, xx, xy, yy = moments / area
     mean, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     # the semi-axes of an ellipse are twice the roots of its principal moments
     a, b = (2 * np.sqrt(np.maximum(mean + sign * difference, 1e-6)) for sign in (1, -1))
     angle = np.arctan2(2 * xy, xx - yy) / 2
     ellipse = np.pi * a * b
     keep = (
-        (area * 4 * np.pi >= _COMPACTNESS * length**2)
-        & (np.abs(area - ellipse) < _AREA_TOLERANCE * ellipse + 3.0)
+        (np.abs(area - ellipse) < _AREA_TOLERANCE * ellipse + 3.0)
         & (2 * b >= _SMALLEST_AXIS)
         & (2 * a + 1 <= _LARGEST_AXIS_RATIO * (2 * b + 1))
     )

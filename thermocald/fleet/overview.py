@@ -318,10 +318,10 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     cameras: list[FleetCamera] = []
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
-    for address, source in zip(addresses, sources, strict=True):
+    for address in addresses:
         with FleetReader(address) as reader:
             now, stations = reader.now(), reader.stations()
-            selected = reader.cameras(now, source)
+            selected = reader.cameras(now)
         for camera in selected:
             camera.state = stations.get(camera.station, camera.state)
             _complete(camera, now)

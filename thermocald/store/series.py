@@ -172,9 +172,7 @@ class SeriesReader(ABC):
         """Return the steps of the clock while this series ran, oldest first."""
 
     @abstractmethod
-    def observations(
-        self, series: StoredSeries, first: int, last: int
-    ) -> dict[int, Observations]:
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
         """Return the latest observations of epochs `first` to `last` (numbers) that have some."""
 
     @abstractmethod

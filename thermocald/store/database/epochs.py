@@ -302,7 +302,7 @@ def insert_series(connection: sqlite3.Connection, series: StoredSeries) -> None:
 
 
 def parse_series(
-    path: Path, key: int, head: str, csv: str, start: str, identity: str, settings: str,
+    path: Path | str, key: int, head: str, csv: str, start: str, identity: str, settings: str,
     created: float,
 ) -> StoredSeries:  # fmt: skip
     """Return a series from the row of a file or a server; `path` is for the messages."""

@@ -159,9 +159,7 @@ class Store(SeriesReader):
                 self.path, missing, series.name,
             )  # fmt: skip
 
-    def observations(
-        self, series: StoredSeries, first: int, last: int
-    ) -> dict[int, Observations]:
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
         with self._reads("observations") as connection:
             return dict(epochs.select_observations(connection, series.id, first, last))
 

@@ -222,10 +222,10 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    reader = csv.reader(lines, delimiter=mark)
+    reader = csv.reader((line.replace("−", "-") for line in lines), delimiter=mark)
     try:
         for row in reader:
-            fields = [field.strip().replace("−", "-") for field in row]
+            fields = [field.strip() for field in row]
             if any(fields):
                 yield reader.line_num, fields
     except csv.Error as cause:
@@ -240,7 +240,7 @@ def _split_lines(lines: list[str], mark: str) -> list[tuple[int, list[str]]]:
 
 
 def _fit_width(row: list[str], width: int) -> list[str]:
-    return row[:width] + [""] * (width - len(row))
+    return row if len(row) == width else row[:width] + [""] * (width - len(row))
 
 
 def _detect_encoding(path: Path) -> str:

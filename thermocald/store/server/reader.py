@@ -80,7 +80,7 @@ class ServerStore(Connected, SeriesReader):
             "AND name = coalesce(%s, name) ORDER BY created_utc, station, camera, name, s.key",
             (wanted.station, wanted.camera, wanted.series),
         )
-        every = [(station, parse_series(self.path, key.int, *row)) for station, key, *row in rows]
+        every = [(station, parse_series(self.where, key.int, *row)) for station, key, *row in rows]
         return [replace(s, identity={"station": station, **s.identity}) for station, s in every]
 
     def stamped_columns(
@@ -100,9 +100,7 @@ class ServerStore(Connected, SeriesReader):
             columns = {name: column[order] for name, column in columns.items()}
         return {name: columns[name] for name in names}
 
-    def observations(
-        self, series: StoredSeries, first: int, last: int
-    ) -> dict[int, Observations]:
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
         rows = self._query(
             "SELECT number, observations FROM epoch WHERE series = %s AND number BETWEEN %s AND %s "
             "AND observations IS NOT NULL ORDER BY number, revision",

@@ -209,6 +209,7 @@ _MONTHS = {
     for name in names.split()
 }  # fmt: skip
 """Months by their first letters in six languages; those that begin with `jui` by four."""
+_SERIAL = re.compile(r"\d{5}(?:[.,]\d+)?")
 _WORD = re.compile(r"[A-Za-z]{3}")
 _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
@@ -239,6 +240,26 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     if found := _ONLY_DATE.fullmatch(text):
         return _date(found, order)
     raise ValueError(f"{text[:40]!r} is not a time")
+
+
+def parse_serial(text: str) -> datetime:
+    """Parse a spreadsheet's number of days since 1899-12-30. Raises ValueError for other text.
+
+    Five decimals, as a cell shows, give the second; eight give the millisecond.
+    """
+    decimals = len(text.replace(",", ".").partition(".")[2])
+    seconds = round(float(text.replace(",", ".")) * 86400.0, 3 if decimals >= 8 else None)
+    return datetime(1899, 12, 30) + timedelta(seconds=seconds)
+
+
+def are_serials(texts: Sequence[str]) -> bool:
+    """Return whether texts are a spreadsheet's days: of 2010 to 2050, at most 15 minutes apart.
+
+    Seconds since a start would have to pass that range at 100 readings a second.
+    """
+    days = [float(t.replace(",", ".")) for t in texts if _SERIAL.fullmatch(t)]
+    in_range = len(days) > 0.8 * len(texts) and min(days) > 40179 and max(days) < 54789
+    return in_range and 0.0 < float(np.median(np.abs(np.diff(days or [0.0, 0.0])))) < 0.0105
 
 
 def whole_seconds(number: float) -> float:

@@ -22,7 +22,9 @@ from thermocald.names import channel_fault
 from thermocald.numbers import column_label, counted
 from thermocald.store.logger.clock import (
     DeviceClock,
+    are_serials,
     parse_moment,
+    parse_serial,
     stated_zones,
     whole_seconds,
 )
@@ -86,6 +88,8 @@ def read_log(
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
     table = _Table(file, time_names, names, order)
+    if table.are_serials:
+        notes.append(f"log: {time_names[0]!r} holds days since 1899-12-30, as of a spreadsheet")
     times = table.times(clock)
     if len(times) < 2:
         raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
@@ -199,7 +203,8 @@ class _Table:
         self.labels: list[str] = []
         columns = [(name, file.names.index(name)) for name in names]
         label = file.names.index(_LABEL) if _LABEL in file.names else None
-        bare = set(self._time_names) <= set(OUR_TIMES)
+        self.are_serials = len(times) == 1 and are_serials(file.column(times[0]))
+        bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
         head = 0
         for line, row in file.rows():
             text = " ".join(row[place] for place in self._places)
@@ -287,7 +292,7 @@ class _Table:
     def _moment(self, line: int, text: str) -> datetime | None:
         """Return the time of a row, None for a row that has no readings."""
         try:
-            moment = parse_moment(text, self._order)
+            moment = parse_serial(text) if self.are_serials else parse_moment(text, self._order)
         except ValueError as cause:
             if not text[:1].isdigit():
                 return None

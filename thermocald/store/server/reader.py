@@ -269,10 +269,17 @@ class ServerWriter(Connected):
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]
     ) -> None:
         """Insert rows by one statement, which skips those that exist."""
+        from psycopg import RawCursor
+
         columns = ", ".join(f'"{name}"' for name in rows[0])
-        places = ", ".join([f"({', '.join(['%b'] * len(rows[0]))})"] * len(rows))
-        connection.execute(
+        width = len(rows[0])
+        places = (
+            ", ".join(f"${i}" for i in range(first, first + width))
+            for first in range(1, width * len(rows) + 1, width)
+        )
+        RawCursor(connection).execute(
             # naming a conflict target would need permission to read
-            f'INSERT INTO "{table}" ({columns}) VALUES {places} ON CONFLICT DO NOTHING',
+            f'INSERT INTO "{table}" ({columns}) VALUES ({"), (".join(places)}) '
+            "ON CONFLICT DO NOTHING",
             [value for row in rows for value in row.values()],
         )

@@ -14,6 +14,7 @@ import psycopg
 
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import succeed
+from thermocald.fleet.overview import fleet_lines, render_fleet
 from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.reader import ServerWriter
 
@@ -93,6 +94,11 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
             assert abs(rate["value"] - value) < 4.5 * rate["sd"]
     (kind,) = document["types"]
     assert kind["type"] == "imx219 3280×2464"
+    # names that differ in the middle are shortened to labels that still differ
+    text = json.dumps(document).replace('"gauge', '"station-north-meadow-creek-')
+    document = json.loads(re.sub(r'(["/])cam"', r'\1rpi-camera-v2.1"', text))
+    for shown in (render_fleet(document), "\n".join(fleet_lines(document))):
+        assert len(set(re.findall(r"station-north-[^< ]*…[^< ]*", shown))) == 10
 
     # the table fits a terminal, and an address narrows it
     lines = run("fleet", fleet).splitlines()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,7 +107,7 @@ def test_an_overview_reads_the_summary_of_a_long_series(server, days):
         connection.execute("DELETE FROM epoch WHERE frame_time < %s", (camera.end - 86400 * 5,))
     assert summary(server) != scanned(server)
     with FleetReader(address(server)) as reader:
-        (record,) = reader.cameras(camera.end, Path())
+        (record,) = reader.cameras(camera.end)
     assert (record.epochs, record.results) == (days * 24, days * 24)
     assert record.last_time == record.last_ok == camera.end
     assert len(record.recent) == 60

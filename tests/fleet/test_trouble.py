@@ -46,7 +46,7 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
         assert [float(c[0]) for c in columns.values()] == [21.5, 2.0, 1.0]
         assert len([*there.epochs(found)]) == 1
     with FleetReader(ServerAddress.parse(narrowed)) as fleet:
-        (record,) = fleet.cameras(2e9, base)
+        (record,) = fleet.cameras(2e9)
         assert (record.station, record.camera) == (evil, evil)
     grant_refused = pytest.raises(ServerError, match="was not granted")
     with grant_refused:

@@ -43,6 +43,8 @@ DIALECTS = {
     "German, Latin-1": GERMAN.encode("latin-1"),
     "German, UTF-8 with BOM": GERMAN.encode("utf-8-sig"),
     "German, UTF-16": GERMAN.encode("utf-16"),
+    "German, UTF-16 without a mark": GERMAN.encode("utf-16-le"),
+    "English, UTF-16 without a mark": ENGLISH.encode("utf-16-be"),
     "lines above, CR LF": ("Logger 4711\nSerie A\n\n" + GERMAN).replace("\n", "\r\n").encode(),
     "English": ENGLISH.encode(),
     "tabs": PLAIN.replace(",", "\t").replace(".", ",").encode(),
@@ -219,7 +221,8 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         ((b"entity_id,state,last_changed\nsensor.humidity,45,2026-06-14T12:00:00Z\n"
          b"sensor.humidity,46,2026-06-14T12:01:00Z\n"), {}, "no sensor .* has temperatures"),
         (b"\x7fELF\0\0\0\0", {}, "is not text"),
-        (b"time,temp\n46187.5,20\n46187.50012,20\n", {}, "line 2.* spreadsheet's date"),
+        (b"time,temp\n46187.5,20\n46187.54,20\n", {}, "line 2.* spreadsheet's date"),
+        (b"Zeit;T\n46187.5,20\n46188.5,20\n", {}, "show 45992.5 as a date with a time"),
         (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
         # 21,5 split at its comma would be 21
         (PLAIN.replace("21.", "21,"), {}, "line 2: the rows hold more fields than the head"),
@@ -267,6 +270,21 @@ def test_the_hour_that_comes_twice(tmp_path):
         logged(tmp_path, once, clock=replace(BERLIN, ambiguous="order"))
     later = logged(tmp_path, once, clock=replace(BERLIN, ambiguous="later")).times
     assert ((later - start) / 60).tolist() == [0, 90, 120, 140]
+
+
+@pytest.mark.parametrize(
+    ("form", "hours"),
+    [("%Y-%m-%d %H:%M:%S", None), ("%m/%d/%Y %I:%M:%S %p", None), ("%d.%m.%Y %H:%M:%S:25", None),
+     ("%Y-%m-%d %H:%M:%S+02:00", 2)],
+)  # fmt: skip
+def test_seconds_count_from_their_minute_also_in_the_hour_that_comes_twice(tmp_path, form, hours):
+    """The minutes of such an hour are written alike, but are two."""
+    zone = time_zone("Europe/Berlin" if hours is None else f"+{hours:02}:00")
+    times = datetime(2026, 10, 24, 23, 50, 7, tzinfo=UTC).timestamp() + 20.0 * np.arange(600)
+    rows = [f"{datetime.fromtimestamp(t, zone):{form}};21.5" for t in times]
+    clock = DeviceClock(time_zone("Europe/Berlin"), ambiguous="order")
+    found = logged(tmp_path, "\n".join(["time;T °C", *rows, ""]), clock=clock)
+    assert np.array_equal(found.times, times + (0.25 if form.endswith("25") else 0.0))
 
 
 def test_the_hour_that_does_not_exist_names_the_fixed_zone(tmp_path):
@@ -433,6 +451,9 @@ PROGRAMS = {
         ['"TOA5","river","CR1000X"', '"TIMESTAMP","RECORD","BattV_Min","AirT_Avg","AirT_Max"',
          '"TS","RN","Volts","Deg C","Deg C"', '"","","Min","Avg","Max"'],
         lambda m, t, i: f'"{m:%Y-%m-%d %H:%M:%S}",{i},12.7,{t:.2f},{t + 1:.2f}'),
+    "days of a spreadsheet": (
+        ["Datum;T °C"],
+        lambda m, t, i: f"{(m.timestamp() / 86400 + 25569):.5f};{t:.2f}".replace(".", ",")),
     "least, most and mean": (
         ["time,T max °C,T min °C,T avg °C"],
         lambda m, t, i: f"{int(m.timestamp())},{t + 0.5:.2f},{t - 0.5:.2f},{t:.2f}"),

@@ -9,6 +9,7 @@ import pytest
 
 from tests.commands import call, succeed
 from thermocald.errors import RecordingError
+from thermocald.store.recording import observation_file
 from thermocald.store.recording.reader import open_recording, read_recording
 from thermocald.store.recording.table import Table
 
@@ -91,7 +92,7 @@ def test_names_of_targets_may_be_categories(recording_path, kind):
     same(before, read_recording(recording_path))
 
 
-def test_text_that_cannot_be_read_is_not_converted(recording_path):
+def test_text_that_cannot_be_read_is_not_converted(recording_path, monkeypatch):
     csv = recording_path / "observations.csv"
     head, first, *rest = csv.read_text().splitlines()
     cells = first.split(",")
@@ -100,6 +101,15 @@ def test_text_that_cannot_be_read_is_not_converted(recording_path):
     done = call("convert", recording_path, "--to", "parquet")
     assert "line 2, column x: '1,5' is not a number; write decimals with a point" in done.stderr
     assert (done.returncode, csv.read_text()) == (1, text)
+    # rows that are read again are not counted twice
+    monkeypatch.setattr(observation_file, "_TEXT_BLOCK", 2000)
+    steps: list[int] = []
+    wrong = ",".join([*cells[:2], '"1,5"', *cells[3:]])
+    csv.write_text("\n".join([head, first, *rest, wrong]))
+    with pytest.raises(RecordingError, match=f"line {len(rest) + 3}, column x"):
+        observation_file.csv_to_parquet(csv, csv.with_suffix(".parquet"), steps.append)
+    assert len(steps) > 1
+    assert sum(steps) == 0
     csv.write_text(f"{head}\n")
     assert "holds no observations" in call("convert", recording_path, "--to", "parquet").stderr
     csv.write_text("\n".join(["", head, first, *rest]))

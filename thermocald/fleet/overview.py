@@ -318,10 +318,10 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     cameras: list[FleetCamera] = []
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
-    for address, source in zip(addresses, sources, strict=True):
+    for address in addresses:
         with FleetReader(address) as reader:
             now, stations = reader.now(), reader.stations()
-            selected = reader.cameras(now, source)
+            selected = reader.cameras(now)
         for camera in selected:
             camera.state = stations.get(camera.station, camera.state)
             _complete(camera, now)
@@ -361,13 +361,14 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
     lines = textwrap.wrap(head, _WIDTH)
     shown = [c for c in cameras if c["findings"]]
     shown += [c for c in cameras if not c["findings"]][:_MOST_WITHOUT]
-    name = min(_LONGEST_NAME, max(14, *(len(_name(c)) for c in shown)))
+    labels = _labels([_name(c) for c in shown], _LONGEST_NAME)
+    name = max(14, *map(len, labels))
     heads = f"{'last':>7} {'waiting':>7} {'ok':>6} {'°C':>6} {'c µm/K':>16}"
     lines += ["", f"{'station/camera':<{name}} {heads}"]
-    for camera in shown:
+    for camera, label in zip(shown, labels, strict=True):
         ok = "–" if camera["ok"] is None else percent(camera["ok"])
         lines.append(
-            f"{shortened(_name(camera), name):<{name}} {short_duration(camera['lag_s']):>7} "
+            f"{label:<{name}} {short_duration(camera['lag_s']):>7} "
             f"{_known(camera['waiting'], 'd'):>7} {ok:>6} "
             f"{_known(camera['temperature'], '.1f'):>6} {_rate(camera, 'c'):>16}"
         )
@@ -482,6 +483,15 @@ def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
     )
 
 
+def _labels(names: Sequence[str], most: int) -> list[str]:
+    """Shorten names to `most` letters, or to as many more as tell them apart."""
+    for length in range(most, max(map(len, names))):
+        labels = [shortened(name, length) for name in names]
+        if len(set(labels)) == len(set(names)):
+            return labels
+    return list(names)
+
+
 def _drawing(
     name: str, rate: str, kind: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]
 ) -> Figure:  # fmt: skip
@@ -508,7 +518,7 @@ def _drawing(
                           color=PALETTE[1] if odd else "#333333")  # fmt: skip
         axis.set_yticks(
             range(len(specimens)) if labelled else [],
-            [shortened(specimen, 22) for *_, specimen, _ in specimens] if labelled else [],
+            _labels([specimen for *_, specimen, _ in specimens], 22) if labelled else [],
         )
         axis.grid(visible=False, axis="y")
         label_axes(axis, f"{parameter_label(rate)} in µm/K")

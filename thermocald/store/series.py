@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
-    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.recording.head import Head
 
 NOT_CALIBRATED = "not_calibrated"  # status of an epoch that is not adjusted yet
@@ -170,6 +170,10 @@ class SeriesReader(ABC):
     @abstractmethod
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """Return the steps of the clock while this series ran, oldest first."""
+
+    @abstractmethod
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
+        """Return the latest observations of epochs `first` to `last` (numbers) that have some."""
 
     @abstractmethod
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:

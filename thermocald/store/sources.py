@@ -128,7 +128,7 @@ class StoredRecording:
     def observations(self, row: int) -> Observations | None:
         """Return the observations of one epoch (from 0)."""
         number = int(self.columns.numbers[row])
-        return next(self.store.epochs(self.series, number, number)).epoch.observations
+        return self.store.observations(self.series, number, number).get(number)
 
     def blocks(
         self, windows: Sequence[slice] | None = None
@@ -137,9 +137,6 @@ class StoredRecording:
         numbers = self.columns.numbers
         for run in grid_runs(len(self), len(self.testfield), windows):
             wanted = numbers[run].tolist()
-            found = {
-                stored.epoch.number: stored.epoch.observations
-                for stored in self.store.epochs(self.series, wanted[0], wanted[-1])
-            }
+            found = self.store.observations(self.series, wanted[0], wanted[-1])
             seen = [found.get(number) for number in wanted]
             yield run.start, ObservationGrid.from_observations(self.testfield, seen)

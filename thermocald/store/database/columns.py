@@ -276,13 +276,21 @@ class SeriesColumns:
             rows += size // 8
         return rows, self._chunks[-1][2] if self._chunks else -1
 
-    def build(self) -> None:
-        """Write chunks while there are enough rows, in the caller's transaction."""
+    def build(self) -> int:
+        """Write chunks while there are enough rows, in the caller's transaction.
+
+        Returns the number of epochs that are in no chunk.
+        """
         rows, last = self._find_chunks()
         while end := self._number_after(last, CHUNK):
             self.insert(rows, end, self.latest(last, end))
             rows, last = self._find_chunks()
             self._merge(last)
+        (loose,) = self._connection.execute(
+            "SELECT count(*) FROM epoch WHERE series_id = ? AND number > ? AND revision = 0",
+            (self._series, last),
+        ).fetchone()
+        return int(loose)
 
     def insert(self, first_row: int, last: int, columns: dict[str, Array]) -> None:
         """Write columns (n,) of the epochs from row `first_row` to number `last` as one chunk."""

@@ -70,7 +70,8 @@ class Store(SeriesReader):
         self._db = connection
         self._file = file  # None if the caller holds the lock, or there is none
         self._lock = threading.RLock()
-        self._unchunked: set[int] = set()  # series whose chunks cannot be built
+        # {series: epochs in no chunk}, -inf if its chunks cannot be built
+        self._loose: dict[int, float] = {}
 
     @classmethod
     def open(
@@ -157,6 +158,10 @@ class Store(SeriesReader):
                 "%s: %d epochs of series %s are missing; `thermocald check` lists them",
                 self.path, missing, series.name,
             )  # fmt: skip
+
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
+        with self._reads("observations") as connection:
+            return dict(epochs.select_observations(connection, series.id, first, last))
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         result = np.full((len(numbers), 16, 16), np.nan)
@@ -365,19 +370,25 @@ class Store(SeriesReader):
                     f"epoch {last}; numbers must increase"
                 )
             epochs.insert_epoch(self._db, series.id, stored)
-            if series.id not in self._unchunked:
-                self._build_chunks(series)
+            loose = self._loose.get(series.id, columns.CHUNK) + 1
+            if loose >= columns.CHUNK:
+                loose = self._build_chunks(series)
+        self._loose[series.id] = loose
 
-    def _build_chunks(self, series: StoredSeries) -> None:
-        """Build chunks; if old rows are damaged, the series gets no more and is read from rows."""
+    def _build_chunks(self, series: StoredSeries) -> float:
+        """Build chunks; return the number of epochs that are in none.
+
+        If old rows are damaged, the series gets no more chunks and is read from its rows.
+        """
         self._db.execute("SAVEPOINT chunks")
+        loose = -np.inf
         try:
-            columns.SeriesColumns(self._db, series.id).build()
+            loose = columns.SeriesColumns(self._db, series.id).build()
         except StoreError as error:
             self._db.execute("ROLLBACK TO chunks")
-            self._unchunked.add(series.id)
             log.warning("%s: %s", self.path, error)
         self._db.execute("RELEASE chunks")
+        return loose
 
     def amend(
         self,

@@ -19,6 +19,8 @@ from thermocald.errors import DataError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from numpy.typing import NDArray
+
     from thermocald.arrays import Array
 
 
@@ -84,34 +86,49 @@ class DeviceClock:
     forced: bool = False
     option: str = "--timezone"
 
-    def utc(self, moments: Sequence[datetime], where: Callable[[int], str]) -> Array:
-        """Convert moments written by the device to seconds since 1970 UTC, (n,).
+    def utc(
+        self,
+        moments: Sequence[datetime],
+        where: Callable[[int], str],
+        of: NDArray[np.int64] | None = None,
+        after: Array | None = None,
+    ) -> Array:
+        """Convert times written by the device to seconds since 1970 UTC, (n,).
 
-        where: names the place of moment i. Raises DataError for a time without a zone, for one that
-        does not exist, and for one that exists twice if it is not known which one is meant.
+        Time i is `after[i]` s after the moment `of[i]`, in the same minute; by default it is moment
+        i. where: names the place of time i. Raises DataError for a time without a zone, for one
+        that does not exist, and for one that exists twice if it is not known which one is meant.
         """
+        of = np.arange(len(moments)) if of is None else of
+        after = np.zeros(len(of)) if after is None else after
+
+        def written(i: int) -> str:
+            moment = moments[of[i]] + timedelta(seconds=float(after[i]))
+            return f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S}"
+
         early, late = np.empty((2, len(moments)))  # differ where the clock was put back or forward
-        for i, moment in enumerate(moments):
+        for k, moment in enumerate(moments):
             local = moment
             if moment.tzinfo is None or self.forced:
                 if self.zone is None:
                     raise DataError(
-                        f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} has no time zone: give it with "
+                        f"{written(int(np.argmax(of == k)))} has no time zone: give it with "
                         f"{self.option}, such as {self.option} Europe/Berlin or {self.option} UTC"
                     )
                 local = moment.replace(tzinfo=self.zone)
-            early[i], late[i] = (local.replace(fold=k).timestamp() for k in (0, 1))
-            if early[i] > late[i]:
+            early[k], late[k] = (local.replace(fold=fold).timestamp() for fold in (0, 1))
+            if early[k] > late[k]:
                 raise DataError(
-                    f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} does not exist in {self.zone}: "
+                    f"{written(int(np.argmax(of == k)))} does not exist in {self.zone}: "
                     "clocks were put forward. For a device that does not change its clock, "
                     # fold 0 has the offset from before the change
                     f"give a fixed zone: {self.option} {local.replace(fold=0).isoformat()[-6:]}"
                 )
+        early, late = early[of] + after, late[of] + after
         twice = np.flatnonzero(early < late)
         if len(twice) and self.ambiguous != "earlier":
-            again = f"{where(twice[0])}: {moments[twice[0]]:%Y-%m-%d %H:%M:%S} exists twice"
-            early[twice] = self._choose(early[twice], late[twice], f"{again} in {self.zone}")
+            again = f"{written(twice[0])} exists twice in {self.zone}"
+            early[twice] = self._choose(early[twice], late[twice], again)
         return early - self.ahead
 
     def _choose(self, earlier: Array, later: Array, again: str) -> Array:
@@ -192,6 +209,7 @@ _MONTHS = {
     for name in names.split()
 }  # fmt: skip
 """Months by their first letters in six languages; those that begin with `jui` by four."""
+_SERIAL = re.compile(r"\d{5}(?:[.,]\d+)?")
 _WORD = re.compile(r"[A-Za-z]{3}")
 _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
@@ -222,6 +240,26 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     if found := _ONLY_DATE.fullmatch(text):
         return _date(found, order)
     raise ValueError(f"{text[:40]!r} is not a time")
+
+
+def parse_serial(text: str) -> datetime:
+    """Parse a spreadsheet's number of days since 1899-12-30. Raises ValueError for other text.
+
+    Five decimals, as a cell shows, give the second; eight give the millisecond.
+    """
+    decimals = len(text.replace(",", ".").partition(".")[2])
+    seconds = round(float(text.replace(",", ".")) * 86400.0, 3 if decimals >= 8 else None)
+    return datetime(1899, 12, 30) + timedelta(seconds=seconds)
+
+
+def are_serials(texts: Sequence[str]) -> bool:
+    """Return whether texts are a spreadsheet's days: of 2010 to 2050, at most 15 minutes apart.
+
+    Seconds since a start would have to pass that range at 100 readings a second.
+    """
+    days = [float(t.replace(",", ".")) for t in texts if _SERIAL.fullmatch(t)]
+    in_range = len(days) > 0.8 * len(texts) and min(days) > 40179 and max(days) < 54789
+    return in_range and 0.0 < float(np.median(np.abs(np.diff(days or [0.0, 0.0])))) < 0.0105
 
 
 def whole_seconds(number: float) -> float:

@@ -27,6 +27,7 @@ from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
 from thermocald.store.logger.clock import (
     DeviceClock,
+    are_serials,
     day_and_month,
     device_clock,
     is_date_like,
@@ -222,10 +223,10 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    reader = csv.reader(lines, delimiter=mark)
+    reader = csv.reader((line.replace("−", "-") for line in lines), delimiter=mark)
     try:
         for row in reader:
-            fields = [field.strip().replace("−", "-") for field in row]
+            fields = [field.strip() for field in row]
             if any(fields):
                 yield reader.line_num, fields
     except csv.Error as cause:
@@ -240,7 +241,7 @@ def _split_lines(lines: list[str], mark: str) -> list[tuple[int, list[str]]]:
 
 
 def _fit_width(row: list[str], width: int) -> list[str]:
-    return row[:width] + [""] * (width - len(row))
+    return row if len(row) == width else row[:width] + [""] * (width - len(row))
 
 
 def _detect_encoding(path: Path) -> str:
@@ -259,6 +260,10 @@ def _detect_encoding(path: Path) -> str:
             if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
                 return "utf-16"
             if b"\0" in head:
+                odd = [head[k::2].count(0) for k in (0, 1)]
+                # every second byte of Latin letters in UTF-16 is 0, and no other
+                if min(odd) == 0 and max(odd) > len(head) / 4:
+                    return "utf-16-be" if odd[0] else "utf-16-le"
                 raise DataError(f"{path}: is not text; save it as CSV in UTF-8")
             file.seek(0)
             # GB 18030 writes 温度 in pairs of high bytes; ° and ä of Latin-1 are single bytes
@@ -287,7 +292,7 @@ def _detect_separator(path: Path, lines: list[str]) -> str:
     raise DataError(
         f"{path}: no separator ({', '.join(SEPARATORS.values())}) splits it into rows with a time "
         f"and a number, as in {sample[-1].strip()[:60]!r}; give --separator, or change the form "
-        "of times and numbers"
+        "of times (in a spreadsheet, show 45992.5 as a date with a time) and numbers"
     )
 
 
@@ -300,7 +305,8 @@ def _is_time(field: str) -> bool:
     try:
         parse_moment(field)
     except ValueError:
-        return is_date_like(field)  # month before day, not decided yet
+        # month before day, not decided yet; or days of a spreadsheet
+        return is_date_like(field) or re.fullmatch(r"[45]\d{4}[.,]\d{5,}", field) is not None
     return True
 
 
@@ -443,7 +449,8 @@ def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if options.times:
         return require_columns(file, options.times, "--time-column")
     numeric, seconds = file.of_kind("number", "seconds"), file.of_kind("seconds")
-    found = [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
+    serial = [n for n in numeric if TIME_NAME.search(n) and are_serials(file.column(n))]
+    found = serial or [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
     if found := found or list(filter(TIME_NAME.search, seconds)):
         return (found[0],)
     dates, clocks = file.of_kind("date"), file.of_kind("time")
@@ -454,7 +461,8 @@ def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in file.names)
     raise DataError(
         f"{file.path}: no column holds dates with times, as in 2026-06-14 12:00:00; change their "
-        f"form, or give --time-column NAME (twice for a date and a time). First row: {shown}"
+        "form (in a spreadsheet, show 45992.5 as a date with a time before it is saved), or "
+        f"give --time-column NAME (twice for a date and a time). First row: {shown}"
     )
 
 

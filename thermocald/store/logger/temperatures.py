@@ -6,11 +6,13 @@ names the option that gives them.
 
 from __future__ import annotations
 
+import math
 import re
 from array import array
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +22,9 @@ from thermocald.names import channel_fault
 from thermocald.numbers import column_label, counted
 from thermocald.store.logger.clock import (
     DeviceClock,
+    are_serials,
     parse_moment,
+    parse_serial,
     stated_zones,
     whole_seconds,
 )
@@ -64,6 +68,8 @@ _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
+_SECONDS = re.compile(r"(.*):([0-5]\d)(\D*)", re.ASCII)
+"""A time with its last two digits, probably the seconds."""
 _MOST_REPEATED = 0.1  # of the rows
 
 
@@ -82,6 +88,8 @@ def read_log(
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
     table = _Table(file, time_names, names, order)
+    if table.are_serials:
+        notes.append(f"log: {time_names[0]!r} holds days since 1899-12-30, as of a spreadsheet")
     times = table.times(clock)
     if len(times) < 2:
         raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
@@ -184,8 +192,10 @@ class _Table:
         self.file, self._order = file, order
         self._time_names = times
         self._places = [file.names.index(name) for name in times]
-        self._seconds, self._lines = array("d"), array("q")
-        self._dated: dict[int, datetime] = {}
+        self._lines, self._seconds = array("i"), array("d")
+        # of each row: the moment from which its seconds count, -1 for 1970
+        self._of, self._moments = array("i"), list[datetime]()
+        self._minutes: dict[tuple[str, str], int] = {}
         self.values = {name: array("d") for name in names}
         self.units: dict[str, Counter[str]] = {name: Counter() for name in names}
         self._untimed: list[tuple[int, str]] = []
@@ -193,13 +203,14 @@ class _Table:
         self.labels: list[str] = []
         columns = [(name, file.names.index(name)) for name in names]
         label = file.names.index(_LABEL) if _LABEL in file.names else None
-        bare = set(self._time_names) <= set(OUR_TIMES)
+        self.are_serials = len(times) == 1 and are_serials(file.column(times[0]))
+        bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
         head = 0
         for line, row in file.rows():
             text = " ".join(row[place] for place in self._places)
             seconds = _as_seconds(text) if bare else None
-            moment = None if seconds is not None else self._moment(line, text)
-            if seconds is None and moment is None:
+            at = (-1, seconds) if seconds is not None else self._find_moment(line, text)
+            if at is None:
                 self._untimed.append((line, text))
                 head = line if self._is_other_head(row) else head
                 continue
@@ -208,9 +219,8 @@ class _Table:
                     f"{file.path}, line {head}: another head begins here, and columns may differ "
                     "from it on: make a file of each part"
                 )
-            if moment is not None:
-                self._dated[len(self._seconds)] = moment
-            self._seconds.append(np.nan if seconds is None else seconds)
+            self._of.append(at[0])
+            self._seconds.append(at[1])
             self._lines.append(line)
             for name, place in columns:
                 self.values[name].append(self._value(line, name, row[place]))
@@ -230,9 +240,11 @@ class _Table:
 
     def times(self, clock: DeviceClock) -> Array:
         """Return the time of each row, s since 1970 UTC."""
-        seconds = np.array(self._seconds)
-        places = list(self._dated)
-        seconds[places] = clock.utc(list(self._dated.values()), lambda k: self.where(places[k]))
+        of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
+        rows = np.flatnonzero(of >= 0)
+        seconds[rows] = clock.utc(
+            self._moments, lambda k: self.where(rows[k]), of[rows], seconds[rows]
+        )
         return seconds
 
     def left_out(self) -> list[str]:
@@ -253,10 +265,34 @@ class _Table:
                 notes.append(f"log: {what}: left empty")
         return notes
 
+    def _find_moment(self, line: int, text: str) -> tuple[int, float] | None:
+        """Return a moment's row and the seconds after it; None for a row that has no readings.
+
+        The times of a minute count from its beginning, which is parsed once: parsing each of them
+        would take longer than all else.
+        """
+        found = _SECONDS.fullmatch(text)
+        minute = (found[1], found[3]) if found else ("", "")
+        known = self._minutes.get(minute, -2)
+        if found and known >= 0:
+            return known, float(found[2])
+        moment, seconds = self._moment(line, text), 0.0
+        if moment is None:
+            return None
+        if found and known == -2 and found[2] != "00":
+            with suppress(ValueError):  # in some forms the last digits are minutes or a fraction
+                begin = parse_moment(f"{minute[0]}:00{minute[1]}", self._order)
+                after = timedelta(seconds=int(found[2]))
+                if isinstance(begin, datetime) and begin + after == moment:
+                    moment, seconds = begin, float(found[2])
+            self._minutes[minute] = len(self._moments) if seconds else -1
+        self._moments.append(moment)
+        return len(self._moments) - 1, seconds
+
     def _moment(self, line: int, text: str) -> datetime | None:
         """Return the time of a row, None for a row that has no readings."""
         try:
-            moment = parse_moment(text, self._order)
+            moment = parse_serial(text) if self.are_serials else parse_moment(text, self._order)
         except ValueError as cause:
             if not text[:1].isdigit():
                 return None
@@ -276,14 +312,14 @@ class _Table:
         if not text:
             return np.nan
         plain = text.replace(",", ".") if self.file.decimal == "," else text
-        if unit := UNIT_BEHIND.search(plain):
+        if not plain[-1].isdigit() and (unit := UNIT_BEHIND.search(plain)):
             plain = plain[: unit.start()]
             self.units[name][stated_unit(f"({unit[0].strip()[-1:]})") or ""] += 1
         try:
             value = float(plain) if "_" not in plain else np.nan
         except ValueError:
             value = np.nan
-        if np.isfinite(value) and value not in _NO_READING:
+        if math.isfinite(value) and value not in _NO_READING:
             return value
         if re.search(r"\d", text) and value not in _NO_READING:
             raise DataError(

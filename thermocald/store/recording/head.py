@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import DataError, RecordingError
@@ -13,7 +14,6 @@ from thermocald.photogrammetry.camera.camera_model import CameraSpec as CameraSp
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
 
 FORMAT = "thermocald-recording/1"
@@ -84,7 +84,7 @@ def read_head(folder: Path) -> Head:
     return head
 
 
-def parse_head(document: Mapping[str, Any], path: Path) -> Head:
+def parse_head(document: Mapping[str, Any], path: Path | str) -> Head:
     """Return the head from the mapping of a `recording.yaml`; `path` is for the messages."""
     top = _Reader(path, document)
     top.require_format(FORMAT)
@@ -95,7 +95,7 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
     except TypeError as cause:
         raise top.fail(next(iter(extra)), f"or another unknown key: {cause}") from cause
     return Head(
-        name=top.text("name", path.resolve().parent.name),
+        name=top.text("name", Path(path).resolve().parent.name),
         series=top.text("series", "M1"),
         interval=top.number("interval", "s", above=0.0, low=1e-4, high=1e8),
         camera=CameraSpec.read(top.inner("camera")),

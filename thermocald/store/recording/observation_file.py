@@ -478,13 +478,22 @@ def _typed(
 def csv_to_parquet(source: Path, target: Path, advance: Callable[[int], object]) -> None:
     """Write observations.csv as Parquet; extra columns of text stay text.
 
-    advance(n) is called after each n rows. Raises RecordingError; UsageError without pyarrow.
+    advance(n) is called after each n rows, and with -n where n rows are read again. Raises
+    RecordingError; UsageError without pyarrow.
     """
     table = Table(source, REQUIRED)
+    done = 0
+
+    def advance_from_start(rows: int) -> None:
+        nonlocal done
+        done += rows
+        advance(rows)
+
     with new_file(target) as partial:
         try:
-            _write(partial, _typed(table, _parsed(table), advance))
+            _write(partial, _typed(table, _parsed(table), advance_from_start))
         except ValueError:  # refused by pyarrow: our parser reads it, or names what is wrong
+            advance(-done)
             _write(partial, _typed(table, table.chunks(), advance))
 
 

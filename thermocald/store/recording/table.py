@@ -11,6 +11,7 @@ import io
 import os
 import re
 from itertools import chain, islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from thermocald.errors import RecordingError, ThermocaldError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
     from typing import NoReturn, TextIO
 
     from numpy.typing import NDArray
@@ -45,22 +45,22 @@ class Table:
 
     def __init__(
         self,
-        path: Path,
+        path: Path | str,
         required: Sequence[str],
         error: type[ThermocaldError] = RecordingError,
         text: str | None = None,
     ) -> None:
-        self.path = path
+        self.path, self.title = Path(path), str(path)  # as a path, an address loses a slash
         self._text = text
         self._error = error
         self.columns = self._header()
         if (count := len(self.columns)) > _MOST_COLUMNS:
             raise error(
-                f"{path}{self._head}: has {count} columns; at most {_MOST_COLUMNS} are read"
+                f"{self.title}{self._head}: has {count} columns; at most {_MOST_COLUMNS} are read"
             )
         for name in self.columns:
             if name and self.columns.count(name) > 1:
-                raise error(f"{path}{self._head}: column {name!r} is duplicated")
+                raise error(f"{self.title}{self._head}: column {name!r} is duplicated")
         for name in required:
             if name not in self.columns:
                 raise error(self._missing(name))
@@ -136,39 +136,39 @@ class Table:
         raise self._error(f"{self._where(row)}{of}: {message}")
 
     def _where(self, row: int) -> str:
-        return f"{self.path}, line {self._line(row)}"
+        return f"{self.title}, line {self._line(row)}"
 
     def _open(self) -> TextIO:
         if self._text is not None:
             return io.StringIO(self._text, newline="")
         # reading a link to a device might never end
         if os.path.exists(self.path) and not os.path.isfile(self.path):
-            raise self._error(f"{self.path}: is not a file")
+            raise self._error(f"{self.title}: is not a file")
         try:
             return self.path.open(newline="", encoding="utf-8-sig")
         except (OSError, ValueError) as cause:  # ValueError: a NUL character in the path
             why = getattr(cause, "strerror", cause)
-            raise self._error(f"{self.path}: cannot be read: {why}") from cause
+            raise self._error(f"{self.title}: cannot be read: {why}") from cause
 
     def _header(self) -> list[str]:
         with self._open() as file:
             try:
                 if len(file.readline(_LONGEST_HEADER)) >= _LONGEST_HEADER:
                     raise self._error(
-                        f"{self.path}, line 1: is longer than {_LONGEST_HEADER} characters"
+                        f"{self.title}, line 1: is longer than {_LONGEST_HEADER} characters"
                     )
                 file.seek(0)
                 header = next(filter(None, csv.reader(file, strict=True)), None)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
                 raise self._unreadable(1, cause) from cause
         if header is None:
-            raise self._error(f"{self.path}: is empty; the first line must name the columns")
+            raise self._error(f"{self.title}: is empty; the first line must name the columns")
         return [name.strip() for name in header]
 
     def _unreadable(self, line: int, cause: Exception) -> ThermocaldError:
         if isinstance(cause, UnicodeDecodeError):
-            return self._error(f"{self.path}: is not text in UTF-8; save it as CSV in UTF-8")
-        return self._error(f"{self.path}, line {line}: is not readable as CSV: {cause}")
+            return self._error(f"{self.title}: is not text in UTF-8; save it as CSV in UTF-8")
+        return self._error(f"{self.title}, line {line}: is not readable as CSV: {cause}")
 
     def _missing(self, name: str) -> str:
         found = ", ".join(n if n.isprintable() else repr(n) for n in self.columns)
@@ -177,7 +177,7 @@ class Table:
             hint = "; separate the columns with commas and write decimals with a point"
         elif near := [c for c in self.columns if re.split(r"\W", c.lower())[0] == name.lower()]:
             hint = f"; is {near[0]!r} meant? Write {name}, without a unit, in these letters"
-        return f"{self.path}{self._head}: column {name} is missing; found: {found[:200]}{hint}"
+        return f"{self.title}{self._head}: column {name} is missing; found: {found[:200]}{hint}"
 
     def _line(self, row: int) -> int:
         """Count the lines of the file up to a row: quoted fields may span several."""

@@ -69,7 +69,7 @@ def read_testfield(path: Path) -> TestField:
     return field
 
 
-def parse_testfield(text: str, path: Path) -> TestField:
+def parse_testfield(text: str, path: Path | str) -> TestField:
     """Return the test field in the text of a `testfield.csv` that was accepted before.
 
     It may be empty, as for a camera that is acquired but not calibrated. path: for the messages.
@@ -109,11 +109,11 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             table.fail(row, "kind", f"{kind!r} is unknown; it is one of {', '.join(KINDS)}")
     if len(names) > _MOST_TARGETS:
         raise TestFieldError(
-            f"{table.path}: holds more than {_MOST_TARGETS} targets; leave out those that no "
+            f"{table.title}: holds more than {_MOST_TARGETS} targets; leave out those that no "
             "camera sees"
         )
     if not names and not may_be_empty:
-        raise TestFieldError(f"{table.path}: holds no targets")
+        raise TestFieldError(f"{table.title}: holds no targets")
     return TestField.build(
         names,
         np.array([found[name] for name in "XYZ"]).T,

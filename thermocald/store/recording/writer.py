@@ -9,6 +9,8 @@ import shutil
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
@@ -22,9 +24,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any, TextIO
 
-    import numpy as np
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
@@ -174,7 +176,7 @@ class RecordingWriter:
             self._add_columns(added)
         names = [self._field.names[i] for i in seen.targets.tolist()]
         cells = [
-            [_number(v, ".5f" if name in ("x", "y") else ".6g") for v in columns[name].tolist()]
+            _numbers(columns[name], "%.5f" if name in ("x", "y") else "%.6g")
             if name in columns
             else [_ABSENT.get(name, "")] * len(seen)
             for name in self._columns
@@ -193,6 +195,14 @@ class RecordingWriter:
             self._observations.writerows([*row, *absent] for row in written)
         before.unlink()
         self._columns += names
+
+
+def _numbers(column: Array, form: str) -> list[str]:
+    """Return the cells of a column (n,); empty for NaN."""
+    cells = list(map(form.__mod__, column.tolist()))  # twice as fast as a call of `_number` each
+    for row in np.flatnonzero(~np.isfinite(column)):
+        cells[row] = ""
+    return cells
 
 
 def _number(value: float, form: str) -> str:

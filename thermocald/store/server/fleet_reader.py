@@ -22,7 +22,6 @@ from thermocald.store.server.connection import Connected
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
     from thermocald.arrays import Array
     from thermocald.store.recording.head import Head
@@ -146,8 +145,8 @@ class FleetReader(Connected):
         )
         return {name: StationState(*state) for name, *state in rows}
 
-    def cameras(self, now: float, path: Path) -> list[FleetCamera]:
-        """Return all cameras, by station and name; path: the server's, for messages."""
+    def cameras(self, now: float) -> list[FleetCamera]:
+        """Return all cameras, by station and name."""
         from psycopg.rows import namedtuple_row
 
         wanted = self.address
@@ -169,7 +168,7 @@ class FleetReader(Connected):
             connection.cursor(row_factory=namedtuple_row) as cursor,
         ):
             series: list[Any] = cursor.execute(statement, values).fetchall()
-        heads = {one.key: parse_head(json.loads(one.head), path) for one in series}
+        heads = {one.key: parse_head(json.loads(one.head), str(wanted)) for one in series}
         owned: list[tuple[FleetCamera, list[Any]]] = []
         for _, found in groupby(series, key=lambda one: (one.station, one.camera)):
             every = list(found)

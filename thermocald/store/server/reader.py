@@ -26,6 +26,7 @@ from thermocald.store.database.epochs import (
     parse_series,
     series_row,
     unpack_covariance,
+    unpack_observations,
 )
 from thermocald.store.schema import COLUMN_NAMES, EPOCH_NUMBERS, EPOCH_TEXTS, sql_name
 from thermocald.store.series import Event, SeriesReader, StoredEpoch, StoredSeries
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from psycopg.sql import Composable
 
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.epochs import KeptFrame
 
 
@@ -78,7 +80,7 @@ class ServerStore(Connected, SeriesReader):
             "AND name = coalesce(%s, name) ORDER BY created_utc, station, camera, name, s.key",
             (wanted.station, wanted.camera, wanted.series),
         )
-        every = [(station, parse_series(self.path, key.int, *row)) for station, key, *row in rows]
+        every = [(station, parse_series(self.where, key.int, *row)) for station, key, *row in rows]
         return [replace(s, identity={"station": station, **s.identity}) for station, s in every]
 
     def stamped_columns(
@@ -97,6 +99,14 @@ class ServerStore(Connected, SeriesReader):
             order = np.lexsort((columns["frame_time"], columns["epoch"]))
             columns = {name: column[order] for name, column in columns.items()}
         return {name: columns[name] for name in names}
+
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
+        rows = self._query(
+            "SELECT number, observations FROM epoch WHERE series = %s AND number BETWEEN %s AND %s "
+            "AND observations IS NOT NULL ORDER BY number, revision",
+            (_key(series), first, last),
+        )
+        return {number: unpack_observations(data) for number, data in rows}
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         rows = self._query(
@@ -259,10 +269,17 @@ class ServerWriter(Connected):
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]
     ) -> None:
         """Insert rows by one statement, which skips those that exist."""
+        from psycopg import RawCursor
+
         columns = ", ".join(f'"{name}"' for name in rows[0])
-        places = ", ".join([f"({', '.join(['%b'] * len(rows[0]))})"] * len(rows))
-        connection.execute(
+        width = len(rows[0])
+        places = (
+            ", ".join(f"${i}" for i in range(first, first + width))
+            for first in range(1, width * len(rows) + 1, width)
+        )
+        RawCursor(connection).execute(
             # naming a conflict target would need permission to read
-            f'INSERT INTO "{table}" ({columns}) VALUES {places} ON CONFLICT DO NOTHING',
+            f'INSERT INTO "{table}" ({columns}) VALUES ({"), (".join(places)}) '
+            "ON CONFLICT DO NOTHING",
             [value for row in rows for value in row.values()],
         )

@@ -294,8 +294,9 @@ class Camera(Device):
         raise NotImplementedError
 
     def frame_size(self) -> tuple[int, int] | None:
-        """Return the frames' (width, height), px, if the configuration states it."""
-        return None
+        """Return the frames' (width, height), px, if the driver has these options; else None."""
+        size = (getattr(self.options, "width", None), getattr(self.options, "height", None))
+        return None if None in size else size
 
     def known_scene(self) -> tuple[Any, Any] | None:
         """Return a simulated camera's sensor and test field, None for any other camera.

@@ -142,9 +142,6 @@ class AndroidCamera(AdbPhone, Camera):
             found.append(f"{self._unchecked}: whether they change cannot be checked")
         return found
 
-    def frame_size(self) -> tuple[int, int]:
-        return self.options.width, self.options.height
-
     def capture(self) -> Frame:
         if "Awake" not in self.shell(STATE):
             self._wake()

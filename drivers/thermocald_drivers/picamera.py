@@ -213,9 +213,6 @@ class Picamera2Camera(Camera):
     def identity(self) -> Mapping[str, str]:
         return {"camera": str(self.options.camera), "model": str(self.options.model or "")}
 
-    def frame_size(self) -> tuple[int, int]:
-        return self.options.width, self.options.height
-
     def capture(self) -> Frame:
         camera = self.opened()
         called_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)

@@ -190,9 +190,6 @@ class V4l2Camera(Camera):
         card = self.handle.card if self.handle else ""
         return {"device": str(self.options.device or self.options.serial), "card": card}
 
-    def frame_size(self) -> tuple[int, int]:
-        return self.options.width, self.options.height
-
     def capture(self) -> Frame:
         stream: Stream = self.opened()
         called = time.monotonic()

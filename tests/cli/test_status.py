@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pty
+import subprocess
 import sys
 import termios
 import threading
@@ -123,3 +124,16 @@ def test_top_in_a_pipe_writes_lines_until_it_ends(monkeypatch, capsys):
     said = capsys.readouterr().out
     assert said.count("thermocald 0.1.0, pid 30190") == 2
     assert "\x1b" not in said
+
+
+@pytest.mark.parametrize(
+    "words", ["run --help", "session start --help", "status --store absent.db"]
+)
+def test_a_command_that_calculates_nothing_starts_without_numpy(words, tmp_path):
+    program = (
+        f"import sys; from thermocald.cli import main; sys.argv[1:] = {words.split()}\n"
+        "try: main()\nfinally: print('numpy' in sys.modules)"
+    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.stdout.endswith("False\n"), done.stdout + done.stderr

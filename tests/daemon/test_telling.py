@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import signal
 import socket
 import time
 from functools import partial
@@ -123,6 +125,10 @@ def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, meas
     assert document["pid"] == daemon.process.pid
     assert document["cameras"]["rpi"]["device"] == "open"
     assert document["thermometers"]["recorded"]["last"]["temperature"] == pytest.approx(25, abs=3)
+    daemon.signal(signal.SIGSTOP)  # or a card that has become read-only
+    os.utime(daemon.store.with_name(f"{daemon.store.name}.live") / "status.json", (0, 0))
+    silent = status()
+    assert (silent.returncode, "the daemon hangs, or" in silent.stderr) == (1, True)
     daemon.kill()
     killed = status()
     assert killed.returncode == 1

@@ -30,8 +30,6 @@ from thermocald.cli.common import (
     session_line,
     show,
 )
-from thermocald.config import load_config
-from thermocald.daemon.live_state import find_state, running_status, status_warnings
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, duration, with_sd
@@ -60,6 +58,7 @@ def run(
 
     Example: thermocald run --config config.yaml
     """
+    from thermocald.config import load_config
     from thermocald.daemon.plan import mock_config, recording_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
@@ -121,6 +120,8 @@ def dashboard(
 
     Example: thermocald dashboard --store thermocald.db
     """
+    from thermocald.config import load_config
+    from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
     from thermocald.store.sources import is_store
 
@@ -146,8 +147,8 @@ def dashboard(
 def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOption = None) -> None:
     """Report the state of the daemon: cameras, thermometers, store.
 
-    The exit status is 1 if the daemon does not run, if its store cannot be written, or if an epoch
-    was taken but not stored.
+    The exit status is 1 if the daemon does not run or has not answered for 30 s, if its store
+    cannot be written, or if an epoch was taken but not stored.
 
     Example: thermocald status --config /etc/thermocald/config.yaml
     """
@@ -159,6 +160,11 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
     if store_["state"] == "out":
         waiting = counted(store_["waiting"], "epoch")
         raise DataError(f"the store cannot be written; {waiting} waiting in memory")
+    if (age := document["age_s"]) > _SILENT_S:
+        raise DataError(
+            f"the status is {duration(age)} old: the daemon hangs, or the disk of the store, on "
+            "which it writes its status, is read-only; look at its log"
+        )
 
 
 def top(
@@ -219,6 +225,9 @@ def keys() -> Iterator[Callable[[float], str]]:
 
 
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
+    from thermocald.config import load_config
+    from thermocald.daemon.live_state import running_status
+
     if store is None:
         store = load_config(require_config(config, "--config FILE or --store FILE")).store.path
     return running_status(store)
@@ -292,10 +301,13 @@ def check(
 
 WIDTH = 79
 _OLD_S = 10.0
+_SILENT_S = 30.0  # as for the page's /healthz
 
 
 def status_lines(document: dict[str, Any]) -> list[str]:
     """Return a `thermocald-status/1` document as lines; the first is the headline."""
+    from thermocald.daemon.live_state import status_warnings
+
     running = duration(max(0.0, document["utc"] - document["started"]))
     headline = f"thermocald {document['version']}, pid {document['pid']}, for {running}"
     if (age := document["age_s"]) > _OLD_S:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 import thermocald as tc
@@ -151,7 +150,7 @@ def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
         found = store.find_series(session.camera, session.series)
         archive_series(store, found, path, config.frames.folder)
         status = store.series_columns(found, ["status"])["status"]
-    say(f"\nrecording: {path} ({int(np.sum(status == 'ok'))} of {len(status)} epochs calibrated)")
+    say(f"\nrecording: {path} ({(status == 'ok').sum()} of {len(status)} epochs calibrated)")
     if not report:
         return
     target = path.with_suffix(".html")

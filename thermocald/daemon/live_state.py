@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald.addresses import without_secrets
-from thermocald.arrays import eight_bit
 from thermocald.errors import DataError
 from thermocald.files import overwrite_json, read_json
 from thermocald.numbers import counted
@@ -82,6 +81,7 @@ class LiveState:
         """Replace a camera's last frame, at most 1280 px wide."""
         import cv2
 
+        from thermocald.arrays import eight_bit
         from thermocald.photogrammetry.targets.image_file import decode_grey
 
         try:

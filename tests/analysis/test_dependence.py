@@ -6,7 +6,6 @@ from scipy.special import betainc, fdtrc
 
 from tests.analysis.test_drift_test import HEATED, TIME_S, WARM_UP, N, noise
 from thermocald.analysis.statistics.dependence import (
-    correlations_of,
     dependence,
     fit_straight_line,
     holm,
@@ -16,6 +15,7 @@ from thermocald.analysis.statistics.dependence import (
     slope_noise,
     unbroken_windows,
 )
+from thermocald.photogrammetry.linalg import correlations
 
 
 def test_pearson_and_its_t_test():
@@ -185,7 +185,7 @@ def test_the_f_test_equals_scipys():
 def test_correlations_of_a_covariance_with_a_held_parameter():
     covariance = np.array([[[4.0, 3.0, 0.0], [3.0, 9.0, 0.0], [0.0, 0.0, 0.0]]])
     expected = [[[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]]]
-    np.testing.assert_allclose(correlations_of(covariance), expected)
+    np.testing.assert_allclose(correlations(covariance), expected)
 
 
 def test_median_over_both_series_and_noise_within_each():

@@ -8,10 +8,10 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
-from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.linalg import correlations
 from thermocald.photogrammetry.series.covariances import with_excess
 from thermocald.photogrammetry.series.mount import drift_gaps
 from thermocald.photogrammetry.series.normals import ObservationGrid
@@ -68,7 +68,7 @@ def test_excess_scatter_has_the_correlations_of_the_noise():
     excess = np.array([0.0, 1.0, 10.0, 100.0])
     wide = with_excess(noise, excess)
     assert np.allclose(np.diagonal(wide - noise, axis1=1, axis2=2)[:4], excess)
-    assert np.allclose(correlations_of(wide[:4]), correlations_of(noise[:4]))
+    assert np.allclose(correlations(wide[:4]), correlations(noise[:4]))
     assert not wide[4].any()
 
 

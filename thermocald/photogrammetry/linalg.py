@@ -173,11 +173,11 @@ def symmetric_power(Q: Array, exponent: float, floor: float = 0.0) -> Array:
     return power
 
 
-def correlation_matrix(covariance: Array) -> Array:
-    """Return the correlation coefficients (p, p); 0 where a variance is not positive."""
-    variance = np.diag(covariance)
-    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, np.inf))
-    return covariance * np.outer(scale, scale)
+def correlations(covariances: Array) -> Array:
+    """Return the correlations of covariances (..., p, p); 0 for held parameters, diagonal 1."""
+    r, _ = unit_diagonal(covariances)
+    np.einsum("...ii->...i", r)[...] = 1.0
+    return np.clip(r, -1.0, 1.0)
 
 
 def rigid_motion(points: Array) -> Array:

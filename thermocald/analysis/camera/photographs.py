@@ -26,7 +26,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
 )
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated, measure
-from thermocald.photogrammetry.linalg import correlation_matrix
+from thermocald.photogrammetry.linalg import correlations
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
@@ -134,7 +134,7 @@ class Photographs:
         if self.interior is None or not self.estimated:
             return None
         free = self._estimated
-        matrix = correlation_matrix(self.covariance[np.ix_(free, free)])
+        matrix = correlations(self.covariance[np.ix_(free, free)])
         return {"names": [IOP_NAMES[i] for i in free], "matrix": matrix}
 
     @property

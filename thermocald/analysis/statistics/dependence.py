@@ -51,7 +51,6 @@ from thermocald.analysis.statistics.noise_models import (
     largest_p_value,
     mixtures,
 )
-from thermocald.photogrammetry.linalg import unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -390,13 +389,6 @@ class IopCorrelations:
     noise: Array
     largest: Array
     epochs: int
-
-
-def correlations_of(covariances: Array) -> Array:
-    """Return the correlations of covariances (n, k, k); 0 for held parameters, diagonal 1."""
-    r, _ = unit_diagonal(covariances)
-    np.einsum("...ii->...i", r)[...] = 1.0
-    return np.clip(r, -1.0, 1.0)
 
 
 def median_correlations(series: list[Array]) -> IopCorrelations | None:

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.dependence import correlations_of
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
 from thermocald.names import checked
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.linalg import correlations
 from thermocald.store.recording.reader import interpolate_readings
 from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
@@ -212,7 +212,7 @@ def measured_series(
         label, source.head.series, source.head.camera.name, source.head.camera.sensor, source.title,
         table.number[ok], time_s - time_s[0], tuple(thermometers),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
-        correlations_of(covariances), exterior, without_result, float(time_s[0]),
+        correlations(covariances), exterior, without_result, float(time_s[0]),
         "" if adjustment is None else adjustment.choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
         slow=table.slow_between_ends[:10],

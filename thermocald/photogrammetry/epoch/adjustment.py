@@ -279,7 +279,7 @@ def adjust(
     s = settings or _USUAL
     unknowns = s.unknowns
     n = len(observations)
-    redundancy = _redundancy(n, s, known is not None)
+    redundancy = _redundancy(n, s, len(unknowns), known is not None)
     if redundancy < s.bounds.minimum_redundancy:
         return _refuse_few(observations, s, redundancy)
     start = np.concatenate([interior.as_array(), exterior.as_array()])
@@ -320,11 +320,11 @@ def adjust(
     return _result(problem, solution, s, use, redundancy)
 
 
-def _redundancy(n: int, s: AdjustmentSettings, known: bool = False) -> int:
+def _redundancy(n: int, s: AdjustmentSettings, unknowns: int, known: bool = False) -> int:
     """Return the redundancy of n targets; known: whether `adjust` is given the covariance."""
     # priors of held parameters are no observations
     priors = len(s.free) if known else len(s.priors.keys() & {*s.free, *EOP_NAMES})
-    return 2 * n + priors - len(s.unknowns)
+    return 2 * n + priors - unknowns
 
 
 def _refuse_few(observations: Observations, s: AdjustmentSettings, redundancy: int) -> Adjustment:
@@ -413,7 +413,7 @@ def cold_start(
     s = settings or AdjustmentSettings()
     if len(observations) == 0:
         return failed("no_observations", "no target was measured", observations, s.free)
-    redundancy = _redundancy(len(observations), s)
+    redundancy = _redundancy(len(observations), s, len(s.unknowns))
     if redundancy < s.bounds.minimum_redundancy:  # few targets may have no orientation either
         return _refuse_few(observations, s, redundancy)
     points = testfield.points[observations.targets]

@@ -101,7 +101,7 @@ class Problem:
 
     points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
     unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight (u, u), prior_value (u,): parameters
-    observed beforehand, with weight 0 for the others.
+    observed beforehand, with weight 0 for the others; both empty if none was.
     """
 
     sensor: Sensor
@@ -125,8 +125,9 @@ class Problem:
 
         known: values (16,) and covariance (16, 16) of parameters that were observed beforehand.
         """
-        weight, value = np.zeros((len(unknowns), len(unknowns))), np.zeros(len(unknowns))
+        weight = value = np.empty(0)
         if known is not None:
+            weight = np.zeros((len(unknowns), len(unknowns)))
             value, variances = known[0][unknowns], known[1].diagonal()[unknowns]
             some = np.flatnonzero(variances > 0)
             # a combination with almost no variance gets an sd of 1e-4 of its parameters' sds
@@ -150,8 +151,9 @@ class Problem:
         # flat @ flat.T would be NumPy's symmetric product, three times as slow at this size.
         products = flat[:-1] @ flat.T
         N, gradient = products[:, :-1], products[:, -1]
-        N += self.prior_weight
-        gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
+        if len(self.prior_weight):
+            N += self.prior_weight
+            gradient += self.prior_weight @ (self.prior_value - values[self.unknowns])
         return N, gradient, float(residuals @ residuals)
 
     def cost(self, v: Array, values: Array) -> float:
@@ -159,7 +161,10 @@ class Problem:
 
         v: whitened residuals of the points in use; values (16,).
         """
-        flat, difference = v.ravel(), values[self.unknowns] - self.prior_value
+        flat = v.ravel()
+        if not len(self.prior_weight):
+            return float(flat @ flat)
+        difference = values[self.unknowns] - self.prior_value
         return float(flat @ flat + difference @ self.prior_weight @ difference)
 
 

@@ -85,6 +85,8 @@ if TYPE_CHECKING:
 
 
 _LOOSE_PX = 3.0  # far beyond the tremble of a mount, and beyond the noise of an epoch's perspective
+_QUIETEST = 0.1  # variance of unit weight of an epoch, over that of the series
+_HIDABLE = 3.0  # times the mean noise, a movement beyond which that noise cannot hide
 
 
 def choose_exterior(
@@ -99,9 +101,10 @@ def choose_exterior(
     if asked == "auto" and not movement.still and not movement.jumps:
         # The noise of a camera that warms up and defocuses changes. Only the choice depends on it.
         unit = series.noise(estimate)[0] / series.variance(estimate)
-        mean = neighbours_variance(unit, estimate.solved)[estimate.system.good].mean()
-        noisier = estimate_mount_movement(series, estimate, float(mean))
-        movement = noisier if noisier.still else movement
+        mean = float(neighbours_variance(unit, estimate.solved)[estimate.system.good].mean())
+        if movement.over_noise < _HIDABLE * mean:
+            noisier = estimate_mount_movement(series, estimate, mean)
+            movement = noisier if noisier.still else movement
     px = image_px(movement.covariance, A)
     doubt = ""
     if movement.hidden.any():
@@ -144,8 +147,11 @@ def estimate_mount_movement(
     free = np.array(free_columns(series.s.free), dtype=np.int64)
     good = system.good & np.isfinite(b).all(axis=1)  # epochs that diverged are left out
     gaps = [*series.s.gaps, *(part.start for part in series.windows[1:])]
+    unit, _, redundancy = series.noise(estimate)
+    shown = estimate.solved & (redundancy >= TRUSTED_REDUNDANCY)
+    scale = np.sqrt(neighbours_variance(unit / variance, shown, _QUIETEST))
     found = estimate_movement(
-        N / variance, b / variance, free, good, series.s.drift_period, correlated, gaps
+        N / variance, b / variance, free, good, scale, series.s.drift_period, correlated, gaps
     )
     if not series.windows or not found.jumps:
         return found

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     """A step (k,) of the pose and the weights (k,) of what is known of it."""
 
 
-_LARGE = 8.0  # robust standard deviations of the change between neighbours
+_LARGE = 6.0  # robust standard deviations of the change between neighbours; noise reaches 3.6
 _LASTING = 0.5  # share of the change that must remain
 SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
@@ -34,13 +34,14 @@ _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a 
 
 
 def find_jumps(
-    trajectory: Array, M: Array, g: Array, gaps: Sequence[int]
+    trajectory: Array, M: Array, g: Array, scale: Array, gaps: Sequence[int]
 ) -> tuple[Array, dict[int, Step], Array]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
-    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; gaps:
-    the first epoch after each gap. Returns the trajectory without any jumps, what is known of the
-    mount's by their first epoch, and the covariance (k, k) of a step in a gap that shows none.
+    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; scale
+    (E,): noise of an epoch over the typical one, as a camera may defocus; gaps: the first epoch
+    after each gap. Returns the trajectory without any jumps, what is known of the mount's by their
+    first epoch, and the covariance (k, k) of a step in a gap that shows none.
     """
     jumps: dict[int, Step]
     left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
@@ -53,7 +54,9 @@ def find_jumps(
         if _chi2(moved, V) < _SHOWN:
             del jumps[row]
             hidden = max(hidden, V, key=np.trace)
-    noise = np.maximum(mad_sd(_without_drift(np.diff(left, axis=0)), axis=0), np.sqrt(2.0))
+    pair = np.hypot(scale[1:], scale[:-1])[:, None]
+    change = _without_drift(np.diff(left, axis=0)) / pair
+    noise = pair * np.maximum(mad_sd(change, axis=0), 1.0)
     examined = {*gaps}
     while len(examined) < _MOST + len(gaps) and len(left) >= 4 * SIDE:
         every = np.diff(left, axis=0)
@@ -71,7 +74,7 @@ def find_jumps(
         if abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
-        if jump := _find_mover(row, step, factor * noise**2 / 2, M, g):
+        if jump := _find_mover(row, step, factor * noise[worst] ** 2 / 2, M, g):
             jumps[row] = jump
     return left, dict(sorted(jumps.items())), hidden
 

@@ -286,11 +286,15 @@ class Movement:
         return self.swaying + self.of_jumps
 
     @property
+    def over_noise(self) -> float:
+        """The largest variance of an epoch's movement in any direction, over that of its noise."""
+        whiten = self._whitening()
+        return float(np.linalg.eigvalsh(whiten @ self.swaying @ whiten.T)[-1])
+
+    @property
     def still(self) -> bool:
         """Whether the movement is hidden by the noise of one epoch in every direction."""
-        whiten = self._whitening()
-        inside = np.linalg.eigvalsh(whiten @ self.swaying @ whiten.T)
-        return not self.jumps and bool(inside[-1] < _HIDDEN)
+        return not self.jumps and self.over_noise < _HIDDEN
 
     def _whitening(self) -> Array:
         """Return T (6, 6) with T · noise · Tᵀ = 1."""
@@ -377,6 +381,7 @@ def estimate_movement(
     b: Array,
     own: Index,
     good: Mask,
+    scale: Array,
     period: float = 24.0,
     correlated: Array | None = None,
     gaps: Sequence[int] = (),
@@ -384,14 +389,15 @@ def estimate_movement(
     """Estimate the variance components of the mount from the normal equations of a series.
 
     N (E, 16, 16), b (E, 16): of every epoch at one linearisation, in units of the noise; own (p,):
-    the free interior parameters; good (E,): epochs to use; period: from `drift_period`; correlated
-    (6, 6): part of the pose's normal matrix from correlated errors, ΣAᵀPCPA; gaps: from
-    `drift_gaps`. In a gap the mount has moved if the perspective shows it.
+    the free interior parameters; good (E,): epochs to use; scale (E,): noise of an epoch
+    over the typical one; period: from `drift_period`; correlated (6, 6): part of the pose's normal
+    matrix from correlated errors, ΣAᵀPCPA; gaps: from `drift_gaps`. In a gap the mount has moved if
+    the perspective shows it.
     """
     rows = np.flatnonzero(good)
     if len(rows) < FEWEST_EPOCHS:
         return STILL
-    N, b = N[rows], b[rows]
+    N, b, scale = N[rows], b[rows], scale[rows]
     trajectory, root, weak = _trajectories(N, b, own)
     if trajectory is None:
         return STILL
@@ -405,6 +411,7 @@ def estimate_movement(
     # the pose by the perspective alone, the interior orientation eliminated
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
     M, g = back.T @ M @ back, g @ back
+    M, g = M / scale[:, None, None] ** 2, g / scale[:, None] ** 2
     unit = _unit_variance(M, g)
     M, g = M / unit, g / unit
     alike, axes = np.linalg.eigh(_hidden(N, own, root))
@@ -415,7 +422,7 @@ def estimate_movement(
     pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
     pauses = _apart(pauses, len(rows), SIDE)
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
-    trajectory, jumps, hidden = find_jumps(trajectory, M, g, pauses)
+    trajectory, jumps, hidden = find_jumps(trajectory, M, g, scale, pauses)
     steps = estimate_steps(M, g, jumps)
     # what the free parameters do not follow is the mount's, however slow
     found = [

@@ -228,8 +228,8 @@ def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array
     return slope * np.sqrt(1.0 - noise), row
 
 
-def neighbours_variance(unit: Array, known: Mask) -> Array:
-    """Return the variance of unit weight (E,) about each epoch, over the series' own, 1 to 9.
+def neighbours_variance(unit: Array, known: Mask, least: float = 1.0) -> Array:
+    """Return the variance of unit weight (E,) about each epoch, over the series', `least` to 9.
 
     unit (E,): of the epochs, over the series' own; known (E,): which of them count. The median of
     the 15 epochs around each, 1 where fewer than 10 of them count: the noise of a camera that
@@ -241,7 +241,7 @@ def neighbours_variance(unit: Array, known: Mask) -> Array:
     middle = np.ones(len(windows))
     middle[enough] = np.nanmedian(windows[enough], axis=1)
     at = np.clip(np.arange(len(unit)) - size // 2, 0, len(windows) - 1)
-    return np.clip(middle, 1.0, _NOISIEST)[at]
+    return np.clip(middle, least, _NOISIEST)[at]
 
 
 def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) -> Array:

@@ -318,6 +318,17 @@ def test_the_mistake_in_a_few_control_points_is_named():
         posed(world, world.seen(20.0), camera)
 
 
+@pytest.mark.parametrize("seed", [2, 3, 5])
+def test_a_click_beside_the_image_accuses_no_other_point(seed):
+    """In ten of 24 such gauges, a good point or the lens was said to be wrong."""
+    world, beside = few(seed, 5), np.zeros((5, 3))
+    beside[1, 0] = 7_000.0
+    world.points += beside
+    world.field = replace(world.field, points=world.field.points + beside)
+    with pytest.raises(DataError, match="px; correct the click or leave it out$"):
+        posed(world, world.seen(20.0), thermal_camera().at(20.0))
+
+
 @pytest.mark.parametrize("factor", [0.8, 1.06])
 def test_the_model_of_another_lens_is_named(factor):
     """Two points that were left out anyway were once said to be exchanged."""

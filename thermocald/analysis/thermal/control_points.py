@@ -158,7 +158,9 @@ class ControlPoints:
             )
         elif pose.ok:
             return pose
-        raise DataError(why + self._remedy(camera))
+        # one that fits nevertheless shows no other mistake
+        remedy = "; correct the click or leave it out" if pose.ok else self._remedy(camera)
+        raise DataError(why + remedy)
 
     def _remedy(self, camera: Camera) -> str:
         """Return the change with which the points fit, as the end of a sentence; else ""."""

@@ -25,12 +25,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
-from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -159,10 +160,15 @@ class Predictor:
         covariance = camera.covariance + np.outer(unknown, unknown)
         covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
         now = replace(camera, covariance=covariance, extrapolated=beyond)
-        alone = replace(camera, covariance=np.outer(unknown, unknown))
-        variance = alone.point_covariance(image_grid(camera.sensor)).trace(axis1=1, axis2=2)
-        largest = math.sqrt(variance.max())
+        by = partials(camera.sensor, camera.values, np.zeros(6), self._across)[1][..., IOP]
+        largest = float(np.linalg.norm(by @ unknown, axis=1).max())
         return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest)
+
+    @cached_property
+    def _across(self) -> Array:
+        """The directions (n, 3) of a grid in the image, which temperature hardly changes."""
+        model = self.thermal.model
+        return directions(model.sensor, model.interior.as_array(), image_grid(model.sensor))
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""

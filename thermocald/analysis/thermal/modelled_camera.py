@@ -21,7 +21,7 @@ from thermocald.physics.effect import Steady
 from thermocald.store.logger.dialect import to_celsius
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import ArrayLike
 
@@ -107,47 +107,62 @@ class Validity:
         return outside
 
 
-def steady_parts(
-    model: ThermalModel, channels: Mapping[str, float] | None = None
-) -> Iterator[tuple[str, int, float, Steady]]:
-    """Yield what makes up a steady camera: a number's name, its row of IOP_NAMES, value and signal.
+def steady_table(
+    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float] | None = None
+) -> tuple[Array, list[float]]:
+    """Return a model's steady camera as a table (10, 2 + p, 3 + 2k), and its k knees, °C.
 
-    channels: °C of other thermometers.
+    The rows are the value, its slope per K, and its derivatives by the parameters `names`. The
+    columns are factors of 1, T - T0 and (T - T0)², and for each knee of the kelvins beyond it and
+    of 1 beyond it. channels: °C of other thermometers.
     """
-    for row, n in enumerate(IOP_NAMES):
-        yield f"interior.{n}", row, float(getattr(model.interior, n)), Steady((1.0, 0.0, 0.0))
-        if n in model.rates:
-            yield f"rates.{n}", row, model.rates[n], Steady((0.0, 1.0, 0.0))
-    for effect in model.effects:
-        kind = catalogue.get(effect.name)
-        steady = kind.steady(effect.values, model.T0, channels)
-        for key in kind.linear:
-            if key in effect.values and key in IOP_NAMES:
-                row = IOP_NAMES.index(key)
-                yield f"{effect.name}.{key}", row, float(effect.values[key]), steady
+    effects = [
+        (e, catalogue.get(e.name), catalogue.get(e.name).steady(e.values, model.T0, channels))
+        for e in model.effects
+    ]
+    knees = [steady.knee for _, _, steady in effects if steady.knee is not None]
+    table = np.zeros((10, 2 + len(names), 3 + 2 * len(knees)))
+
+    def add(group: str, key: str, value: float, steady: Steady) -> None:
+        rows = table[IOP_NAMES.index(key)]
+        signal, slope = np.zeros((2, table.shape[2]))
+        signal[:3] = steady.powers
+        slope[:2] = steady.powers[1], 2.0 * steady.powers[2]
+        if steady.knee is not None:
+            k = 3 + 2 * knees.index(steady.knee)
+            signal[k] = slope[k + 1] = 1.0
+            if (knee := f"{group}.{steady.knee_name}") in names:
+                rows[2 + names.index(knee), k + 1] -= value
+        rows[:2] += value * signal, value * slope
+        if (name := f"{group}.{key}") in names:
+            rows[2 + names.index(name)] += signal
+
+    for n in IOP_NAMES:
+        add("interior", n, float(getattr(model.interior, n)), Steady((1.0, 0.0, 0.0)))
+    for n, rate in model.rates.items():
+        add("rates", n, rate, Steady((0.0, 1.0, 0.0)))
+    for effect, kind, steady in effects:
+        for n in kind.linear:
+            if n in effect.values and n in IOP_NAMES:
+                add(effect.name, n, float(effect.values[n]), steady)
+    return table, knees
 
 
 def steady_camera(
-    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float] | None, T: float
+    model: ThermalModel, names: tuple[str, ...], table: tuple[Array, list[float]], T: float
 ) -> tuple[Array, Array, Array]:
     """Return a model's steady camera at T °C: values (10,), slope (10,) per K, derivatives (10, p).
 
-    names: of the parameters whose derivatives are wanted; channels: °C of other thermometers.
+    names, table: as in `steady_table`.
     """
-    dT, values, columns = T - model.T0, np.zeros(10), np.zeros((10, 1 + len(names)))
-    for name, row, value, steady in steady_parts(model, channels):
-        p0, p1, p2 = steady.powers
-        beyond = 0.0 if steady.knee is None else max(T - steady.knee, 0.0)
-        signal = p0 + dT * (p1 + dT * p2) + beyond
-        values[row] += value * signal
-        columns[row, 0] += value * (p1 + 2.0 * dT * p2 + (beyond > 0.0))
-        if name in names:
-            columns[row, 1 + names.index(name)] += signal
-        knee = f"{name.rpartition('.')[0]}.{steady.knee_name}"
-        if beyond > 0.0 and knee in names:
-            columns[row, 1 + names.index(knee)] -= value
-    carried = model.carried_derivatives(values, columns, ("slope", *names))
-    return model.carried(values), carried[:, 0], carried[:, 1:]
+    factors, knees = table
+    dT = T - model.T0
+    basis = [1.0, dT, dT * dT]
+    for knee in knees:
+        basis += [max(T - knee, 0.0), float(knee < T)]
+    columns = factors @ np.array(basis)
+    carried = model.carried_derivatives(columns[:, 0], columns[:, 1:], ("slope", *names))
+    return model.carried(columns[:, 0]), carried[:, 0], carried[:, 1:]
 
 
 def predict_orientations(
@@ -175,15 +190,16 @@ def predict_orientations(
         elif group == "rates":
             J[:, IOP_NAMES.index(key), i] = drive - model.T0
         else:
-            sides = {sign: moved_model(model, name, sign) for sign in (1.0, -1.0)}
-            if not catalogue.get(group).is_drive:
-                up, down = (side.influence(group, history) for side in sides.values())
-            else:
-                drives = [
-                    driven[name, sign] if driven else side.drive(history)
-                    for sign, side in sides.items()
-                ]
-                up, down = (moved[:, None] * model.rate_vector for moved in drives)
+            sides = []
+            for sign in (1.0, -1.0):
+                if driven and catalogue.get(group).is_drive:
+                    sides.append(driven[name, sign][:, None] * model.rate_vector)
+                elif catalogue.get(group).is_drive:
+                    moved = moved_model(model, name, sign).drive(history)
+                    sides.append(moved[:, None] * model.rate_vector)
+                else:
+                    sides.append(moved_model(model, name, sign).influence(group, history))
+            up, down = sides
             J[:, :, i] = (up - down) / (2.0 * _step(model, name))
     carried = model.carried_derivatives(linear, J, ("slope", *names))
     return model.carried(linear), carried[..., 0], carried[..., 1:]

@@ -127,6 +127,7 @@ def _power(a: Adequacy) -> Array:
 
 
 _ROUGH = 1.25  # times the noise left over, beyond which the readings did not show the true rate
+_CLEAR = 150.0  # noises of a reading that the temperature must cover to show its rate
 _SELDOM = 0.05  # bias of a delay by curvature between readings, over their interval
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
@@ -335,7 +336,11 @@ def build_camera(
     if delays and bulge > _SELDOM:
         fitted["read_seldom"] = {"effects": delays, "bulge": bulge}
     poorly = find_poorly_read(fitter, fit)
-    if verdict["left_over_in_noise"] > _ROUGH:
+    clear = any(
+        np.ptp(s.history.temperature()) > _CLEAR * f.thermometer_sd
+        for s, f in zip(series, fits, strict=True)
+    )
+    if not clear or verdict["left_over_in_noise"] > _ROUGH:
         rated = [e.name for e in model.effects if catalogue.get(e.name).follows_rate]
         poorly += [name for name in rated if name not in poorly]
     if poorly:

@@ -36,7 +36,7 @@ from thermocald.analysis.thermal.modelled_camera import (
     require_known,
     require_sd,
     steady_camera,
-    steady_parts,
+    steady_table,
 )
 from thermocald.arrays import floats, seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
@@ -141,8 +141,7 @@ class ThermalCamera(Result):
         Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
         """
         (then, _, J0), (now, _, J) = (
-            steady_camera(self.model, self.parameters, dict.fromkeys(self.channels, t), t)
-            for t in (since, T)
+            self._steady(t, dict.fromkeys(self.channels, t)) for t in (since, T)
         )
         return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
@@ -244,7 +243,19 @@ class ThermalCamera(Result):
         """The temperatures that the model was fitted on, without limits if it states none."""
         return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
-    @property
+    @cached_property
+    def _table(self) -> tuple[Array, list[float]]:
+        """The steady camera's table, for one thermometer."""
+        return steady_table(self.model, self.parameters)
+
+    def _steady(
+        self, T: float, channels: Mapping[str, float] | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p)."""
+        own = steady_table(self.model, self.parameters, channels) if channels else self._table
+        return steady_camera(self.model, self.parameters, own, T)
+
+    @cached_property
     def channels(self) -> tuple[str, ...]:
         """The other thermometers that the model's effects follow."""
         named = (e.values.get("channel") for e in self.model.effects)
@@ -275,10 +286,12 @@ class ThermalCamera(Result):
                 raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
-        values, slope, J = steady_camera(self.model, self.parameters, channels, T)
+        values, slope, J = self._steady(T, channels)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
-        covariance = self._propagated(J, slope, temperature_sd**2) + np.diag(drift)
+        beyond, covariance = 0.0, self._propagated(J, slope, temperature_sd**2)
+        if others or not self.validity.low <= T <= self.validity.high:
+            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+            covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
 
     def _propagated(self, J: Array, slope: Array, noise: Array | float = 0.0) -> Array:
@@ -286,10 +299,11 @@ class ThermalCamera(Result):
 
         noise (…): the variance of the temperature, K².
         """
-        covariance = np.einsum("...pi,ij,...qj->...pq", J, self.covariance, J, optimize=True)
-        of_reading = slope[..., :, None] * slope[..., None, :]
-        total: Array = covariance + np.asarray(noise)[..., None, None] * of_reading
-        return total
+        covariance: Array = J @ self.covariance @ np.swapaxes(J, -1, -2)
+        if np.any(noise):
+            of_reading = slope[..., :, None] * slope[..., None, :]
+            covariance += np.asarray(noise)[..., None, None] * of_reading
+        return covariance
 
     def along(
         self,
@@ -352,7 +366,7 @@ class ThermalCamera(Result):
             return predict_orientations(self.model, self.parameters, part, self.model.drive(part))
 
         if relative_to is not None:
-            base = steady_camera(self.model, self.parameters, None, relative_to)[2]
+            base = self._steady(relative_to)[2]
         elif since is not None:
             then = np.array([since - begin])
             base = predicted(history.at(then))[2]
@@ -404,14 +418,9 @@ class ThermalCamera(Result):
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        powers = np.zeros((3, 10))
-        knees: dict[str, Array] = {}
-        for name, row, value, steady in steady_parts(self.model):
-            powers[:, row] += value * np.array(steady.powers)
-            if steady.knee is not None:
-                knee = np.array([steady.knee, *np.zeros(10)])
-                knees.setdefault(name.rpartition(".")[0], knee)[1 + row] += value
-        return powers, list(knees.values())
+        factors, knees = self._table[0][:, 0], self._table[1]
+        bends = [np.array([T, *factors[:, 3 + 2 * k]]) for k, T in enumerate(knees)]
+        return factors[:, :3].T, bends
 
 
 def load_camera(path: Path | str) -> ThermalCamera:

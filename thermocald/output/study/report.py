@@ -254,8 +254,9 @@ def answer_sentences(camera: CameraStudy) -> list[str]:
         sentences.append(
             f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
             "about the series' mean with the correlations of an epoch's adjustment (the "
-            f"reference's procedure) cause errors of {mc.overall_mean / 10:.2f} cm on average and "
-            f"up to {mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
+            f"reference's procedure) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
+            f"average and up to {plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of "
+            f"{mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
         sentences += _trajectory(camera, mc.clusters_mm[0])
@@ -360,7 +361,9 @@ def _change(study: SeriesStudy) -> str:
         elif moved > 3 * sd:
             words.append(f"the principal point moved by {with_sd(moved, sd, 'px')}")
         else:
-            words.append(f"the principal point stayed within {plain(3 * sd, 'px', 2)}")
+            words.append(
+                f"the principal point stayed within {plain(max(farthest, 3 * sd), 'px', 2)}"
+            )
     if "c" in d:
         words.append(_distance(d["c"]))
     if not words:

@@ -189,12 +189,13 @@ def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
 
 def test_a_nearly_steady_camera_is_described_by_numbers_that_hold(warm_up):
     """It moves by 4.5 standard deviations and back, and errs by less than 0.1 mm on the plane."""
-    steady = warm_up(drift={}, sds=SDS / 10)()
+    steady = warm_up(drift={}, kelvin=0.05, sds=SDS / 10)()
     steady.values[:, 1] += 6.3e-6 * (1 - np.abs(np.linspace(-1, 1, len(steady))))
     text = " ".join(answer_sentences(study_camera("rpi", [steady], StudySettings(sets=500))))
     farthest = np.hypot(*steady.path_px.T).max()
     assert float(re.search(r"stayed within (\S+) px", text)[1]) == pytest.approx(farthest, rel=0.05)
     assert re.search(r"errors of 0\.00\d\d+ cm on average and up to 0\.0\d\d+ cm", text)
+    assert re.search(r"while temperature stayed within 0\.\d\d K\.", text)
 
 
 def test_last_minus_first_ignores_missing_epochs():

@@ -514,11 +514,16 @@ def test_without_its_extra_a_report_names_it(monkeypatch, tmp_path, missing, nam
         invoke("testfield", "check", "--report", tmp_path / "page.html")
 
 
-def test_three_epochs_are_correlated_by_chance_which_is_not_told(warm_up, undrawn):
-    words = words_of(render_study(study([warm_up(epochs=3)("M1")], StudySettings(sets=500))))
-    assert "M1: in 20 seconds the principal point" in words
+@pytest.mark.parametrize(
+    ("epochs", "span", "drift"), [(3, "20 seconds", {"c": 0.007}), (8, "1 minute", {})]
+)
+def test_few_epochs_allow_neither_correlations_nor_a_model(warm_up, undrawn, epochs, span, drift):
+    series = warm_up(drift, epochs)("M1")
+    words = words_of(render_study(study([series], StudySettings(sets=500))))
+    assert f"M1: in {span} the principal point" in words
     assert "Correlation matrix, M1" not in words
     assert "change together" not in words
+    assert "Fit a thermal model" not in words
     assert "Record more epochs, over a wider range of temperatures." in words
 
 

@@ -104,8 +104,8 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     ]
     return Figure(
         "deviations", "Deviations from the first epoch",
-        "Each parameter minus its value in the first epoch. The bands are the 95 % uncertainty of "
-        "one epoch's adjustment; a line that leaves its band shows a change.",
+        "Each parameter minus its value in the first epoch. The band about a line is the 95 % "
+        "uncertainty of one epoch's adjustment; changes smaller than that may be noise.",
         tuple(panels),
     )  # fmt: skip
 

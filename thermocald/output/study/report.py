@@ -93,7 +93,8 @@ def _answer(camera: CameraStudy) -> Answer:
     proof = dependence_figure(camera, ("c", "x0", "y0"))
     if proof is None and any(len(study.series) > 1 for study in camera.series):
         proof = principal_point_figure(camera)
-    if any(c.dependences for study in camera.series for c in study.channels):
+    channels = [channel for study in camera.series for channel in study.channels]
+    if any(d.p_holm < _SIGNIFICANT for c in channels for d in c.dependences.values()):
         steps = [
             "Fit a thermal model, with which to correct measurements: thermocald fit.",
             "Find what a straight line does not explain, and why: thermocald discover.",
@@ -406,6 +407,8 @@ def _warmed(study: SeriesStudy) -> str:
         back = abs(d.change) < 3 * d.sd_change
         end = "" if back else f"{plain(abs(d.change), 'K', 3)} from "
         return f", while {name} {rose} by up to {largest}{over} and ended {end}where it started"
+    if abs(d.change) < 3 * d.sd_change:
+        return f", while {name} stayed within {plain(d.range, 'K', 2)}"
     return f", while {name} changed by {plain(d.change, 'K', 3)}"
 
 

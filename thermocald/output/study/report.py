@@ -237,11 +237,7 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
     for camera in study.cameras:
         lines.append(camera.label)
         lines += [f"  {s}" for s in (*answer_sentences(camera), *detail_sentences(camera))]
-        for one in camera.series:
-            lines += [f"  {line}" for line in doubt_lines(one.series.doubts, one.series.name)]
-        for one in camera.series:
-            lines += [f"  note, {one.series.name}: {note}" for note in one.notes]
-        lines += [f"  note: {note}" for note in camera.notes]
+        lines += [f"  note: {note}" for note in _notes(camera)]
     return lines
 
 

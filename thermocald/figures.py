@@ -30,8 +30,11 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-# safe for the colour-blind (Okabe & Ito 2008), dark enough for thin lines on white paper
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+# safe for the colour-blind (Okabe & Ito 2008; the last three Tol 2021), dark enough for thin lines
+PALETTE = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000", "#332288",
+    "#882255", "#999933",
+)  # fmt: skip
 PALE, GREY = "#9fb4c1", "#555555"
 BAND = 1.96  # standard deviations: 95 % on every page
 _MOST_POINTS = 800

@@ -102,7 +102,7 @@ def require_channels(names: Iterable[object], where: str, error: type[Exception]
 
 
 _LONGEST_PATH = 4096
-_LONGEST_NAME = 120
+LONGEST_NAME = 120
 
 
 def relative_path(text: str, what: str, error: type[ThermocaldError]) -> Path:
@@ -122,11 +122,11 @@ def file_name(text: str, what: str, error: type[ThermocaldError]) -> str:
         or text.startswith(".")
         or "/" in text
         or not text.isprintable()
-        or len(text) > _LONGEST_NAME
+        or len(text) > LONGEST_NAME
     ):
         raise error(
             f"{what}: {text[:80]!r} cannot be part of a file's name: it must be 1 to "
-            f"{_LONGEST_NAME} printable characters without `/`, and not begin with a full stop"
+            f"{LONGEST_NAME} printable characters without `/`, and not begin with a full stop"
         )
     return text
 

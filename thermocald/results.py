@@ -220,7 +220,7 @@ class Calibration(Photographs, Result):
                     "thousandths of px; give --pixel-pitch or --camera"
                 )
         else:
-            lines.append(f"not calibrated: {document['status']}: {document['reason']}")
+            lines.append(f"not calibrated: {document['reason']}")
         for p in document["photographs"]:
             line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
             if p["exterior"] is not None:

@@ -1,11 +1,12 @@
 """Studies of series and cameras: results, and notes where there is no result."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.analysis.conftest import INTERIOR, NEXUS
+from tests.analysis.conftest import INTERIOR, NEXUS, SDS
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.measured import StudySettings, Thermometer
 from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
@@ -184,6 +185,17 @@ def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
     for words in ("the principal distance grew by up to", "ended where it started",
                   "temperature rose by up to 1"):  # fmt: skip
         assert words in sentences[1]
+
+
+def test_a_nearly_steady_camera_is_described_by_numbers_that_hold(warm_up):
+    """It moves by 4.5 standard deviations and back, and errs by less than 0.1 mm on the plane."""
+    steady = warm_up(drift={}, kelvin=0.05, sds=SDS / 10)()
+    steady.values[:, 1] += 6.3e-6 * (1 - np.abs(np.linspace(-1, 1, len(steady))))
+    text = " ".join(answer_sentences(study_camera("rpi", [steady], StudySettings(sets=500))))
+    farthest = np.hypot(*steady.path_px.T).max()
+    assert float(re.search(r"stayed within (\S+) px", text)[1]) == pytest.approx(farthest, rel=0.05)
+    assert re.search(r"errors of 0\.00\d\d+ cm on average and up to 0\.0\d\d+ cm", text)
+    assert re.search(r"while temperature stayed within 0\.\d\d K\.", text)
 
 
 def test_last_minus_first_ignores_missing_epochs():

@@ -29,7 +29,7 @@ _SETTLED = """name => document.querySelector('#course-note').textContent.startsW
 
 
 def _name(k: int) -> str:
-    return f"cam-{k:02}"
+    return f"{'a-camera-of-a-long-name-' * 4}{k:02}"  # as a recording may have
 
 
 @pytest.fixture

@@ -34,11 +34,13 @@ from thermocald.errors import DriverMissing
 from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
+from thermocald.output.study.figures import deviation_figure
 from thermocald.output.study.report import render_study, save_figures
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
+from thermocald.report import Answer, Chapter
 from thermocald.store.recording.reader import open_recording
 from thermocald.thermal.reduce import reduce_together
 
@@ -514,11 +516,16 @@ def test_without_its_extra_a_report_names_it(monkeypatch, tmp_path, missing, nam
         invoke("testfield", "check", "--report", tmp_path / "page.html")
 
 
-def test_three_epochs_are_correlated_by_chance_which_is_not_told(warm_up, undrawn):
-    words = words_of(render_study(study([warm_up(epochs=3)("M1")], StudySettings(sets=500))))
-    assert "M1: in 20 seconds the principal point" in words
+@pytest.mark.parametrize(
+    ("epochs", "span", "drift"), [(3, "20 seconds", {"c": 0.007}), (8, "1 minute", {})]
+)
+def test_few_epochs_allow_neither_correlations_nor_a_model(warm_up, undrawn, epochs, span, drift):
+    series = warm_up(drift, epochs)("M1")
+    words = words_of(render_study(study([series], StudySettings(sets=500))))
+    assert f"M1: in {span} the principal point" in words
     assert "Correlation matrix, M1" not in words
     assert "change together" not in words
+    assert "Fit a thermal model" not in words
     assert "Record more epochs, over a wider range of temperatures." in words
 
 
@@ -541,6 +548,18 @@ def test_a_years_report_is_as_small_and_as_quick_to_open(warm_up, warm_study, pa
 
 
 @pytest.mark.slow
+def test_ten_series_have_a_colour_each(warm_up):
+    series = [warm_up(epochs=3, seed=k)(f"M{k}") for k in range(10)]
+    figure = deviation_figure(study(series, StudySettings(sets=50)).cameras[0])
+    assert len({curve.colour for curve in figure.panels[0].curves}) == 10
+
+
+def test_a_number_and_its_unit_share_a_line():
+    sentence = "B2 changes by (−7.3 ± 0.4)·10⁻⁷ mm⁻¹/K in 20 minutes."
+    page = Chapter("Camera", Answer(sentence), ()).page()
+    assert "(−7.3\xa0±\xa00.4)·10⁻⁷\xa0mm⁻¹/K in 20\xa0minutes." in page
+
+
 def test_figures_for_a_paper(warm_study, tmp_path):
     paths = save_figures(warm_study, tmp_path / "figures")
     names = {p.name for p in paths}

@@ -32,6 +32,7 @@ from starlette.routing import Route
 
 from thermocald.addresses import HostNames
 from thermocald.errors import DataError, ThermocaldError, UsageError
+from thermocald.names import LONGEST_NAME
 from thermocald.output.dashboard.server import Limits
 from thermocald.output.dashboard.view import View
 
@@ -124,7 +125,6 @@ _PLOTLY = "package_data/plotly.min.js"
 _COOKIE = "thermocald_token"
 _STREAM_EVERY_S = 0.5
 _ALIVE_EVERY = 22
-_NAME_LENGTH = 64
 
 
 def build_application(
@@ -336,8 +336,8 @@ def _camera_and_series(request: Request) -> tuple[str, str]:
     found = []
     for key in ("camera", "series"):
         value = request.query_params.get(key, "")
-        if not value or len(value) > _NAME_LENGTH or not value.isprintable():
-            raise UsageError(f"{key}: give a name of at most {_NAME_LENGTH} characters")
+        if not value or len(value) > LONGEST_NAME or not value.isprintable():
+            raise UsageError(f"{key}: give a name of at most {LONGEST_NAME} characters")
         found.append(value)
     return found[0], found[1]
 

@@ -104,8 +104,8 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     ]
     return Figure(
         "deviations", "Deviations from the first epoch",
-        "Each parameter minus its value in the first epoch. The bands are the 95 % uncertainty of "
-        "one epoch's adjustment; a line that leaves its band shows a change.",
+        "Each parameter minus its value in the first epoch. The band about a line is the 95 % "
+        "uncertainty of one epoch's adjustment; changes smaller than that may be noise.",
         tuple(panels),
     )  # fmt: skip
 
@@ -293,8 +293,8 @@ def _object_space(camera: CameraStudy) -> Iterator[Figure]:
         f"Errors of each image point on a plane at {mc.distance_mm / 1000:g} m for {mc.sets:,} "
         f"drawn interior orientations ({min(_DRAWN, mc.sets)} are shown). "
         f"{percent(float(mc.fractions[0]))} of all errors are below {limits[0] / 10:g} cm, "
-        f"the mean is {mc.overall_mean / 10:.2f} cm; the largest, {mc.largest[worst] / 10:.1f} cm, "
-        f"occurs at the {_place(worst, size)}.",
+        f"the mean is {plain(mc.overall_mean / 10, 'cm', 3)}; the largest, "
+        f"{plain(mc.largest[worst] / 10, 'cm', 2)}, occurs at the {_place(worst, size)}.",
         tuple(panels), columns=size,
     )  # fmt: skip
     number = np.arange(1.0, len(mc.image_points) + 1)
@@ -313,7 +313,7 @@ def _object_space(camera: CameraStudy) -> Iterator[Figure]:
     yield Figure(
         "errors-by-point", "Errors by image point",
         f"Mean and largest error of each image point, and the mean of the largest, "
-        f"{mc.mean_largest / 10:.1f} cm. The largest error is smallest at the "
+        f"{plain(mc.mean_largest / 10, 'cm', 2)}. The largest error is smallest at the "
         f"{_place(least, size)}. A shift of the principal point moves all points alike, a change "
         "of the principal distance moves those at the edges of the image most.",
         (panel,),

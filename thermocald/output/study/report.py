@@ -93,7 +93,8 @@ def _answer(camera: CameraStudy) -> Answer:
     proof = dependence_figure(camera, ("c", "x0", "y0"))
     if proof is None and any(len(study.series) > 1 for study in camera.series):
         proof = principal_point_figure(camera)
-    if any(c.dependences for study in camera.series for c in study.channels):
+    channels = [channel for study in camera.series for channel in study.channels]
+    if any(d.p_holm < _SIGNIFICANT for c in channels for d in c.dependences.values()):
         steps = [
             "Fit a thermal model, with which to correct measurements: thermocald fit.",
             "Find what a straight line does not explain, and why: thermocald discover.",
@@ -236,11 +237,7 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
     for camera in study.cameras:
         lines.append(camera.label)
         lines += [f"  {s}" for s in (*answer_sentences(camera), *detail_sentences(camera))]
-        for one in camera.series:
-            lines += [f"  {line}" for line in doubt_lines(one.series.doubts, one.series.name)]
-        for one in camera.series:
-            lines += [f"  note, {one.series.name}: {note}" for note in one.notes]
-        lines += [f"  note: {note}" for note in camera.notes]
+        lines += [f"  note: {note}" for note in _notes(camera)]
     return lines
 
 
@@ -254,8 +251,9 @@ def answer_sentences(camera: CameraStudy) -> list[str]:
         sentences.append(
             f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
             "about the series' mean with the correlations of an epoch's adjustment (the "
-            f"reference's procedure) cause errors of {mc.overall_mean / 10:.2f} cm on average and "
-            f"up to {mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
+            f"reference's procedure) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
+            f"average and up to {plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of "
+            f"{mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
         sentences += _trajectory(camera, mc.clusters_mm[0])
@@ -360,7 +358,9 @@ def _change(study: SeriesStudy) -> str:
         elif moved > 3 * sd:
             words.append(f"the principal point moved by {with_sd(moved, sd, 'px')}")
         else:
-            words.append(f"the principal point stayed within {plain(3 * sd, 'px', 2)}")
+            words.append(
+                f"the principal point stayed within {plain(max(farthest, 3 * sd), 'px', 2)}"
+            )
     if "c" in d:
         words.append(_distance(d["c"]))
     if not words:
@@ -403,6 +403,8 @@ def _warmed(study: SeriesStudy) -> str:
         back = abs(d.change) < 3 * d.sd_change
         end = "" if back else f"{plain(abs(d.change), 'K', 3)} from "
         return f", while {name} {rose} by up to {largest}{over} and ended {end}where it started"
+    if abs(d.change) < 3 * d.sd_change:
+        return f", while {name} stayed within {plain(d.range, 'K', 2)}"
     return f", while {name} changed by {plain(d.change, 'K', 3)}"
 
 

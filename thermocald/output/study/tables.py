@@ -204,7 +204,7 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
 
     def row(label: str, fractions: Array, mean: float, largest: float) -> tuple[str, ...]:
         shown = [percent(float(v), 1) for v in fractions]
-        return (label, *shown, f"{mean / 10:.2f} cm", f"{largest / 10:.1f} cm")
+        return (label, *shown, plain(mean / 10, "cm", 3), plain(largest / 10, "cm", 2))
 
     linear = np.maximum(first.fractions, 0.0)
     clusters = Table(
@@ -235,11 +235,11 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
         range(len(mc.image_points)),
         {
             "image point px": lambda k: "{:.0f}, {:.0f}".format(*mc.image_points[k]),
-            "mean cm": lambda k: f"{mc.mean[k] / 10:.2f}",
-            "mean cm, first order": lambda k: f"{first.mean[k] / 10:.2f}",
-            "largest cm": lambda k: f"{mc.largest[k] / 10:.1f}",
-            "largest cm, first order": lambda k: f"{first.expected_largest[k] / 10:.1f}",
-            "ellipse sd cm": lambda k: f"{axes[k, 1]:.2f} × {axes[k, 0]:.2f}",
+            "mean cm": lambda k: plain(mc.mean[k] / 10, "", 3),
+            "mean cm, first order": lambda k: plain(first.mean[k] / 10, "", 3),
+            "largest cm": lambda k: plain(mc.largest[k] / 10, "", 2),
+            "largest cm, first order": lambda k: plain(first.expected_largest[k] / 10, "", 2),
+            "ellipse sd cm": lambda k: f"{plain(axes[k, 1], '', 2)} × {plain(axes[k, 0], '', 2)}",
             "direction": lambda k: f"{direction[k]:.0f}°",
             "bias mm": lambda k: f"{np.linalg.norm(mc.mean_error[k]):.2f}",
         },

@@ -39,7 +39,12 @@ from thermocald.photogrammetry.linalg import (
     unit_diagonal,
 )
 from thermocald.photogrammetry.series.covariances import pose_equations
-from thermocald.photogrammetry.series.jumps import SIDE, estimate_steps, find_jumps
+from thermocald.photogrammetry.series.jumps import (
+    SIDE,
+    estimate_steps,
+    find_jumps,
+    perspective_drift,
+)
 from thermocald.photogrammetry.series.target_noise import slow_course
 
 if TYPE_CHECKING:
@@ -251,7 +256,8 @@ class Movement:
     noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
     first epoch after each jump of the mean pose; steps: the jumps, each with the course (E,) of a
     unit step about its mean, the step (6,) and its covariance (6, 6); hidden (6, 6): covariance of
-    a step in a gap that shows none.
+    a step in a gap that shows none; drift (6, 6): mean square of a drift that the perspectives of
+    all epochs show together.
     """
 
     white: Array
@@ -261,6 +267,7 @@ class Movement:
     jumps: tuple[int, ...] = ()
     steps: tuple[tuple[Array, Array, Array], ...] = ()
     hidden: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    drift: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def shifts(self) -> Array:
@@ -448,7 +455,7 @@ def estimate_movement(
     )
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
-        first, moved, back @ hidden @ back.T,
+        first, moved, back @ hidden @ back.T, back @ perspective_drift(M, g) @ back.T,
     )  # fmt: skip
 
 

@@ -49,11 +49,7 @@ from thermocald.photogrammetry.series.covariances import (
     typical_sensitivity,
     with_excess,
 )
-from thermocald.photogrammetry.series.estimator import (
-    NOISE_SHOWN,
-    Estimate,
-    SeriesEstimator,
-)
+from thermocald.photogrammetry.series.estimator import NOISE_SHOWN, Estimate, SeriesEstimator
 from thermocald.photogrammetry.series.mount import (
     FEWEST_EPOCHS,
     Movement,

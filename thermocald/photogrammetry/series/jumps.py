@@ -103,7 +103,7 @@ def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[
     return [(found[j], Q[j, :, j]) for j in each[1:]]
 
 
-def perspective_drift(M: Array, g: Array) -> Array:
+def find_drift(M: Array, g: Array) -> Array:
     """Return the mean square (k, k) of the pose's drift about its mean, 0 if not significant.
 
     M (E, k, k), g (E, k): as in `find_jumps`. The drift is a parabola in time, to which the
@@ -117,8 +117,8 @@ def perspective_drift(M: Array, g: Array) -> Array:
     drift, V = (Q @ np.einsum("ea,ei->ai", basis, g).ravel())[k:], Q[k:, k:]
     if _chi2(drift, V) < _DRIFTS:
         return np.zeros((k, k))
-    course = basis[:, 1:] @ drift.reshape(2, k)
-    return course.T @ course / n
+    course: Array = basis[:, 1:] @ drift.reshape(2, k)
+    return np.asarray(course.T @ course / n)
 
 
 def _without_drift(change: Array) -> Array:
@@ -138,8 +138,7 @@ def _is_abrupt(change: Array) -> Mask:
     usual[0], usual[-1] = 2 * change[1] - change[2], 2 * change[-2] - change[-3]
     next_to[1:-1] = np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
     next_to[0], next_to[-1] = np.abs(change[1]), np.abs(change[-2])
-    stands_out: Mask = np.abs(change - usual) > _ABRUPT * next_to
-    return stands_out
+    return np.asarray(np.abs(change - usual) > _ABRUPT * next_to)
 
 
 def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:

@@ -76,8 +76,7 @@ def scaled_solve(N: Array, b: Array, ridge: float = 0.0) -> Array:
 
 def explained(N: Array, b: Array, ridge: float = 0.0) -> Array:
     """Return the χ² that the unknowns explain: bᵀN⁻¹b, for N and b as in `scaled_solve`."""
-    total: Array = np.sum(b * scaled_solve(N, b, ridge), axis=-1 if b.ndim < N.ndim else -2)
-    return total
+    return np.asarray(np.sum(b * scaled_solve(N, b, ridge), axis=-1 if b.ndim < N.ndim else -2))
 
 
 def eliminate(N: Array, b: Array, kept: int) -> tuple[Array, Array]:
@@ -100,8 +99,7 @@ def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, Mask
 
 def best_level(N: Array, b: Array) -> Array:
     """Return the values (p,) that fit the normal equations (E, p, p), (E, p) of all epochs best."""
-    level: Array = np.linalg.lstsq(N.sum(axis=0), b.sum(axis=0), rcond=1e-12)[0]
-    return level
+    return np.asarray(np.linalg.lstsq(N.sum(axis=0), b.sum(axis=0), rcond=1e-12)[0])
 
 
 def subtract_level(N: Array, b: Array) -> Array:
@@ -169,8 +167,7 @@ def root_of(Q: Array) -> Array:
 def symmetric_power(Q: Array, exponent: float, floor: float = 0.0) -> Array:
     """Return a power of one symmetric matrix (p, p), its eigenvalues raised to at least `floor`."""
     values, vectors = np.linalg.eigh(Q)
-    power: Array = (vectors * np.clip(values, floor, None) ** exponent) @ vectors.T
-    return power
+    return np.asarray((vectors * np.clip(values, floor, None) ** exponent) @ vectors.T)
 
 
 def correlations(covariances: Array) -> Array:

@@ -308,8 +308,7 @@ class OnlineFilter:
     @property
     def rates(self) -> Array:
         """Rates (3,) of c, x0, y0, mm/K."""
-        result: Array = (self._x * self._scale)[len(self._free) :]
-        return result
+        return np.asarray((self._x * self._scale)[len(self._free) :])
 
     @property
     def rates_covariance(self) -> Array:

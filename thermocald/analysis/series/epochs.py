@@ -156,8 +156,7 @@ class Epochs(Result):
         course, variances = self.slow_errors
         ends = np.flatnonzero(self.ok)[[0, -1]] if self.ok.any() else [0, 0]
         first, last = course[:, ends].T
-        out: Array = -2.0 * (first * last) @ variances
-        return out
+        return np.asarray(-2.0 * (first * last) @ variances)
 
     @property
     def time(self) -> NDArray[np.datetime64]:

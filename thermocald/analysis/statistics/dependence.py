@@ -307,8 +307,9 @@ def pearson_matrix(columns: Sequence[Array]) -> Array:
     """
     k = len(columns)
     matrix = np.full((k, k), np.nan)
+    finite = [np.isfinite(column) for column in columns]
     for i, j in combinations_with_replacement(range(k), 2):
-        both = np.isfinite(columns[i]) & np.isfinite(columns[j])
+        both = finite[i] & finite[j]
         a, b = columns[i][both], columns[j][both]
         if len(a) > 2 and np.ptp(a) > 0 and np.ptp(b) > 0:
             matrix[i, j] = matrix[j, i] = _pearson(a - a.mean(), b - b.mean())

@@ -191,8 +191,7 @@ def _posterior(prior: Array, information: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(prior), 1e-300))
     p, n = prior / np.outer(scale, scale), information * np.outer(scale, scale)
     found = np.linalg.solve(np.eye(len(p)) + p @ n, p) * np.outer(scale, scale)
-    symmetric: Array = (found + found.T) / 2
-    return symmetric
+    return np.asarray((found + found.T) / 2)
 
 
 def _shrunk_correlation(standard: Array) -> tuple[Array, Array]:

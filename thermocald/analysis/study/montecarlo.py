@@ -27,11 +27,7 @@ from thermocald.analysis.camera.undistortion import ideal_points, image_grid, so
 from thermocald.analysis.statistics.dependence import pearson_matrix
 from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
-    image_to_mm,
-    partials,
-)
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, image_to_mm, partials
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -246,10 +242,7 @@ class Trajectory:
 
 
 def trajectories(
-    series: Sequence[MeasuredSeries],
-    distance_mm: float,
-    size: int,
-    clusters_mm: Sequence[float],
+    series: Sequence[MeasuredSeries], distance_mm: float, size: int, clusters_mm: Sequence[float]
 ) -> tuple[Trajectory, ...]:
     """Compare one camera's epochs with its first, mean and last interior orientation.
 

@@ -49,11 +49,7 @@ from thermocald.photogrammetry.series.covariances import (
     typical_sensitivity,
     with_excess,
 )
-from thermocald.photogrammetry.series.estimator import (
-    NOISE_SHOWN,
-    Estimate,
-    SeriesEstimator,
-)
+from thermocald.photogrammetry.series.estimator import NOISE_SHOWN, Estimate, SeriesEstimator
 from thermocald.photogrammetry.series.mount import (
     FEWEST_EPOCHS,
     Movement,
@@ -111,6 +107,11 @@ def choose_exterior(
         hidden = 2.0 * image_px(movement.hidden, A)
         where = "between the sampled epochs" if series.windows else "in a gap"
         doubt = f"; {where} it may have moved by up to {hidden:.1g} px unnoticed"
+    if (drift := image_px(movement.drift, A)) > 2.0 * px:
+        doubt += (
+            f"; but over the series the perspective changes as if it drifted by {drift:.1g} px, "
+            "which counts as the camera's: compare --exterior per_epoch"
+        )
     if movement.still and asked == "auto":
         noise = image_px(movement.noise, A)
         why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px){doubt}"

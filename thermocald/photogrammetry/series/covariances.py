@@ -72,8 +72,7 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
 def scaled_covariances(Q: Array, system: SeriesSystem, unit: Array, pooled: float) -> Array:
     """Scale cofactors (E, p, p) by the epochs' variances (E,), the priors' part by the series'."""
     bound = system.Q @ system.design.own_prior @ system.Q
-    covariances: Array = (Q - bound) * unit[:, None, None] + pooled * bound
-    return covariances
+    return np.asarray((Q - bound) * unit[:, None, None] + pooled * bound)
 
 
 def with_excess(covariance: Array, excess: Array) -> Array:
@@ -156,8 +155,7 @@ def typical_sensitivity(system: SeriesSystem) -> Array:
     design = system.design
     N = system.N[system.good].mean(axis=0)
     Q, _ = cofactors((N[design.own[:, None], design.own] + design.own_prior)[None])
-    sensitivity: Array = Q[0] @ N[design.own[:, None], EOP_COLUMNS]
-    return sensitivity
+    return np.asarray(Q[0] @ N[design.own[:, None], EOP_COLUMNS])
 
 
 def perspective_cofactor_roots(system: SeriesSystem) -> Array:
@@ -237,8 +235,7 @@ def estimate_held_affinity(
 
 
 def _normals(A: Array, W: Array) -> Array:
-    N: Array = np.einsum("tki,tkl,tlj->ij", A, W, A, optimize=True)
-    return N
+    return np.asarray(np.einsum("tki,tkl,tlj->ij", A, W, A, optimize=True))
 
 
 def _full(weights: Array) -> Array:

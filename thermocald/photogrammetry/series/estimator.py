@@ -199,8 +199,7 @@ class SeriesEstimator:
         predicted = project(self.sensor, values[IOP], values[EOP], self.testfield.points)
         size = np.linalg.norm(self.grid.points - predicted, axis=2)
         usual = median_known(np.where(use, size, np.nan).T)
-        near: Mask = size < _FAR * np.fmax(usual, 1.0)[:, None]
-        return near
+        return np.asarray(size < _FAR * np.fmax(usual, 1.0)[:, None])
 
     @property
     def has_offsets(self) -> bool:

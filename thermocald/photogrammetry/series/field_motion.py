@@ -212,15 +212,13 @@ def _find_masked(s: FieldSeries, most: int) -> list[int]:
 
 def _often_seen(s: FieldSeries) -> Mask:
     """Return a mask (T,) of the targets seen in enough epochs to show a wander."""
-    out: Mask = s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times))
-    return out
+    return np.asarray(s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times)))
 
 
 def _slow_power(s: FieldSeries) -> Array:
     """Return χ² (T,) of each target's slow residuals."""
     v = np.nan_to_num(s.residuals) * np.sqrt(s.w)
-    out: Array = np.sum(np.tensordot(cosines(s.times), v, 1) ** 2, axis=(0, 2))
-    return out
+    return np.asarray(np.sum(np.tensordot(cosines(s.times), v, 1) ** 2, axis=(0, 2)))
 
 
 def _own_power(s: FieldSeries, w: Array, included: bool) -> Array:
@@ -239,8 +237,7 @@ def _own_power(s: FieldSeries, w: Array, included: bool) -> Array:
     level = np.nan_to_num(s.residuals).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, s.residuals - level, 0.0) * root
     slow = np.einsum("jtk,tkl->jtl", np.tensordot(cosines(s.times), v, 1), vectors)
-    out: Array = np.sum(slow**2 / np.maximum(values, _LEAST_FREE), axis=(0, 2))
-    return out
+    return np.asarray(np.sum(slow**2 / np.maximum(values, _LEAST_FREE), axis=(0, 2)))
 
 
 def _usual_limits(s: FieldSeries, power: Array, there: Mask) -> Array:
@@ -254,8 +251,7 @@ def _usual_limits(s: FieldSeries, power: Array, there: Mask) -> Array:
 def _slow_movement(s: FieldSeries, row: int) -> Array:
     """Return the slow part (E, 2) px of a target's residuals."""
     slow = cosines(s.times)
-    out: Array = slow.T @ np.einsum("je,ek->jk", slow, np.nan_to_num(s.residuals[:, row]))
-    return out
+    return np.asarray(slow.T @ np.einsum("je,ek->jk", slow, np.nan_to_num(s.residuals[:, row])))
 
 
 def _size_px(smooth: Array) -> float:
@@ -417,8 +413,7 @@ def _rigid(s: FieldSeries, rows: Index) -> Array:
     """Return ∂ image points / ∂ shifts, rotations (2k, 6), px/mm; rotations at the board's size."""
     X = s.points[rows] - s.points[rows].mean(axis=0)
     X /= max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
-    out: Array = (s.B[rows] @ rigid_motion(X)).reshape(-1, 6)
-    return out
+    return np.asarray((s.B[rows] @ rigid_motion(X)).reshape(-1, 6))
 
 
 def _board_equations(s: FieldSeries, rows: Index, rigid: Array) -> tuple[Array, Array]:

@@ -23,13 +23,15 @@ if TYPE_CHECKING:
     """A step (k,) of the pose and the weights (k,) of what is known of it."""
 
 
-_LARGE = 6.0  # robust standard deviations of the change between neighbours; noise reaches 3.6
+_LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
+_CERTAIN = 6.0  # standard deviations of the step by the epochs around
 _LASTING = 0.5  # share of the change that must remain
 SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
 _ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from both
 _LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
 _EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
+_DRIFTS = 39.1  # χ² with 12 degrees of freedom, exceeded by chance in one of 10,000 series
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
 
 
@@ -71,7 +73,8 @@ def find_jumps(
         examined.add(row)
         step, factor = _step(left, row)
         lasting = _step(left, row, 1)[0][column]  # a spike is no jump
-        if abs(lasting) < _LASTING * abs(change[worst, column]):
+        certain = abs(step[column]) > _CERTAIN * noise[worst, column] * np.sqrt(factor / 2)
+        if not certain or abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
         if jump := _find_mover(row, step, factor * noise[worst] ** 2 / 2, M, g):
@@ -100,6 +103,24 @@ def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[
     return [(found[j], Q[j, :, j]) for j in each[1:]]
 
 
+def find_drift(M: Array, g: Array) -> Array:
+    """Return the mean square (k, k) of the pose's drift about its mean, 0 if not significant.
+
+    M (E, k, k), g (E, k): as in `find_jumps`. The drift is a parabola in time, to which the
+    perspectives of all epochs together are far more sensitive than that of a single one.
+    """
+    n, k = g.shape
+    u = np.linspace(-1.0, 1.0, n)
+    basis = np.polynomial.legendre.legvander(u, 2)
+    N = np.einsum("ea,eb,eij->aibj", basis, basis, M).reshape(3 * k, 3 * k)
+    Q = inverse_of_determined(N)
+    drift, V = (Q @ np.einsum("ea,ei->ai", basis, g).ravel())[k:], Q[k:, k:]
+    if _chi2(drift, V) < _DRIFTS:
+        return np.zeros((k, k))
+    course: Array = basis[:, 1:] @ drift.reshape(2, k)
+    return np.asarray(course.T @ course / n)
+
+
 def _without_drift(change: Array) -> Array:
     """Return changes (E - 1, k) between neighbours less the median of those around."""
     padded = np.pad(change, ((SIDE, SIDE), (0, 0)), mode="edge")
@@ -117,8 +138,7 @@ def _is_abrupt(change: Array) -> Mask:
     usual[0], usual[-1] = 2 * change[1] - change[2], 2 * change[-2] - change[-3]
     next_to[1:-1] = np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
     next_to[0], next_to[-1] = np.abs(change[1]), np.abs(change[-2])
-    stands_out: Mask = np.abs(change - usual) > _ABRUPT * next_to
-    return stands_out
+    return np.asarray(np.abs(change - usual) > _ABRUPT * next_to)
 
 
 def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:

@@ -39,7 +39,7 @@ from thermocald.photogrammetry.linalg import (
     unit_diagonal,
 )
 from thermocald.photogrammetry.series.covariances import pose_equations
-from thermocald.photogrammetry.series.jumps import SIDE, estimate_steps, find_jumps
+from thermocald.photogrammetry.series.jumps import SIDE, estimate_steps, find_drift, find_jumps
 from thermocald.photogrammetry.series.target_noise import slow_course
 
 if TYPE_CHECKING:
@@ -123,8 +123,7 @@ def _drift(omega: Array, period: float) -> Array:
     """
     x = 2.0 - 2.0 * np.cos(omega)
     if not period:
-        walk: Array = (x[0] / x) ** 2
-        return walk
+        return np.asarray((x[0] / x) ** 2)
     fast = 2.0 - 2.0 * np.cos(2.0 * np.pi / period)
     shape: Array = 1.0 / (x * (1.0 + (x / fast) ** 2)) ** 2
     shape /= shape.max()
@@ -144,8 +143,7 @@ def _level_ends(trajectory: Array) -> Array:
     first = 2 * (slopes[0] @ trajectory[:m]) * t[0] + slopes[1] @ trajectory[:m]
     last = 2 * (slopes[0] @ trajectory[-m:]) * t[-1] + slopes[1] @ trajectory[-m:]
     u = np.arange(n)[:, None]
-    level: Array = trajectory - first * u - (last - first) * u**2 / (2 * (n - 1))
-    return level
+    return np.asarray(trajectory - first * u - (last - first) * u**2 / (2 * (n - 1)))
 
 
 def _remove_drift(coefficients: Array, low: int) -> Array:
@@ -199,8 +197,7 @@ def _likelihood(coefficients: Array, low: int) -> Array:
     last = np.clip((at * np.sqrt(2.0)).astype(int) - low, 8, m)
     first = np.clip((at / np.sqrt(2.0)).astype(int) - low - 1, 0, last - 8)
     mean = (sums[..., last, :] - sums[..., first, :]) / (last - first)[:, None]
-    likelihood: Array = -0.5 * np.log(np.maximum(mean, 1.0)).sum(axis=(-1, -2))
-    return likelihood
+    return np.asarray(-0.5 * np.log(np.maximum(mean, 1.0)).sum(axis=(-1, -2)))
 
 
 def _cosines(trajectory: Array) -> Array:
@@ -209,8 +206,7 @@ def _cosines(trajectory: Array) -> Array:
     even = np.concatenate([trajectory, trajectory[::-1]])
     spectrum = np.fft.rfft(even, axis=0)[1:n]
     turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
-    coefficients: Array = (spectrum * turn).real / np.sqrt(2 * n)
-    return coefficients
+    return np.asarray((spectrum * turn).real / np.sqrt(2 * n))
 
 
 def _fit(power: Array, shapes: Array) -> tuple[Array, Array]:
@@ -251,7 +247,8 @@ class Movement:
     noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
     first epoch after each jump of the mean pose; steps: the jumps, each with the course (E,) of a
     unit step about its mean, the step (6,) and its covariance (6, 6); hidden (6, 6): covariance of
-    a step in a gap that shows none.
+    a step in a gap that shows none; drift (6, 6): mean square of a drift that the perspectives of
+    all epochs show together.
     """
 
     white: Array
@@ -261,6 +258,7 @@ class Movement:
     jumps: tuple[int, ...] = ()
     steps: tuple[tuple[Array, Array, Array], ...] = ()
     hidden: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    drift: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def shifts(self) -> Array:
@@ -448,7 +446,7 @@ def estimate_movement(
     )
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
-        first, moved, back @ hidden @ back.T,
+        first, moved, back @ hidden @ back.T, back @ find_drift(M, g) @ back.T,
     )  # fmt: skip
 
 
@@ -510,8 +508,7 @@ def _hidden(N: Array, own: Index, root: Array) -> Array:
     usual = N.mean(axis=0)
     Q, _ = stacked_inverses(usual[None, own[:, None], own])
     looks = np.linalg.solve(root.T, usual[EOP_COLUMNS[:, None], own])
-    hidden: Array = looks @ Q[0] @ looks.T
-    return hidden
+    return np.asarray(looks @ Q[0] @ looks.T)
 
 
 def _separate(

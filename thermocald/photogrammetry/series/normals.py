@@ -146,8 +146,7 @@ class ObservationGrid:
 
 def inverses_of(xx: Array, yy: Array, xy: Array) -> Array:
     """Invert covariances of image points (n,); return the weights (n, 3) xx, yy, xy."""
-    weights: Array = np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
-    return weights
+    return np.asarray(np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None])
 
 
 def _of_planes(points: Array, weights: Array) -> ObservationGrid:

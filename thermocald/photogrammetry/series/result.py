@@ -14,10 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import (
-    EOP_COLUMNS,
-    free_columns,
-)
+from thermocald.photogrammetry.camera.camera_model import EOP_COLUMNS, free_columns
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.series.mount import STILL, Movement
 
@@ -229,5 +226,4 @@ class SeriesAdjustment:
 def enough_targets(grid: ObservationGrid, s: SeriesSettings) -> Mask:
     """Return a mask (E,) of the epochs with enough targets for their own parameters."""
     count = 2 * grid.observed.sum(axis=1) - s.carried
-    enough: Mask = count >= s.bounds.minimum_redundancy
-    return enough
+    return np.asarray(count >= s.bounds.minimum_redundancy)

@@ -147,9 +147,7 @@ def correlated_pairs(
             right.append(columns[j])
             covariances.append(covariance[i, j])
     return CorrelatedPairs(
-        np.concatenate(left),
-        np.concatenate(right),
-        np.concatenate(covariances) / redundancy_share,
+        np.concatenate(left), np.concatenate(right), np.concatenate(covariances) / redundancy_share
     )
 
 

@@ -29,7 +29,7 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("replya", "M1"), "error: no such command 'replya'"),
+        (("replya", "M1"), r"error: no such command 'replya'. Did you mean 'replay'\? See 'thermo"),
         (("replay",), r"error: missing argument '(?i:recording)'; see 'thermocald replay --help'"),
         (("replay", "M1", "M1"), "see 'thermocald replay --help'"),
         (("study", "M1", "--distance", "-3"), "error: .*--distance"),

@@ -127,17 +127,17 @@ def main() -> None:
 
 def _print_usage_error(error: Any) -> int:
     """Print a usage error in one line, or the help for a group without a command."""
-    status: int = error.exit_code
     command = "thermocald" if error.ctx is None else error.ctx.command_path
     message = error.format_message()
     if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
-        return status
+        return int(error.exit_code)
     message = message[0].lower() + message[1:]
     named = r"^invalid value for '([^']+)'(?: / '[^']+')*: (?:Input )?"
     message = re.sub(named, r"\1: ", message)
-    say(f"error: {' '.join(message.split()).rstrip('.')}; see '{command} --help'")
-    return status
+    text = f"{' '.join(message.split()).rstrip('.')}; see '{command} --help'"
+    say(f"error: {text.replace('?; see', '? See')}")  # Did you mean …?
+    return int(error.exit_code)
 
 
 def _prepare_process() -> None:

@@ -110,13 +110,9 @@ class _Connection(H11Protocol):
     def _watch(self) -> None:
         now = self.loop.time()
         answering = self.cycle is not None and not self.cycle.response_complete
-        if answering:
-            limit = _STUCK_S
-            if not self.flow.write_paused:
-                self._progress_at = now
-        else:
-            limit = _REQUEST_S
-        if now - self._progress_at > limit:
+        if answering and not self.flow.write_paused:
+            self._progress_at = now
+        if now - self._progress_at > (_STUCK_S if answering else _REQUEST_S):
             self.transport.abort()
             return
         self._watching = self.loop.call_later(_LOOK_EVERY_S, self._watch)

@@ -456,15 +456,13 @@ def study_document(study: Study) -> dict[str, Any]:
 
 
 def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
-    correlations = None
-    if camera.correlations is not None:
-        correlations = {"parameters": IOP_NAMES, **jsonable(camera.correlations)}
+    correlations = jsonable(camera.correlations)
     return {
         "label": camera.label,
         "series": [_series(one, distance_mm) for one in camera.series],
         "interior_orientation": dict(zip(IOP_NAMES, camera.iop.tolist(), strict=True)),
         "sd_over_time": dict(zip(IOP_NAMES, camera.sds.tolist(), strict=True)),
-        "iop_correlations": correlations,
+        "iop_correlations": correlations and {"parameters": IOP_NAMES, **correlations},
         "correlations_over_time": {"parameters": IOP_NAMES, "r": camera.over_time},
         "object_space": _object_space(camera),
         "trajectory": camera.trajectories,

@@ -51,7 +51,7 @@ _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 # A file of text or Parquet of this size (a day of 150 targets every 10 s) is read in parts.
 LONG_FROM_BYTES = 100_000_000
 _ROWS = 1 << 18
-_TEXT_BLOCK = 1 << 24  # bytes of text that pyarrow parses at a time
+_TEXT_BLOCK = 1 << 23  # bytes of text that pyarrow parses at a time
 _KEPT_DAYS = 14.0  # since a copy was last read
 
 log = logging.getLogger(__name__)

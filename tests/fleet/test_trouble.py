@@ -16,7 +16,14 @@ import psycopg
 
 from tests.fleet.conftest import address, count, execute, new_cluster
 from thermocald.cli.server import find_series_tasks
-from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
+from thermocald.errors import (
+    RecordingError,
+    ServerError,
+    ServerGone,
+    StoreError,
+    StoreVersionError,
+    TestFieldError,
+)
 from thermocald.fleet.forward import Forwarder
 from thermocald.store.database.store import Store
 from thermocald.store.server.connection import ServerAddress, create_tables, grant
@@ -55,6 +62,24 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
     if "/" not in evil:
         (task,) = find_series_tasks([base], tmp_path / "out", "discover")
         assert task[1].parent == tmp_path / "out"
+
+
+def test_what_is_wrong_with_a_series_names_the_server_as_it_was_given(filled, server):
+    """As a path, the address had lost a slash."""
+    store, _ = filled
+    Forwarder(store.path, address(server), "bank").send_waiting()
+    where = f"^postgresql://owner@127.0.0.1:{server.port}/thermocald, "
+    execute(server, "UPDATE testfield SET csv = replace(csv, 'target,', 'target,x,')")
+    with (
+        ServerStore(address(server)) as there,
+        pytest.raises(TestFieldError, match=where + "line"),
+    ):
+        there.all_series()
+    execute(server, "UPDATE series SET head = replace(head, 'interval\": ', 'interval\": -')")
+    with ServerStore(address(server)) as there, pytest.raises(RecordingError, match=where + "key"):
+        there.all_series()
+    with FleetReader(address(server)) as fleet, pytest.raises(RecordingError, match=where + "key"):
+        fleet.cameras(2e9)
 
 
 def test_a_newer_server_is_told_from_an_older_one(filled, server):

@@ -246,7 +246,7 @@ def test_units_and_orders_that_are_said_are_used(tmp_path):
     june = logged(tmp_path, american, date_order="mdy").times[0]
     july = logged(tmp_path, american, date_order="dmy").times[0]
     assert july - june == 29 * 86400
-    lost = logged(tmp_path, b"time,temp\n2026-06-14 12:00,-127\n2026-06-14 12:01,21\n")
+    lost = logged(tmp_path, b"time,temp\n2026-06-14 12:00,-196.6\n2026-06-14 12:01,21\n")
     assert np.isnan(lost.channels["temp"][0])
 
 
@@ -454,6 +454,9 @@ PROGRAMS = {
     "days of a spreadsheet": (
         ["Datum;T °C"],
         lambda m, t, i: f"{(m.timestamp() / 86400 + 25569):.5f};{t:.2f}".replace(".", ",")),
+    "a remark between the rows": (
+        ["time,T °C"],
+        lambda m, t, i: "# battery changed\r\n" * (i == 6) + f"{int(m.timestamp())},{t:.2f}"),
     "least, most and mean": (
         ["time,T max °C,T min °C,T avg °C"],
         lambda m, t, i: f"{int(m.timestamp())},{t + 0.5:.2f},{t - 0.5:.2f},{t:.2f}"),
@@ -506,10 +509,12 @@ def test_another_head_below_is_refused(tmp_path, head):
     assert len(found.times) == 27
 
 
-def test_a_row_that_is_cut_off_is_left_out(tmp_path):
+@pytest.mark.parametrize("lost", [5, 12])
+def test_a_row_that_is_cut_off_is_left_out(tmp_path, lost):
+    """A logger is writing the row: of 22.60 is left 22, or of the time a part."""
     path = tmp_path / "log.csv"
     read(tmp_path, ["time,T °C"], lambda m, t, i: f"{int(m.timestamp())},{t:.2f}")
-    path.write_bytes(path.read_bytes()[:-5])  # of 22.60 is left 22
+    path.write_bytes(path.read_bytes()[:-lost])
     found = read_log(path)
     assert found.times.tolist() == [m.timestamp() for m in MOMENTS[:-1]]
     assert "the last row is cut off" in found.notes[-1]

@@ -225,24 +225,6 @@ def select_epochs(
         yield from latest_epochs(rows, partial(read_details, connection) if details else None)
 
 
-def select_observations(
-    connection: sqlite3.Connection, series: int, first: int, last: int
-) -> Iterator[tuple[int, Observations]]:
-    """Yield number and observations of each measurement of epochs `first` to `last`, oldest first.
-
-    The epochs' other columns are not read, which halves the time. Raises DamageError.
-    """
-    names = ("id", "number", "detail_checksum")
-    found = connection.execute(
-        f"SELECT {', '.join(names)} FROM epoch WHERE series_id = ? AND number BETWEEN ? AND ? "
-        "AND measured IS NOT NULL ORDER BY number, revision",
-        (series, first, last),
-    ).fetchall()
-    for values in found:
-        row = dict(zip(names, values, strict=True))
-        yield row["number"], unpack_observations(read_details(connection, row)[1])
-
-
 def read_details(connection: sqlite3.Connection, row: Mapping[str, Any]) -> tuple[bytes, bytes]:
     """Read the packed covariance and observations of a row, empty if it has none.
 

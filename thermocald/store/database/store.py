@@ -160,8 +160,16 @@ class Store(SeriesReader):
             )  # fmt: skip
 
     def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
+        names = ("id", "number", "detail_checksum")  # half the time of reading whole rows
         with self._reads("observations") as connection:
-            return dict(epochs.select_observations(connection, series.id, first, last))
+            found = connection.execute(
+                f"SELECT {', '.join(names)} FROM epoch WHERE series_id = ? AND number BETWEEN ? "
+                "AND ? AND measured IS NOT NULL ORDER BY number, revision",
+                (series.id, first, last),
+            ).fetchall()
+            rows = [dict(zip(names, values, strict=True)) for values in found]
+            packed = {row["number"]: epochs.read_details(connection, row)[1] for row in rows}
+            return {number: epochs.unpack_observations(seen) for number, seen in packed.items()}
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         result = np.full((len(numbers), 16, 16), np.nan)

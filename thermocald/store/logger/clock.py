@@ -247,8 +247,9 @@ def parse_serial(text: str) -> datetime:
 
     Five decimals, as a cell shows, give the second; eight give the millisecond.
     """
-    decimals = len(text.replace(",", ".").partition(".")[2])
-    seconds = round(float(text.replace(",", ".")) * 86400.0, 3 if decimals >= 8 else None)
+    if not _SERIAL.fullmatch(text):
+        raise ValueError(f"{text[:40]!r} is no number of days")
+    seconds = round(float(text.replace(",", ".")) * 86400.0, 3 if len(text) >= 14 else None)
     return datetime(1899, 12, 30) + timedelta(seconds=seconds)
 
 
@@ -258,8 +259,9 @@ def are_serials(texts: Sequence[str]) -> bool:
     Seconds since a start would have to pass that range at 100 readings a second.
     """
     days = [float(t.replace(",", ".")) for t in texts if _SERIAL.fullmatch(t)]
-    in_range = len(days) > 0.8 * len(texts) and min(days) > 40179 and max(days) < 54789
-    return in_range and 0.0 < float(np.median(np.abs(np.diff(days or [0.0, 0.0])))) < 0.0105
+    if len(days) <= max(1, 0.8 * len(texts)) or min(days) < 40179 or max(days) > 54789:
+        return False
+    return 0.0 < float(np.median(np.abs(np.diff(days)))) < 0.0105
 
 
 def whole_seconds(number: float) -> float:

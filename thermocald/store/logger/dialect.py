@@ -198,7 +198,8 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
     for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
         row, next_row = start[i][1], start[i + 1][1]
         named = row not in head and not _is_data(row) and any(map(TIME_NAME.search, row))
-        if named and _is_data(next_row):
+        # a remark (`# battery changed`) fills one field
+        if named and sum(map(bool, row)) > 1 and _is_data(next_row):
             head, first = [row], i + 1
     names = _column_names(head, width)
     rows = tuple(tuple(_fit_width(row, len(names))) for _, row in start[first:] + last)
@@ -215,8 +216,10 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
 
 
 def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
-    """Return whether the last number of the last row has fewer decimals than any above it."""
-    column = max(i for i, field in enumerate(rows[-1]) if field)
+    """Return whether the last row has fewer fields, or its last number fewer decimals, than any."""
+    *ends, column = (max((i for i, field in enumerate(row) if field), default=0) for row in rows)
+    if column < min(ends, default=0):
+        return True
     *others, last = (len(row[column].partition(decimal)[2]) for row in rows if row[column])
     return last < min(others, default=0)
 

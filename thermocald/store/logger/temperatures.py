@@ -63,7 +63,10 @@ _LABEL = "entity_id"
 _CHANGES = "last_changed"
 """Home Assistant's column of times: it writes a row when the value changes, and only then."""
 _PAUSE, _LONGEST_PAUSE_S = 5.0, 86400.0  # of the usual interval: a longer one is a pause
-_NO_READING = {-127.0, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 9999.0}
+_NO_READING = {
+    -127.0, -196.6, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 3276.7, 9999.0, 9999.99,
+}  # fmt: skip
+"""Numbers that stand for none: -196.6 is the -127 of the DS18B20 in °F, 3276.7 a full register."""
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
@@ -232,7 +235,8 @@ class _Table:
         text = " ".join(row).strip()
         named = any(TIME_NAME.search(row[place]) for place in self._places)
         above = any(line.startswith(text) for line in self.file.above)
-        return named and not above and not re.search(r"\d:\d\d", text)
+        several = sum(map(bool, row)) > 1  # a remark fills one
+        return named and several and not above and not re.search(r"\d:\d\d", text)
 
     def where(self, row: int) -> str:
         """Return a row's place in the file for messages."""

@@ -51,7 +51,7 @@ _GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 # A file of text or Parquet of this size (a day of 150 targets every 10 s) is read in parts.
 LONG_FROM_BYTES = 100_000_000
 _ROWS = 1 << 18
-_TEXT_BLOCK = 1 << 24  # bytes of text that pyarrow parses at a time
+_TEXT_BLOCK = 1 << 23  # bytes of text that pyarrow parses at a time
 _KEPT_DAYS = 14.0  # since a copy was last read
 
 log = logging.getLogger(__name__)
@@ -321,7 +321,8 @@ class ColumnChunk(Chunk):
         self._size = len(batch)
 
     def text(self, name: str) -> tuple[str, ...]:
-        return tuple("" if v is None else str(v) for v in self._batch.column(name).to_pylist())
+        words, rows = self._encoded(name)
+        return tuple(map([*words, ""].__getitem__, rows.tolist()))
 
     def numbers(self, name: str, *, empty_is_nan: bool = False) -> Array:
         column = self._batch.column(name)
@@ -340,12 +341,17 @@ class ColumnChunk(Chunk):
         return bool(types.is_floating(kind) or types.is_integer(kind))
 
     def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:
-        encoded = self._batch.column(name).dictionary_encode()
-        known = [index.get(str(word), -1) for word in encoded.dictionary.to_pylist()]
-        # the indices of other programs may be unsigned
-        rows = encoded.indices.cast(_pyarrow().int64()).fill_null(-1).to_numpy()
+        words, rows = self._encoded(name)
+        known = [index.get(word, -1) for word in words]
         found: NDArray[np.int64] = np.array([*known, -1], dtype=np.int64)[rows]
         return found
+
+    def _encoded(self, name: str) -> tuple[list[str], NDArray[np.int64]]:
+        """Return the words of a column, and each row's place among them, -1 if it is empty."""
+        encoded = self._batch.column(name).dictionary_encode()
+        words = ["" if word is None else str(word) for word in encoded.dictionary.to_pylist()]
+        # the indices of other programs may be unsigned
+        return words, encoded.indices.cast(_pyarrow().int64()).fill_null(-1).to_numpy()
 
 
 def _parse_once(table: Table) -> Table:

@@ -272,14 +272,11 @@ class ServerWriter(Connected):
         from psycopg import RawCursor
 
         columns = ", ".join(f'"{name}"' for name in rows[0])
-        width = len(rows[0])
-        places = (
-            ", ".join(f"${i}" for i in range(first, first + width))
-            for first in range(1, width * len(rows) + 1, width)
-        )
+        places = map("${}".format, range(1, len(rows) * len(rows[0]) + 1))
+        lines = (", ".join(line) for line in zip(*[places] * len(rows[0]), strict=True))
         RawCursor(connection).execute(
             # naming a conflict target would need permission to read
-            f'INSERT INTO "{table}" ({columns}) VALUES ({"), (".join(places)}) '
+            f'INSERT INTO "{table}" ({columns}) VALUES ({"), (".join(lines)}) '
             "ON CONFLICT DO NOTHING",
             [value for row in rows for value in row.values()],
         )

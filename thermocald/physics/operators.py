@@ -148,18 +148,24 @@ def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
 
 def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:  # noqa: ARG001
     """Return the matrix (E, K) of `lag`, without weights older than 14 tau (below 1e-6)."""
-    from scipy.sparse import csr_array, diags_array, eye_array
+    from scipy.sparse import csr_array
 
-    a, old, new = _lag_weights(knots, tau)
-    driven = diags_array([np.append(1.0, new), old], offsets=[0, -1])
+    _, old, new = _lag_weights(knots, tau)
     left, right, decayed, rise = _lag_within(knots, tau, at)
-    own, states = eye_array(len(knots)).tocsr(), (_decay_matrix(a) @ driven).tocsr()
-    parts = ((1.0 - decayed - rise, own[left]), (decayed, states[left]), (rise, own[right]))
-    whole = sum(diags_array(weight) @ rows for weight, rows in parts).tocoo()
-    first = np.searchsorted(knots, knots[left] - _LAG_CUT * tau) - 1
-    kept = whole.col >= first[whole.row]
-    place = whole.row[kept], whole.col[kept]
-    return csr_array((whole.data[kept], place), shape=whole.shape)
+    first = np.maximum(np.searchsorted(knots, knots[left] - _LAG_CUT * tau) - 1, 0)
+    size, shape = left - first + 1, (len(at), len(knots))
+    ends = np.cumsum(size)
+    knot = np.arange(ends[-1]) - np.repeat(ends - size - first, size)
+    kept = np.exp((knots[knot] - np.repeat(knots[left], size)) / tau)
+    kept *= np.repeat(decayed, size)
+    weights = np.append(1.0, new)[knot] * kept
+    kept *= np.append(0.0, old)[knot]  # the share of the knot before
+    kept[ends - size] = 0.0
+    weights[:-1] += kept[1:]
+    states = csr_array((weights, knot, np.append(0, ends)), shape=shape)
+    own = np.concatenate([1.0 - decayed - rise, rise])
+    rows = np.tile(np.arange(len(at)), 2)
+    return states + csr_array((own, (rows, np.concatenate([left, right]))), shape=shape)
 
 
 def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:

@@ -189,12 +189,17 @@ class HypothesisFitter:
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
         """Return the weighting of a series with the covariance for some coefficients."""
-        carried: list[tuple[Array, Array, str]] = []
+        carried: list[tuple[Array, Array, str]] = []  # equal operators once, their directions added
         unresolved: dict[int, tuple[Array, Array]] = {}
         for block, operator, channel in self.list_operators(terms, blocks, series):
             (d,) = block.directions(x)
             if d.any():
-                carried.append((d, operator, channel))
+                for k, (other, known, of) in enumerate(carried):
+                    if of == channel and np.array_equal(known, operator):
+                        carried[k] = (other + d, known, of)
+                        break
+                else:
+                    carried.append((d, operator, channel))
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
         bends = list(unresolved.values())
         return prepare(self.series[series], carried, bends, self.thermometer_factor)

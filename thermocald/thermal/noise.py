@@ -36,6 +36,7 @@ from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import detect_tremble, weight_jumps_down
 from thermocald.thermal.scan import ORDERS
 from thermocald.thermal.series import ReducedSeries, cosines, in_blocks
+from thermocald.thermal.thermometer import CLIPPED_AT, CLIPPED_SD
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -317,8 +318,8 @@ def _estimate_clipped_sd(values: Array) -> float:
     """Estimate the sd of a normal distribution with contaminated tails."""
     scale = float(np.sqrt(np.mean(values**2)))
     for _ in range(20):
-        kept = values[np.abs(values) <= 2.2 * scale]
-        scale = float(np.sqrt(np.mean(kept**2))) / 0.9162 if len(kept) > 5 else scale
+        kept = values[np.abs(values) <= CLIPPED_AT * scale]
+        scale = float(np.sqrt(np.mean(kept**2))) / CLIPPED_SD if len(kept) > 5 else scale
     return scale
 
 

@@ -382,19 +382,17 @@ class ReducedSeries:
 
     def state_sd(self, channel: str) -> Array:
         """Return the standard deviations of the independent errors, K."""
-        instrument = self.thermometers[channel]
-        sd = instrument.sd
+        sd = self.thermometers[channel].sd
         if self.blocks is None:
-            return sd[instrument.erring]
+            return sd[self.thermometers[channel].erring]
         pool = self.blocks.pool  # a state's sd is that of the mean over its knots
         return np.asarray(np.sqrt(pool.T @ sd**2) / pool.sum(axis=0))
 
     def state_deviation(self, channel: str) -> Array:
         """Return the independent errors' part of readings minus smooth trajectory, K."""
-        instrument = self.thermometers[channel]
-        deviation = instrument.deviation
+        deviation = self.thermometers[channel].deviation
         if self.blocks is None:
-            return deviation[instrument.erring]
+            return deviation[self.thermometers[channel].erring]
         pool = self.blocks.pool
         return np.asarray((pool.T @ deviation) / pool.sum(axis=0))
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index
 
+# a normal distribution without what is beyond k sigma, and its sd, √(1 - 2 k φ(k) / (2 Φ(k) - 1))
+CLIPPED_AT, CLIPPED_SD = 2.2, 0.9162
 _SMOOTHING = np.logspace(-1, 5, 19)
 _OFTEN_SHARP = 0.2  # share of sharp intervals above which a sharp bend need not be a kink
 _KINK = 1.5  # times the usual sharp bend, which a kink must then exceed
@@ -213,9 +215,8 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
     kept = np.abs(d) <= 4.0 * spread if spread > 0.0 else np.ones(len(d), dtype=bool)
     scale = 0.0
     for _ in range(20):
-        scale = float(np.sqrt(np.mean(d[kept] ** 2)))
-        scale /= 0.9156  # sd of a standard normal distribution clipped at 2.2 sigma
-        now = np.abs(d) <= max(2.2 * scale, 1e-12)
+        scale = float(np.sqrt(np.mean(d[kept] ** 2))) / CLIPPED_SD
+        now = np.abs(d) <= max(CLIPPED_AT * scale, 1e-12)
         if np.array_equal(now, kept):
             break
         kept = now
@@ -334,7 +335,7 @@ def smooth_channel(
         sharp = np.isin(np.arange(len(t) - 1), index)
         for row in np.flatnonzero(curved):
             points, weights = _weigh_neighbours(t, times[row], sharp)
-            mixing[row, row], mixing[row, knot[points]] = 0.0, weights
+            mixing.rows[row], mixing.data[row] = knot[points].tolist(), weights.tolist()
             trajectory[row] = weights @ smooth[points]
     if len(rows):
         bend, limit = _measure_bends(t, filled, noise)

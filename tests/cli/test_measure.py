@@ -327,7 +327,7 @@ def test_a_click_beside_the_image_accuses_no_other_point(seed):
     beside[1, 0] = 7_000.0
     world.points += beside
     world.field = replace(world.field, points=world.field.points + beside)
-    with pytest.raises(DataError, match="px; correct the click or leave it out$"):
+    with pytest.raises(DataError, match=r"px; correct the click or leave it out$"):
         posed(world, world.seen(20.0), thermal_camera().at(20.0))
 
 

@@ -175,8 +175,8 @@ class ControlPoints:
         x, y = seen.points.T
         size = np.array([camera.sensor.width, camera.sensor.height])
         upright = "turned by 90° they fit: were x, y read in an image that was shown upright?"
-        for turned in ((y, size[1] - 1 - x), (size[0] - 1 - y, x)):
-            changes.append((upright, camera, field, replace(seen, points=np.stack(turned, axis=1))))
+        turned = ((y, size[1] - 1 - x), (size[0] - 1 - y, x))
+        changes += [(upright, camera, field, replace(seen, points=np.array(t).T)) for t in turned]
         for factor in _OTHER_SIZES:
             at, sigmas = (seen.points + 0.5) * factor - 0.5, seen.sigmas * factor
             text = f"times {factor:g} they fit: are x, y of images of {size[0] / factor:g} × "

@@ -89,12 +89,11 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         kind = document["type"]
         lines.append(f"  combined with the type {kind['name']} ({kind['cameras']} cameras)")
     for name, rate in document["rates"].items():
-        shown = with_sd(1e3 * rate["value"], 1e3 * rate.get("sd", math.nan), "µm/K")
-        lines.append(f"  {name:>4}: {shown}")
+        lines.append(f"  {name:>4}: {_shown(rate, 'µm/K', 1e3)}")
     lines += [f"  {doubt}" for doubt in _find_doubtful(document)]
     for effect in document["effects"]:
         parts = [
-            f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"
+            f"{k} = {_shown(v, v['unit'])}"
             for k, v in effect["parameters"].items()
             if isinstance(v, dict)
         ]

@@ -158,6 +158,20 @@ def test_a_missing_effect_is_found_in_the_course_of_a_day(lacks):
         assert sum(drawn(rng, lacks, size).model_misses for _ in range(40)) >= fewest
 
 
+def test_a_knock_is_no_slope_of_the_turns():
+    """The slope of a mount that stood still was 2 to 12 standard deviations off."""
+    rng, off = np.random.default_rng(33), []
+    for _ in range(40):
+        day = drawn(rng, "", 0.0)
+        day.values[1:, :3] = 1e-5 * rng.normal(size=(len(day.times) - 1, 3))
+        day.values[int(rng.integers(4, len(day.times) - 2)) :, :2] += 5e-4
+        slopes, sds = day.per_kelvin
+        off.append(slopes[:2] / sds[:2])
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.9, abs=0.15)
+    at_once = replace(day, temperatures=np.where(day.values[:, 0] > 2.5e-4, 30.0, 20.0))
+    assert "cannot be told from its movements" in str(at_once)
+
+
 def test_a_movement_is_reported_with_its_frame(tmp_path):
     bank, thermal = Bank(11), camera()
     turned = np.array([3e-4, -4e-4, 0.0])

@@ -244,6 +244,7 @@ def test_a_gradient_that_few_kelvin_hardly_show_is_doubted(seed, epochs, power, 
     found = fit_thermal_model([reduced(s)], [NO_GRADIENT])
     poorly = found.fitted.get("read_poorly", {"effects": []})
     assert ("thermal_gradient" in poorly["effects"]) is doubted
+    assert ("values may be wrong by several standard deviations" in found.page()) is doubted
 
 
 def test_correlated_constants_are_reported_by_slope_and_curvature():

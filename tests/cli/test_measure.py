@@ -263,6 +263,8 @@ UNSEEN = {"x": "", "y": ""}
      (lambda _, r: {n: 1000 * float(r[n]) for n in "XYZ"}, "are they in mm?"),
      (lambda i, r: {"x": 4 * float(r["x"])} if i < 6 else UNSEEN, "px, outside the camera's 3280"),
      (lambda _, r: {"x": r["y"], "y": r["x"]}, "X and Y, or x and y, are exchanged"),
+     (lambda _, r: {"x": 2463 - float(r["y"]), "y": r["x"]}, "turned by 90° they fit: were x, y"),
+     (lambda _, r: {n: 0.5 * float(r[n]) for n in ("x", "y", "sx", "sy")}, "of 1640 × 1232 px?"),
      # behind the camera, whose centre is at Y = 312999 m
      (lambda _, r: {"Y": 2 * 312_999.0 - float(r["Y"])}, "or a sign is wrong"),
      (lambda i, _: {"X": 192_000 + i, "Y": 313_020, "Z": 138}, "lie on one line"),
@@ -325,7 +327,7 @@ def test_a_click_beside_the_image_accuses_no_other_point(seed):
     beside[1, 0] = 7_000.0
     world.points += beside
     world.field = replace(world.field, points=world.field.points + beside)
-    with pytest.raises(DataError, match="px; correct the click or leave it out$"):
+    with pytest.raises(DataError, match=r"px; correct the click or leave it out$"):
         posed(world, world.seen(20.0), thermal_camera().at(20.0))
 
 

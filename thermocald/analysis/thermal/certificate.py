@@ -88,35 +88,12 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
     if "type" in document:
         kind = document["type"]
         lines.append(f"  combined with the type {kind['name']} ({kind['cameras']} cameras)")
-        if unseen := [name for name, weight in kind["weights"].items() if weight > _UNSEEN]:
-            lines.append(
-                f"  these recordings show little of {', '.join(unseen)}: value and standard "
-                "deviation are the type's; record the change between two temperatures, too"
-            )
     for name, rate in document["rates"].items():
-        shown = with_sd(1e3 * rate["value"], 1e3 * rate.get("sd", math.nan), "µm/K")
-        lines.append(f"  {name:>4}: {shown}")
-    if hang := document.get("rates_hang_on_c"):
-        lines.append(
-            f"  the field hardly determines c (to {percent(hang['c_known_to'], 2)}), and the rates "
-            "depend on it: they may be wrong by several of their standard deviations; use a field "
-            "with depth, such as three walls that meet"
-        )
-    if seldom := document.get("read_seldom"):
-        lines.append(
-            f"  {', '.join(seldom['effects'])}: how the temperature turns between two readings is "
-            "not known, and times may be wrong by several standard deviations; read the "
-            "thermometer more often"
-        )
-    if poorly := document.get("read_poorly"):
-        lines.append(
-            f"  {', '.join(poorly['effects'])}: the thermometer is too noisy or too coarse for the "
-            "changes between its readings: values may be wrong by several standard deviations; "
-            "use a better thermometer or heat faster"
-        )
+        lines.append(f"  {name:>4}: {_shown(rate, 'µm/K', 1e3)}")
+    lines += [f"  {doubt}" for doubt in _find_doubtful(document)]
     for effect in document["effects"]:
         parts = [
-            f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"
+            f"{k} = {_shown(v, v['unit'])}"
             for k, v in effect["parameters"].items()
             if isinstance(v, dict)
         ]
@@ -141,6 +118,36 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
     ]
     lines += [f"  {line}" for line in doubt_lines(document.get("doubts", ()))]
     return [part for line in lines for part in line.split("\n")]
+
+
+def _find_doubtful(document: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on each number whose standard deviation is not its own, or too small."""
+    said = []
+    weights = document["type"]["weights"] if "type" in document else {}
+    if unseen := [name for name, weight in weights.items() if weight > _UNSEEN]:
+        said.append(
+            f"these recordings show little of {', '.join(unseen)}: value and standard "
+            "deviation are the type's; record the change between two temperatures, too"
+        )
+    if hang := document.get("rates_hang_on_c"):
+        said.append(
+            f"the field hardly determines c (to {percent(hang['c_known_to'], 2)}), and the rates "
+            "depend on it: they may be wrong by several of their standard deviations; use a field "
+            "with depth, such as three walls that meet"
+        )
+    if seldom := document.get("read_seldom"):
+        said.append(
+            f"{', '.join(seldom['effects'])}: how the temperature turns between two readings is "
+            "not known, and times may be wrong by several standard deviations; read the "
+            "thermometer more often"
+        )
+    if poorly := document.get("read_poorly"):
+        said.append(
+            f"{', '.join(poorly['effects'])}: the thermometer is too noisy or too coarse for the "
+            "changes between its readings: values may be wrong by several standard deviations; "
+            "use a better thermometer or heat faster"
+        )
+    return said
 
 
 _DISTANCE_MM = 10_000.0
@@ -180,7 +187,9 @@ def render_certificate(
             )
         ),
         about=(f"{sensor}{f'; fitted to {series}' if series else ''}.",),
-        notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
+        notes=tuple(map(as_sentence, [
+            *_find_doubtful(document), *doubt_lines(document.get("doubts", ()))
+        ])),
     ).page()  # fmt: skip
 
 

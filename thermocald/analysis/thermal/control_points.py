@@ -36,6 +36,7 @@ _LARGEST_EXTENT_MM = 2e6  # it is larger for mm read as metres
 _FITS = 3.0  # largest sigma0 of a pose that fits after mirroring
 _BETTER = 0.5  # largest fraction of sigma0 that a change has to leave
 _OTHER_LENSES = (1.0, 1.3, 0.77, 1.7, 0.6)  # principal distances to try, over the model's
+_OTHER_SIZES = (2.0, 4.0, 0.5)  # of the camera's images over those of the image points
 _EXCHANGED = 20  # points of which each two are exchanged, in search of a mistake
 _ROUND_MM = 1e6  # the origin is rounded to this
 _SURVEYED_MM = 20.0  # a GNSS receiver with corrections, if no standard deviation is given
@@ -171,6 +172,16 @@ class ControlPoints:
             (mirrored, camera, replace(field, points=field.points[:, [1, 0, 2]]), seen),
             (mirrored, camera, field, replace(seen, points=seen.points[:, ::-1])),
         ]
+        x, y = seen.points.T
+        size = np.array([camera.sensor.width, camera.sensor.height])
+        upright = "turned by 90° they fit: were x, y read in an image that was shown upright?"
+        turned = ((y, size[1] - 1 - x), (size[0] - 1 - y, x))
+        changes += [(upright, camera, field, replace(seen, points=np.array(t).T)) for t in turned]
+        for factor in _OTHER_SIZES:
+            at, sigmas = (seen.points + 0.5) * factor - 0.5, seen.sigmas * factor
+            text = f"times {factor:g} they fit: are x, y of images of {size[0] / factor:g} × "
+            text += f"{size[1] / factor:g} px? Give them for {size[0]} × {size[1]} px"
+            changes.append((text, camera, field, replace(seen, points=at, sigmas=sigmas)))
         for i, j in combinations(range(min(n, _EXCHANGED)), 2):
             order = np.arange(n)
             order[[i, j]] = j, i

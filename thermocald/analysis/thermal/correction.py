@@ -100,8 +100,8 @@ def image_corrections(
 ) -> tuple[Maps, Array, list[dict[str, float]]]:
     """Return maps, the values (n, 10) of the images' cameras to resample them with, and a summary.
 
-    The summary of an image holds the shift of a sample of points and its RMS sd, px. Arguments and
-    errors as in `correct_points`.
+    The summary of an image holds the RMS shift and RMS sd of a sample of points, px per coordinate,
+    and the largest shift. Arguments and errors as in `correct_points`.
     """
     steady, along = _predict(camera, log, times, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
@@ -110,12 +110,12 @@ def image_corrections(
     found = []
     for i in range(len(along)):
         now = along[i]
-        shift = np.linalg.norm(steady.as_seen_by(points, now.interior) - points, axis=1)
+        moved = steady.as_seen_by(points, now.interior) - points
         variance = replace(steady, covariance=now.covariance).point_covariance(points)
         found.append({
             "temperature": now.temperature,
-            "rms_correction_px": float(np.sqrt(np.mean(shift**2))),
-            "largest_correction_px": float(shift.max()),
+            "rms_correction_px": float(np.sqrt(np.mean(moved**2))),
+            "largest_correction_px": float(np.linalg.norm(moved, axis=1).max()),
             "rms_left_over_px": float(np.sqrt(np.mean(variance.diagonal(axis1=1, axis2=2)))),
             "extrapolated_K": now.extrapolated,
         })  # fmt: skip

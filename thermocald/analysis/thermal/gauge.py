@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -104,6 +103,8 @@ class Predictor:
         # `at` checks the range of temperature itself, for each epoch and without a warning
         self._free = replace(thermal, model=replace(thermal.model, validity={}))
         self._channels = thermal.channels
+        model = thermal.model  # rays of a grid, which temperature hardly changes
+        self._across = directions(model.sensor, model.interior.as_array(), image_grid(model.sensor))
         self._pair: tuple[LiveCamera, LiveCamera] | None = None
         self._now: tuple[Camera, Camera] | None = None
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
@@ -163,12 +164,6 @@ class Predictor:
         by = partials(camera.sensor, camera.values, np.zeros(6), self._across)[1][..., IOP]
         largest = float(np.linalg.norm(by @ unknown, axis=1).max())
         return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest)
-
-    @cached_property
-    def _across(self) -> Array:
-        """The directions (n, 3) of a grid in the image, which temperature hardly changes."""
-        model = self.thermal.model
-        return directions(model.sensor, model.interior.as_array(), image_grid(model.sensor))
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""

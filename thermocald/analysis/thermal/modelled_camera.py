@@ -148,23 +148,6 @@ def steady_table(
     return table, knees
 
 
-def steady_camera(
-    model: ThermalModel, names: tuple[str, ...], table: tuple[Array, list[float]], T: float
-) -> tuple[Array, Array, Array]:
-    """Return a model's steady camera at T °C: values (10,), slope (10,) per K, derivatives (10, p).
-
-    names, table: as in `steady_table`.
-    """
-    factors, knees = table
-    dT = T - model.T0
-    basis = [1.0, dT, dT * dT]
-    for knee in knees:
-        basis += [max(T - knee, 0.0), float(knee < T)]
-    columns = factors @ np.array(basis)
-    carried = model.carried_derivatives(columns[:, 0], columns[:, 1:], ("slope", *names))
-    return model.carried(columns[:, 0]), carried[:, 0], carried[:, 1:]
-
-
 def predict_orientations(
     model: ThermalModel,
     names: tuple[str, ...],
@@ -189,17 +172,14 @@ def predict_orientations(
             J[:, IOP_NAMES.index(key), i] = 1.0
         elif group == "rates":
             J[:, IOP_NAMES.index(key), i] = drive - model.T0
+        elif catalogue.get(group).is_drive:
+            up, down = (
+                driven[name, sign] if driven else moved_model(model, name, sign).drive(history)
+                for sign in (1.0, -1.0)
+            )
+            J[:, :, i] = ((up - down) / (2.0 * _step(model, name)))[:, None] * model.rate_vector
         else:
-            sides = []
-            for sign in (1.0, -1.0):
-                if driven and catalogue.get(group).is_drive:
-                    sides.append(driven[name, sign][:, None] * model.rate_vector)
-                elif catalogue.get(group).is_drive:
-                    moved = moved_model(model, name, sign).drive(history)
-                    sides.append(moved[:, None] * model.rate_vector)
-                else:
-                    sides.append(moved_model(model, name, sign).influence(group, history))
-            up, down = sides
+            up, down = (moved_model(model, name, s).influence(group, history) for s in (1.0, -1.0))
             J[:, :, i] = (up - down) / (2.0 * _step(model, name))
     carried = model.carried_derivatives(linear, J, ("slope", *names))
     return model.carried(linear), carried[..., 0], carried[..., 1:]

@@ -217,18 +217,23 @@ class SceneCourse(Result):
     def per_kelvin(self) -> tuple[Array, Array]:
         """Slopes (4,) of `values` against the temperature, and their standard deviations.
 
-        From the larger of stated and observed scatter; NaN below four frames or 1 K of change.
+        From the larger of stated and observed scatter; NaN below four frames or 1 K of change. A
+        movement of the camera is a step in its turns; NaN if it cannot be separated from a slope.
         """
-        T = self.temperatures[self.seen]
+        T, rows = self.temperatures[self.seen], np.flatnonzero(self.seen)
+        steps = [(rows >= row).astype(float) for row, _, _ in self.movements if row > rows[0]]
         slopes, sds = np.full(4, np.nan), np.full(4, np.nan)
         if len(T) < 4 or np.ptp(T) < 1.0:
             return slopes, sds
         for k in range(4):
             y, s = self.values[self.seen, k], self.sd[self.seen, k]
-            A = np.column_stack([np.ones(len(T)), T - T.mean()]) / s[:, None]
+            own = steps if k < 3 else []
+            A = np.column_stack([np.ones(len(T)), T - T.mean(), *own]) / s[:, None]
+            if np.linalg.matrix_rank(A) < A.shape[1]:
+                continue
             inverse = np.linalg.inv(A.T @ A)
             x = inverse @ A.T @ (y / s)
-            scatter = float(np.sum((y / s - A @ x) ** 2) / (len(T) - 2))
+            scatter = float(np.sum((y / s - A @ x) ** 2)) / max(len(T) - 2 - len(own), 1)
             ends = 2.0 * self.locked[k] / np.ptp(T)
             slopes[k], sds[k] = x[1], np.hypot(np.sqrt(inverse[1, 1] * max(1.0, scatter)), ends)
         return slopes, sds
@@ -336,7 +341,7 @@ class SceneCourse(Result):
     def lines(self) -> list[str]:
         out = [f"{int(self.seen.sum())} of {len(self.names)} frames follow the reference frame"]
         slopes, sds = self.per_kelvin
-        if np.isfinite(slopes).all():
+        if np.isfinite(slopes[3]):
             verdict = "the model misses an effect"
             if not self.model_misses:
                 verdict = "consistent with the model"
@@ -348,6 +353,8 @@ class SceneCourse(Result):
             out.append(
                 "turn of the mount or shift of the principal point (one station cannot separate "
                 f"them): {px[0]} px per kelvin about x, {px[1]} about y"
+                if np.isfinite(slopes[:2]).all()
+                else "whether the mount turns with temperature cannot be told from its movements"
             )
         else:
             out.append("the temperature hardly changed: the model cannot be tested")

@@ -35,7 +35,6 @@ from thermocald.analysis.thermal.modelled_camera import (
     predict_orientations,
     require_known,
     require_sd,
-    steady_camera,
     steady_table,
 )
 from thermocald.arrays import floats, seconds
@@ -252,8 +251,15 @@ class ThermalCamera(Result):
         self, T: float, channels: Mapping[str, float] | None = None
     ) -> tuple[Array, Array, Array]:
         """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p)."""
-        own = steady_table(self.model, self.parameters, channels) if channels else self._table
-        return steady_camera(self.model, self.parameters, own, T)
+        model, names = self.model, self.parameters
+        table, knees = steady_table(model, names, channels) if channels else self._table
+        dT = T - model.T0
+        basis = [1.0, dT, dT * dT]
+        for knee in knees:
+            basis += [max(T - knee, 0.0), float(knee < T)]
+        columns = table @ np.array(basis)
+        carried = model.carried_derivatives(columns[:, 0], columns[:, 1:], ("slope", *names))
+        return model.carried(columns[:, 0]), carried[:, 0], carried[:, 1:]
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

@@ -221,9 +221,9 @@ class CalibrationConfig(Section):
             raise wrong(f"{min(both)} is both in `free` and in `fixed`")
         if len(set(self.free)) != len(self.free):
             raise wrong("`free` names a parameter twice")
-        prior = self.priors.get("c")
-        for c in (self.fixed.get("c"), prior and prior.value):
-            if c is not None and not 0.1 <= c <= 10_000.0:
+        stated = [*self.fixed.items(), *((name, p.value) for name, p in self.priors.items())]
+        for name, c in stated:
+            if name == "c" and not 0.1 <= c <= 10_000.0:
                 raise wrong(f"c is {c:g}; a principal distance is within 0.1 … 10,000 mm")
         return self
 

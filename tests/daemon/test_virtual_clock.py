@@ -23,7 +23,6 @@ def run(tmp_path, small_camera, small_field, monkeypatch):
 
     step_s: what the clock is set forward by, after a minute.
     """
-
     monkeypatch.setattr("thermocald.daemon.service._TURN_S", 0.01)  # several in an epoch
 
     def ran(epochs, camera=(), thermometer=(), statuses=None, step_s=0.0):

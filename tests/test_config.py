@@ -107,6 +107,7 @@ BAD = [
     (camera(name="../x"), "cameras[0].name: is '../x'"),
     (camera(driver=None), "cameras[0].driver: is empty; must be text"),
     (camera(testfield="none.csv"), "cameras[0].testfield: there is no file /etc/thermocald/none"),
+    (camera(thermometers=["lens", "lens"]), "`thermometers` names one twice"),
     (camera(thermometers=["lense"]), "there is no thermometer 'lense'; is 'lens' meant?"),
     (
         camera(sensor={"width_px": 1, "height_px": 2464, "pixel_pitch_mm": 0.001}),
@@ -122,6 +123,8 @@ BAD = [
     (document(calibration={"free": ["c", "c"]}), "names a parameter twice"),
     (document(calibration={"fixed": {"c": 3.0}}), "c is both in `free` and in `fixed`"),
     (document(calibration={"priors": {"c": {"value": 3, "sd": 0}}}), "calibration.priors.c.sd"),
+    (document(calibration={"priors": {"c": {"value": 0.003, "sd": 1}}}), "calibration: c is 0.003"),
+    (document(calibration={"free": [], "fixed": {"c": -3}}), "calibration: c is -3; a principal"),
     (document(calibration={"exterior": "free"}), "'per_epoch'"),
     (document(frames={"keep": "some"}), "frames.keep: is 'some'"),
     (document(frames={"max_size_gb": -1}), "frames.max_size_gb: is -1"),

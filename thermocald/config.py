@@ -221,6 +221,10 @@ class CalibrationConfig(Section):
             raise wrong(f"{min(both)} is both in `free` and in `fixed`")
         if len(set(self.free)) != len(self.free):
             raise wrong("`free` names a parameter twice")
+        stated = [*self.fixed.items(), *((name, p.value) for name, p in self.priors.items())]
+        for name, c in stated:
+            if name == "c" and not 0.1 <= c <= 10_000.0:
+                raise wrong(f"c is {c:g}; a principal distance is within 0.1 … 10,000 mm")
         return self
 
 
@@ -450,6 +454,8 @@ class Config(Section):
                         f"camera {camera.name!r}: there is no thermometer {name!r}"
                         + nearest(name, known)
                     )
+            if len(set(camera.thermometers)) != len(camera.thermometers):
+                raise wrong(f"camera {camera.name!r}: `thermometers` names one twice")
         if self.frames.corrected and not any(c.thermal_model for c in self.cameras):
             raise wrong("frames.corrected needs a camera with a thermal_model")
         return self

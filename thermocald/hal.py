@@ -295,7 +295,7 @@ class Camera(Device):
 
     def frame_size(self) -> tuple[int, int] | None:
         """Return the frames' (width, height), px, if the driver has these options; else None."""
-        size = (getattr(self.options, "width", None), getattr(self.options, "height", None))
+        size: Any = (getattr(self.options, "width", None), getattr(self.options, "height", None))
         return None if None in size else size
 
     def known_scene(self) -> tuple[Any, Any] | None:

@@ -18,10 +18,14 @@ from thermocald.store.database.store import Store
 
 
 @pytest.fixture
-def run(tmp_path, small_camera, small_field):
-    """A count, faults of camera and thermometer → the stored columns of that many epochs."""
+def run(tmp_path, small_camera, small_field, monkeypatch):
+    """A count, faults of camera and thermometer → the stored columns of that many epochs.
 
-    def ran(epochs, camera=(), thermometer=(), statuses=None):
+    step_s: what the clock is set forward by, after a minute.
+    """
+    monkeypatch.setattr("thermocald.daemon.service._TURN_S", 0.01)  # several in an epoch
+
+    def ran(epochs, camera=(), thermometer=(), statuses=None, step_s=0.0):
         document = demo_config(tmp_path, 1).model_dump(mode="json", by_alias=True)
         document["cameras"][0]["options"] |= {
             "testfield": str(small_field), "model": str(small_camera), "faults": list(camera)
@@ -29,10 +33,16 @@ def run(tmp_path, small_camera, small_field):
         document["thermometers"][0]["options"] |= {"faults": list(thermometer)}
         config = parse_config(document, Path("config.yaml"))
         clock = VirtualClock(1_600_000_000.0)
-        Service(config, epochs=epochs, until_finished=True, clock=clock).run()
+        steps = [step_s]
+
+        def set_clock(_):
+            if clock.monotonic() >= 60.0:
+                clock.step_utc(steps.pop() if steps else 0.0)
+
+        Service(config, epochs=epochs, until_finished=True, clock=clock, on_turn=set_clock).run()
         store = Store.open(config.store.path)
         series = store.find_series()
-        names = ["frame_time", "temperature_time", "temperature", "sd_c"]
+        names = ["frame_time", "temperature_time", "temperature", "sd_c", "drift_px_per_min"]
         found = store.series_columns(series, ["status"])["status"].tolist()
         assert found == (statuses or ["ok"] * epochs)
         return store, series, store.series_columns(series, names)
@@ -66,6 +76,16 @@ def test_what_is_away_loses_its_own_and_gives_nothing_that_was_not_taken(run):
     assert np.round(np.diff(found["frame_time"])).tolist() == [10.0, 30.0, 10.0, 10.0]
     own = (skew_s(found) > 0) & (skew_s(found) < 1)
     assert own.tolist() == [True, True, True, False, True]
+
+
+def test_a_clock_that_is_set_back_is_no_drift_that_ends(run):
+    """For an hour all epochs counted as one of before: 0.02 px/min, where the drift was 0.3."""
+    store, _, found = run(30, step_s=-3600.0)
+    store.close()
+    (back,) = np.flatnonzero(np.diff(found["frame_time"]) < 0)
+    before, after = found["drift_px_per_min"][back], found["drift_px_per_min"][back + 1 :]
+    assert np.isnan(after[0])
+    assert after[-1] == pytest.approx(before, rel=0.2)
 
 
 def test_a_camera_that_repeats_its_frame_is_reported_once(run):

@@ -70,7 +70,7 @@ def serial(server, tmp_path, text, options):
 
     def speak():
         """Send unprompted and repeatedly: on a busy machine the first may precede the reading."""
-        while not stop.wait(0.02):
+        while not stop.wait(0.004):
             far.send(b"\r\n" + line + b"\r\n")
 
     speaker = threading.Thread(target=speak)

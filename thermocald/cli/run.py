@@ -161,10 +161,8 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
         waiting = counted(store_["waiting"], "epoch")
         raise DataError(f"the store cannot be written; {waiting} waiting in memory")
     if (age := document["age_s"]) > _SILENT_S:
-        raise DataError(
-            f"the status is {duration(age)} old: the daemon hangs, or the disk of the store, on "
-            "which it writes its status, is read-only; look at its log"
-        )
+        why = "the daemon hangs, or its store's disk is read-only; look at its log"
+        raise DataError(f"the status is {duration(age)} old: {why}")
 
 
 def top(
@@ -381,8 +379,7 @@ def _device(device: dict[str, Any]) -> str:
         for name, value in device.get("last", {}).items()
         if value is not None
     ]
-    last = ", ".join(shown)
-    text: str = device["device"] + (f", {last}" if last else "")
+    text = ", ".join([device["device"], *shown])
     if device["faults"]:
         text += f", {counted(device['faults'], 'fault')}"
     return text

@@ -275,27 +275,22 @@ def plan_separation(
     estimated, or None; max_c: the highest temperature allowed, °C, None for the output's limit;
     max_rate: the fastest rise, K/min; max_duty: the largest share of time with heat.
     """
-    from thermocald.discovery.experiment import (
-        Body,
-        Limits,
-        estimate_body,
-        rank_experiments,
-        read_alternatives,
-    )
+    from thermocald.discovery import experiment
 
     if session.programme:
         raise UsageError("--until-separated plans the programme; omit --programme")
-    names = read_alternatives(text)
+    names = experiment.read_alternatives(text)
     heaters = [config.outputs[i] for i in heating_outputs(config, "--until-separated")]
     highest = min(float(o.options["limit_c"]) - _BELOW_LIMIT_K for o in heaters)
-    limits = Limits(highest if max_c is None else min(highest, max_c), max_rate, max_duty)
-    body = Body()
+    hottest = highest if max_c is None else min(highest, max_c)
+    limits = experiment.Limits(hottest, max_rate, max_duty)
+    body = experiment.Body()
     if known is not None:
         there = np.isfinite(readings := next(iter(known.readings.values())))
         there &= np.isfinite(known.reading_times)
-        body = estimate_body(known.reading_times[there], readings[there])
+        body = experiment.estimate_body(known.reading_times[there], readings[there])
     camera = next(c for c in config.cameras if c.name == session.camera)
-    found = rank_experiments(*names, limits, body, session.epochs, camera.period_s)
+    found = experiment.rank_experiments(*names, limits, body, session.epochs, camera.period_s)
     document = {**session.model_dump(mode="python"), "programme": found[0].programme()}
     watch = Watch(config.store.path, session, names, known, say)
     return _describe(found, names), type(session).model_validate(document), watch

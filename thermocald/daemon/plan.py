@@ -288,32 +288,25 @@ def recording_config(path: Path, store: Path | None = None) -> Config:
     except ConfigurationError as error:
         raise RecordingError(f"{path}: cannot be played: {error}") from error
     sensor = head.camera.sensor
-    replay = {"driver": "replay", "recording": str(path.absolute()), "after": after}
-    period = max(0.05, head.interval)
-    return parse_config(
-        {
-            "store": {"path": str(place), "durable": False},
-            "frames": {"keep": "none", "folder": f"{name}-frames"},
-            "cameras": [
-                {
-                    "name": camera,
-                    "series": series,
-                    "period_s": period,
-                    "sensor": {
-                        "width_px": sensor.width,
-                        "height_px": sensor.height,
-                        "pixel_pitch_mm": sensor.pixel_pitch,
-                    },
-                    "principal_distance_mm": head.camera.principal_distance,
-                    "testfield": str((path / "testfield.csv").absolute()),
-                    "thermometers": ["recorded"] if head.channels else [],
-                    **replay,
-                }
-            ],
-            "thermometers": [{"name": "recorded", "period_s": period, **replay}],
-        },
-        Path("config.yaml"),
-    )
+    replay = {
+        "driver": "replay", "recording": str(path.absolute()), "after": after,
+        "period_s": max(0.05, head.interval),
+    }  # fmt: skip
+    played = {
+        "name": camera, "series": series, **replay,
+        "sensor": {"width_px": sensor.width, "height_px": sensor.height,
+                   "pixel_pitch_mm": sensor.pixel_pitch},
+        "principal_distance_mm": head.camera.principal_distance,
+        "testfield": str((path / "testfield.csv").absolute()),
+        "thermometers": ["recorded"] if head.channels else [],
+    }  # fmt: skip
+    document = {
+        "store": {"path": str(place), "durable": False},
+        "frames": {"keep": "none", "folder": f"{name}-frames"},
+        "cameras": [played],
+        "thermometers": [{"name": "recorded", **replay}],
+    }
+    return parse_config(document, Path("config.yaml"))
 
 
 def _played_until(path: Path, camera: str, series: str) -> float | None:

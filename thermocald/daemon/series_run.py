@@ -124,7 +124,7 @@ class SeriesRun:
         self._strange: list[str] = []  # channels that are no columns of the series
         self._start: list[dict[str, Any]] | None = None  # rows of the first good epochs
         self._failed = 0  # latest epochs in a row without a result
-        self._shown = self._previewed = float("-inf")
+        self._shown = self._previewed = self._observed = float("-inf")
         if (stored := self.series) is not None:
             check_series(plan, stored, self.thermometers.named_columns(names))
         self.first = 1 if stored is None else self._guard.last_epoch(stored) + 1
@@ -232,6 +232,10 @@ class SeriesRun:
                 )
         if self._observer is not None and in_order:
             noise = () if running is None else (running.tremble, running.field_variance)
+            if calibrated.epoch.frame_time < self._observed and isinstance(calibrator, Calibrator):
+                # the clock was set back: no rate of change can be estimated across that
+                self._observer.watch = type(self._observer.watch)()
+            self._observed = calibrated.epoch.frame_time
             columns |= self._observer.observe(calibrated, adjusted, *noise)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})
 

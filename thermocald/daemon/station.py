@@ -239,7 +239,9 @@ class Station:
             loop.stop()
         done = True
         for loop in self._loops:
-            done &= loop.join(max(0.1, deadline - time.monotonic() - 0.5 * grace_s))
+            hangs = loop.busy_s() > self.runtime.hang_after_s  # is not waited for
+            left_s = 0.0 if hangs else deadline - time.monotonic() - 0.5 * grace_s
+            done &= loop.join(max(0.1, left_s))
         for camera in self.cameras:
             if camera.run is not None:
                 done &= camera.run.pipeline.stop(max(0.1, deadline - time.monotonic()))

@@ -284,7 +284,9 @@ class _Frame:
             )
         reasons = [why for why in self._missed.values() if why != "not found"]
         if not reasons:
-            return "no target of the test field is found in the frame"
+            whole = any(code.startswith("CHESS") for code in self._field.codes)
+            remedy = "; a chessboard must be whole in the frame, with its margin" if whole else ""
+            return f"no target of the test field is found in the frame{remedy}"
         word, count = Counter(reasons).most_common(1)[0]
         remedy = f"; {_REMEDIES[word]}" if word in _REMEDIES else ""
         return f"{len(reasons)} targets are seen and none can be measured: {word} ({count}){remedy}"

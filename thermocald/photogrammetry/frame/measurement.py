@@ -31,11 +31,7 @@ from thermocald.photogrammetry.targets.boards import locate_chessboards, predict
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
-from thermocald.photogrammetry.targets.markers import (
-    corners_turned_deg,
-    is_marker,
-    locate_markers,
-)
+from thermocald.photogrammetry.targets.markers import corners_turned_deg, is_marker, locate_markers
 from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_maps
 from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings
 

@@ -21,6 +21,7 @@ from tests.photogrammetry.fields import (
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import frame_figures, measure
+from thermocald.photogrammetry.targets.boards import chessboard
 from thermocald.photogrammetry.targets.outline import local_maps
 
 FIELD, NORMALS = small_field()
@@ -113,8 +114,9 @@ MOVED = np.random.default_rng(2).permutation(FIELD.points)
         (replace(FIELD, points=MOVED), "other_field", "not where"),
         (TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters), "nothing_found",
          "coded"),
+        (chessboard(9, 6, 25.0), "nothing_found", "must be whole in the frame"),
     ],
-    ids=["other codes", "codes elsewhere", "plain circles"],
+    ids=["other codes", "codes elsewhere", "plain circles", "chessboard"],
 )  # fmt: skip
 def test_another_field_is_detected(frame, field, word, reason):
     found = measure(frame, field)

@@ -26,11 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.epoch.adjustment import (
-    GeometryBounds,
-    image_coverage,
-    weaknesses,
-)
+from thermocald.photogrammetry.epoch.adjustment import GeometryBounds, image_coverage, weaknesses
 from thermocald.photogrammetry.field.testfield import field_normals, plane_fit
 from thermocald.photogrammetry.linalg import scaled_inverse, unit_diagonal
 from thermocald.photogrammetry.targets.outline import facing, local_maps
@@ -254,10 +250,7 @@ def _front(field: TestField) -> Array:
 
 
 def check_field(
-    camera: CameraModel,
-    field: TestField,
-    station: ExteriorOrientation,
-    sigma_px: float = 0.03,
+    camera: CameraModel, field: TestField, station: ExteriorOrientation, sigma_px: float = 0.03
 ) -> FieldCheck:
     """Check a field for a camera at a station; sigma_px: of an image coordinate.
 
@@ -337,11 +330,7 @@ def _visible(
 
 
 def precision(
-    camera: CameraModel,
-    station: ExteriorOrientation,
-    points: Array,
-    sigmas: Array,
-    sigma_px: float,
+    camera: CameraModel, station: ExteriorOrientation, points: Array, sigmas: Array, sigma_px: float
 ) -> dict[str, Array]:
     """Return standard deviations of `DEFAULT_FREE` from targets at points (n, 3) mm with sigmas mm.
 

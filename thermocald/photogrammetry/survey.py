@@ -31,11 +31,7 @@ from thermocald.photogrammetry.field.testfield import (
     sheet_normals,
     target_normals,
 )
-from thermocald.photogrammetry.frame.measurement import (
-    REPEATED,
-    find_repeated,
-    predict_circles,
-)
+from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated, predict_circles
 from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles

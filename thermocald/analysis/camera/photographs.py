@@ -19,11 +19,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.epoch.adjustment import (
-    AdjustmentSettings,
-    cold_start,
-    pose_only,
-)
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, cold_start, pose_only
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated, measure
 from thermocald.photogrammetry.linalg import correlations

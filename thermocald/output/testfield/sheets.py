@@ -27,11 +27,7 @@ from thermocald.figures import drawing_style
 from thermocald.files import new_file
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import boards, ring_code
-from thermocald.photogrammetry.targets.markers import (
-    dictionary,
-    marker_cells,
-    marker_dictionaries,
-)
+from thermocald.photogrammetry.targets.markers import dictionary, marker_cells, marker_dictionaries
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:

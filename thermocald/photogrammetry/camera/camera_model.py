@@ -174,10 +174,8 @@ class ExteriorOrientation(_Parameters):
     @classmethod
     def from_rotation(cls, R: ArrayLike, centre: ArrayLike) -> ExteriorOrientation:
         """Build from R (3, 3), camera to object, and the projection centre (3,) mm."""
-        return cls(
-            *rotation_angles(np.asarray(R, dtype=float)).tolist(),
-            *np.asarray(centre, float).tolist(),
-        )
+        angles = rotation_angles(np.asarray(R, dtype=float))
+        return cls.from_array(np.concatenate([angles, np.asarray(centre)]))
 
 
 @dataclass(frozen=True, slots=True)

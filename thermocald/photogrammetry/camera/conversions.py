@@ -74,11 +74,7 @@ def image_grid(sensor: Sensor, shape: tuple[int, int] = _GRID) -> Array:
 
 
 def convert(
-    sensor: Sensor,
-    source: Family,
-    values: Array,
-    target: Family,
-    covariance: Array | None = None,
+    sensor: Sensor, source: Family, values: Array, target: Family, covariance: Array | None = None
 ) -> tuple[Array, Array | None, bool, float, float]:
     """Convert a camera (values and covariance in the source's order) to another family.
 

@@ -31,11 +31,7 @@ from thermocald.photogrammetry.targets.boards import locate_chessboards, predict
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
-from thermocald.photogrammetry.targets.markers import (
-    corners_turned_deg,
-    is_marker,
-    locate_markers,
-)
+from thermocald.photogrammetry.targets.markers import corners_turned_deg, is_marker, locate_markers
 from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_maps
 from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings
 
@@ -284,7 +280,9 @@ class _Frame:
             )
         reasons = [why for why in self._missed.values() if why != "not found"]
         if not reasons:
-            return "no target of the test field is found in the frame"
+            whole = any(code.startswith("CHESS") for code in self._field.codes)
+            remedy = "; a chessboard must be whole in the frame, with its margin" if whole else ""
+            return f"no target of the test field is found in the frame{remedy}"
         word, count = Counter(reasons).most_common(1)[0]
         remedy = f"; {_REMEDIES[word]}" if word in _REMEDIES else ""
         return f"{len(reasons)} targets are seen and none can be measured: {word} ({count}){remedy}"

@@ -437,10 +437,7 @@ def bring_to_datum(
     blocks = Q.reshape(m, 3, m, 3)
     turned = np.einsum("ab,mbnc,dc->mand", turn, blocks, turn, optimize=True).reshape(3 * m, 3 * m)
     placed = Bundle(
-        bundle.interior,
-        turn @ bundle.rotations,
-        scale * bundle.centres @ turn.T + shift,
-        points,
+        bundle.interior, turn @ bundle.rotations, scale * bundle.centres @ turn.T + shift, points
     )
     by = ", ".join(f"{d.a}–{d.b} = {d.length:g} ± {d.sigma:g} mm" for d in distances)
     statement = f"inner constraints over {m} targets, {where}; scale by {by}"
@@ -489,11 +486,7 @@ def _scaled(
 
 
 def _placement(
-    points: Array,
-    centres: Array,
-    nominal: Array | None,
-    first: Distance,
-    index: dict[str, int],
+    points: Array, centres: Array, nominal: Array | None, first: Distance, index: dict[str, int]
 ) -> tuple[Array, Array, str]:
     """Return the rotation (3, 3) and shift (3,) into the datum, and the datum in words."""
     if nominal is not None:

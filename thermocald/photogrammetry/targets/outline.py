@@ -166,10 +166,7 @@ def window_reach(blur: float) -> float:
 
 
 def windows(
-    image: Image,
-    maps: LocalMap,
-    coded: NDArray[np.bool_],
-    blur: float = 0.9,
+    image: Image, maps: LocalMap, coded: NDArray[np.bool_], blur: float = 0.9
 ) -> Iterator[Windows]:
     """Yield the windows of targets of similar size, with the pixels near each outline.
 

@@ -42,12 +42,7 @@ from thermocald.photogrammetry.targets.markers import (
     parse_marker,
     to_8_bit,
 )
-from thermocald.photogrammetry.targets.outline import (
-    RING_INNER,
-    RING_OUTER,
-    LocalMap,
-    find_circles,
-)
+from thermocald.photogrammetry.targets.outline import RING_INNER, RING_OUTER, LocalMap, find_circles
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -224,11 +219,7 @@ _MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
 
 
 def ring_misfit(
-    level: Single,
-    maps: LocalMap,
-    ones: NDArray[np.bool_],
-    which: NDArray[np.int64],
-    within: Array,
+    level: Single, maps: LocalMap, ones: NDArray[np.bool_], which: NDArray[np.int64], within: Array
 ) -> Array:
     """Return the RMS (n,) of samples against the ring that was read, drawn with one of two blurs.
 

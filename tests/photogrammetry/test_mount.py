@@ -16,14 +16,17 @@ from thermocald.photogrammetry.series.normals import linearise
 
 def simulate(
     rng, field: TestField, epochs: int, px: float, memory: float, grows: float = 0.0,
-    warm_px: float = 8.0,
+    warm_px: float = 8.0, off: float = np.inf,
 ):  # fmt: skip
     """Return observations and true values (E, 16) of a camera that warms up on a moving mount.
 
     px, memory: the mount's tremble in the image, and the correlation of neighbouring epochs; grows:
-    by how much the noise in the middle is larger than at both ends, where it is 0.4 of the usual.
+    by how much the noise in the middle is larger than at both ends, where it is 0.4 of the usual;
+    off: epoch from which it cools.
     """
-    truth = scene.warming_up(warm_px * (1 - np.exp(-np.arange(epochs) / 25)))
+    after = np.maximum(np.arange(epochs) - off, 0.0)
+    warmed = 1 - np.exp(-np.minimum(np.arange(epochs), off) / 25)
+    truth = scene.warming_up(warm_px * warmed * np.exp(-after / 25))
     at = linearise(scene.SENSOR, field, scene.TRUTH[:10], scene.TRUTH[10:])
     per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
     move = rng.normal(size=(epochs, 3))
@@ -103,6 +106,17 @@ def test_auto_reports_its_choice_with_a_reason(seeds, epochs, tremble, exterior)
     found = [scene.adjusted_series(field, grid, exterior="auto") for grid in grids]
     assert exterior in [r.exterior for r in found]
     assert all(r.choice and r.ok.all() for r in found)
+
+
+@pytest.mark.parametrize("epochs", [40, 80, 120, 160])
+def test_a_heater_that_is_switched_off_moves_no_mount(epochs):
+    """Regression: up to 120 epochs the mount moved by 0.02 px, in longer series it jumped."""
+    field = scene.corner_field(per_side=4)
+    for seed in range(3):
+        rng = np.random.default_rng([48, seed])
+        grid, _ = simulate(rng, field, epochs, *STILL, off=epochs / 2)
+        r = scene.adjusted_series(field, grid, exterior="auto")
+        assert r.exterior == "series", r.choice
 
 
 def test_the_variance_of_a_line_through_a_swaying_mount_is_true():

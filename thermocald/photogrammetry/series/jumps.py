@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
 _CERTAIN = 6.0  # standard deviations of the step by the epochs around
+_BENT = 3.0  # standard deviations of a change of the rate
 _LASTING = 0.5  # share of the change that must remain
 SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
@@ -74,7 +75,8 @@ def find_jumps(
         step, factor = _step(left, row)
         lasting = _step(left, row, 1)[0][column]  # a spike is no jump
         certain = abs(step[column]) > _CERTAIN * noise[worst, column] * np.sqrt(factor / 2)
-        if not certain or abs(lasting) < _LASTING * abs(change[worst, column]):
+        bent = _is_bent(left[:, column], row, noise[worst, column] / np.sqrt(2.0))
+        if not certain or bent or abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
         if jump := _find_mover(row, step, factor * noise[worst] ** 2 / 2, M, g):
@@ -150,6 +152,23 @@ def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
     t = t[(t < -apart) | (t >= apart)]
     estimator = np.linalg.pinv(np.column_stack([np.ones(len(t)), t, t >= 0]))[2]
     return estimator @ trajectory[row + t], float(estimator @ estimator)
+
+
+def _is_bent(trajectory: Array, row: int, sd: float) -> bool:
+    """Return whether the rate of a trajectory (E,) changes at an epoch, which may explain a step.
+
+    sd: of an epoch. A heater that is switched between two epochs bends the course anywhere between
+    them: the curves before and after then differ by up to half an epoch's change of the rate.
+    """
+    rows = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory)))
+    u, after = rows - row + 0.5, rows >= row
+    bend = np.linalg.pinv(np.column_stack([u**0, u, after, u * after]))[3]
+    if abs(bend @ trajectory[rows]) < _BENT * sd * np.linalg.norm(bend):
+        return False
+    curves = np.column_stack([u**0, u, u**2, after, u * after, u**2 * after])
+    step, rate = np.linalg.pinv(curves)[3:5]
+    left = abs(step @ trajectory[rows]) - 0.5 * abs(rate @ trajectory[rows])
+    return bool(left < _CERTAIN * sd * np.linalg.norm(step))
 
 
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:

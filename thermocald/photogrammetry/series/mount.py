@@ -55,7 +55,8 @@ _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six
 _SLOW_COST = 2.0  # further log-likelihood that a memory must gain
 _NEGLIGIBLE = 0.02  # of the noise's variance
 _DEGREE = 6
-_LEAST_FAST = 120  # frequencies of a drift's removal; with fewer too much movement would be lost
+_LEAST_FAST = 30  # frequencies of a drift's removal
+_ENOUGH_FAST = 120  # frequencies; with fewer too much of a movement goes with the drift
 _MOST_BENDS = 4
 _MOST_BENDS_TRIED = 400
 _TOGETHER = 200_000  # epochs of all bends that are tried at once: 100 MB
@@ -75,8 +76,17 @@ def components(trajectory: Array, period: float, held: bool = False) -> tuple[Ar
     """
     n = len(trajectory)
     coefficients = _cosines(_level_ends(trajectory) if period else trajectory)
-    if period and n - 1 - (low := int(2 * n / period)) >= _LEAST_FAST:
-        coefficients = _remove_drift(coefficients, low)
+    if period and (fast := n - 1 - (low := int(2 * n / period))) >= _LEAST_FAST:
+        found = _sizes(_remove_drift(coefficients, low), period, held)
+        # so a short series may show that a mount does not move, but not how far it moves
+        if fast >= _ENOUGH_FAST or (found[0] + found[1]).max() < 1.0:
+            return found
+    return _sizes(coefficients, period, held)
+
+
+def _sizes(coefficients: Array, period: float, held: bool) -> tuple[Array, Array, float]:
+    """Return the components of cosine coefficients (E - 1, k), as `components`."""
+    n = len(coefficients) + 1
     power = coefficients**2
     omega = np.pi * np.arange(1, n) / n
     one = np.ones_like(omega)
@@ -155,14 +165,15 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
     """
     fast, n = coefficients[low:], len(coefficients) + 1
     u = np.linspace(-1.0, 1.0, n)[:, None]
-    basis = _cosines(u ** np.arange(1, _DEGREE + 1))[low:]
+    m = len(fast)
+    basis = _cosines(u ** np.arange(1, min(_DEGREE, m // 10) + 1))[low:]
     basis = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
     fast = fast - basis @ (basis.T @ fast)
     rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
     parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
     needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
     likelihood = float(_likelihood(fast, low))
-    for _ in range(_MOST_BENDS):
+    for _ in range(min(_MOST_BENDS, (m // 4 - basis.shape[1]) // 3)):
         tried = (_best_bend(fast, basis, u - u[part, 0], low) for part in parts)
         better, left, bend = max(tried, key=itemgetter(0))
         if better - likelihood < needed:

@@ -71,7 +71,7 @@ def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
                 _answer(camera),
                 tuple(_sections(camera, study.settings)),
                 (f"{names}, {series[0].sensor}. Measured: {measured}.",),
-                tuple(_notes(camera)),
+                (*map(as_sentence, _doubts(camera)), *_notes(camera)),
             )
         )
     return render_report(title, chapters, _LEAD)
@@ -199,12 +199,13 @@ def _notes(camera: CameraStudy) -> list[str]:
         note if len(names) == len(camera.series) else f"{', '.join(names)}: {note}"
         for note, names in holders.items()
     ]
-    doubts = [
-        as_sentence(line)
-        for study in camera.series
-        for line in doubt_lines(study.series.doubts, study.series.name)
-    ]
-    return doubts + notes + list(camera.notes)
+    return notes + list(camera.notes)
+
+
+def _doubts(camera: CameraStudy) -> list[str]:
+    """Return the doubts about all series, a line each."""
+    measured = [study.series for study in camera.series]
+    return [line for series in measured for line in doubt_lines(series.doubts, series.name)]
 
 
 _CLOSE = 0.9
@@ -237,6 +238,7 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
     for camera in study.cameras:
         lines.append(camera.label)
         lines += [f"  {s}" for s in (*answer_sentences(camera), *detail_sentences(camera))]
+        lines += [f"  {line}" for line in _doubts(camera)]
         lines += [f"  note: {note}" for note in _notes(camera)]
     return lines
 

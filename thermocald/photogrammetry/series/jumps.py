@@ -75,8 +75,9 @@ def find_jumps(
         step, factor = _step(left, row)
         lasting = _step(left, row, 1)[0][column]  # a spike is no jump
         certain = abs(step[column]) > _CERTAIN * noise[worst, column] * np.sqrt(factor / 2)
-        bent = _is_bent(left[:, column], row, noise[worst, column] / np.sqrt(2.0))
-        if not certain or bent or abs(lasting) < _LASTING * abs(change[worst, column]):
+        if not certain or abs(lasting) < _LASTING * abs(change[worst, column]):
+            continue
+        if _is_bent(left[:, column], row, noise[worst, column] / np.sqrt(2.0)):
             continue
         left[row:] -= step
         if jump := _find_mover(row, step, factor * noise[worst] ** 2 / 2, M, g):

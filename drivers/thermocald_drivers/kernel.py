@@ -146,7 +146,7 @@ class _KernelThermometer(support.CheckedThermometer):
             raise WrongDevice(f"{where} is there {len(matches)} times; set chip: {addresses}")
         inputs = self._inputs(matches[0])
         if not inputs:
-            raise WrongDevice(f"{matches[0]}: this device has no temperature input")
+            raise support.absent(f"{matches[0]}: no temperature input is there", seen=self.seen)
         self._channels = self._select(inputs, matches[0])
         self.handle, self.seen = matches[0], True
         self._name = support.read_line(matches[0] / self.name_file)
@@ -173,7 +173,8 @@ class _KernelThermometer(support.CheckedThermometer):
         for channel, key in self.options.channels.items():
             if key not in inputs and key not in by_label:
                 known = ", ".join([*inputs, *by_label])
-                raise WrongDevice(f"{folder}: no input {key!r} for {channel!r}; there is {known}")
+                message = f"{folder}: no input {key!r} for {channel!r}; there is {known}"
+                raise support.absent(message, seen=self.seen)
             chosen[channel] = key if key in inputs else by_label[key]
         return chosen
 
@@ -237,7 +238,10 @@ class HwmonThermometer(_KernelThermometer):
         fault = folder / f"{key}_fault"
         if fault.exists() and _number(fault) != 0:
             raise BadReading(f"{folder.name} {key}: the chip reports a broken sensor (fault flag)")
-        value = _number(folder / f"{key}_input") / 1000.0
+        number = _number(folder / f"{key}_input")
+        if not number.is_integer():
+            raise BadReading(f"{folder.name} {key}: {number:g} is not a whole number of 1/1000 °C")
+        value = number / 1000.0
         if self._name.startswith("w1_") and value in chips.idle_celsius("ds18b20"):
             raise BadReading(
                 f"{folder.name} {key}: {value:g} °C is a 1-wire power-on value; use driver: "

@@ -87,3 +87,23 @@ def test_a_page_that_dies_is_started_again_and_says_when_acquisition_ended(daemo
         ".startsWith('acquisition has stopped: no daemon has run since 20')"
     )
     assert "stored data are shown below" in page.text_content("#state")
+
+
+@pytest.mark.parametrize(
+    ("series", "state", "note"),
+    [(None, "idle: a session begins a series", "no epoch of camera one is stored yet"),
+     ("", "this daemon takes no camera's epochs; the devices show its thermometers", "")],
+)  # fmt: skip
+def test_without_an_epoch_it_says_why(daemon, devices, page_of, series, state, note):
+    port = free_port()
+    sections = devices(period_s=1.0, series=series)
+    if series == "":
+        sections["cameras"] = []
+    daemon.run(**sections, dashboard={"enabled": True, "port": port})
+    daemon.until(lambda: serves(port))
+    page = page_of(f"http://127.0.0.1:{port}/")
+    page.wait_for_function("() => document.querySelector('#course-note').textContent !== ''")
+    assert page.text_content("#state") == state
+    assert page.text_content("#course-note") == (note or state)
+    assert "housing" in page.text_content("#devices")
+    assert daemon.stop() == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drivers.fakes.sysfs import Sysfs
+from thermocald.acquisition.device_loop import Link
 from thermocald.errors import (
     BadReading,
     DeviceGone,
@@ -32,6 +33,7 @@ READ = [
     ("hwmon", "it87", {"temp1_input": "85000"}, {}, {"temperature": 85.0}),
     ("hwmon", "w1_slave_temp", {"temp1_input": "85000"}, {}, "power-on"),
     ("hwmon", "lm90", {"temp1_input": "21000", "temp1_fault": "1"}, {}, "fault"),
+    ("hwmon", "lm75", {"temp1_input": "31.5"}, {}, "31.5 is not a whole number of 1/1000 °C"),
     *(("hwmon", "lm75", {"temp1_input": text}, {}, "not a number") for text in ("", "٢٨٠٠٠")),
     # bmp280 family: raw only; ABI: (raw + offset) * scale in m°C
     ("iio", "tmp006", {"in_temp_ambient_raw": "731", "in_temp_scale": "31.25",
@@ -64,10 +66,25 @@ def test_what_the_kernel_says_is_read_rightly_or_refused(
             device.read()
 
 
-def test_a_channel_that_is_not_there(sysfs):
-    sysfs.hwmon(0, "it87", temp2_input="51000")
-    with pytest.raises(WrongDevice, match=r"temp1.*there is temp2"):
-        thermometer("hwmon", sysfs, chip="it87", channels={"lens": "temp1"}).open()
+@pytest.mark.parametrize("name", ["it87", "cpu_thermal"])
+def test_an_input_that_was_missing_is_read_when_it_is_there(sysfs, name):
+    clock = VirtualClock()
+    options = {"sysfs": str(sysfs.root), "chip": name}
+    if name == "it87":
+        sysfs.hwmon(0, name, temp2_input="51000")
+        options["channels"] = {"lens": "temp1"}
+        problem = "no input 'temp1' for 'lens'; there is temp2"
+    else:
+        sysfs.hwmon(0, name)
+        problem = "no temperature input is there"
+    link = Link("thermometer", name, open_device("thermometer", "hwmon", options, clock), clock)
+    read = []
+    assert not link.do(lambda: read.append(link.device.read()))
+    assert (link.state, problem in link.why) == ("out", True)
+    sysfs.hwmon(0, name, temp1_input="21000")
+    clock.sleep_until(clock.monotonic() + 20.0)
+    assert link.do(lambda: read.append(link.device.read()))
+    assert list(read[0].values.values()) == [21.0]
 
 
 def test_a_number_handed_on_to_another_chip_is_noticed(sysfs):

@@ -233,8 +233,7 @@ class SeriesRun:
         if self._observer is not None and in_order:
             noise = () if running is None else (running.tremble, running.field_variance)
             if calibrated.epoch.frame_time < self._observed and isinstance(calibrator, Calibrator):
-                # the clock was set back: no rate of change can be estimated across that
-                self._observer.watch = type(self._observer.watch)()
+                self._observer.forget_course()  # the clock was set back
             self._observed = calibrated.epoch.frame_time
             columns |= self._observer.observe(calibrated, adjusted, *noise)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})

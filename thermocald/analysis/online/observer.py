@@ -255,7 +255,7 @@ class OnlineObserver:
         event = innovation.change if innovation.change in _SENTENCES else ""
         if event:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
-            self.watch = EquilibriumWatch()
+            self.forget_course()
         if innovation.change != "outlier":
             given = condition_on_exterior(adjustment.values, errors[0], self._pitch)
             self.watch.add(epoch.frame_time, *given)
@@ -270,6 +270,10 @@ class OnlineObserver:
         sd = np.sqrt(np.diag(self.filter.covariance()))
         columns |= with_sds(names, self.filter.values()[PRINCIPAL], sd[PRINCIPAL])
         return columns | ({"event": 1.0} if event else {})
+
+    def forget_course(self) -> None:
+        """Begin the watch of the drift anew: no rate can be estimated across what happened."""
+        self.watch = EquilibriumWatch()
 
     def report(self) -> dict[str, Any]:
         """Return state, drift, time to steady and the estimates with sds, for status and page."""

@@ -81,10 +81,16 @@ function fillCameras() {
   if (names.length) options($("camera"), [...new Set(names)]);
 }
 
+function noCamera() {
+  return status.pid ? "this daemon takes no camera's epochs; the devices show its thermometers" : "nothing is stored yet";
+}
+
 // What a camera does now, in words, and its class of CSS.
 function verdict(camera, last) {
   if (["out", "failed", "hung"].includes(camera.device)) return [`${camera.device}: ${camera.why || "it does not answer"}`, "failed"];
-  if (last.epoch === undefined) return [camera.series === "" ? "idle" : "no epoch yet", ""];
+  if (last.epoch === undefined) {
+    return [!camera.device ? noCamera() : camera.series === "" ? "idle: a session begins a series" : "no epoch yet", ""];
+  }
   if (["ok", "predicted", "resected", "last_pose"].includes(last.status)) return [last.online?.sentence || last.state, last.state];
   return [last.status.replaceAll("_", " ") + (last.reason ? `: ${last.reason}` : ""),
     last.status === "not_calibrated" ? "drifting" : "failed"];
@@ -206,7 +212,7 @@ async function refreshCourse() {
     options($("series"), series.filter((s) => s.camera === chosen()).map((s) => s.series).reverse());
     for (const id of ["bar", "course"]) $(id).hidden = !$("series").value;
     if (!$("series").value) {
-      $("course-note").textContent = "no epoch of this camera is stored yet";
+      $("course-note").textContent = chosen() ? `no epoch of camera ${chosen()} is stored yet` : noCamera();
       Plotly.purge("course");
       return;
     }

@@ -26,6 +26,9 @@ def document(**changes) -> dict:
     }
 
 
+SENSOR = {"width_px": 3280, "height_px": 2464, "pixel_pitch_mm": 0.00112}
+
+
 def parse(doc: dict, **kwargs) -> Config:
     return parse_config(doc, Path("/etc/thermocald/config.yaml"), **kwargs)
 
@@ -60,6 +63,7 @@ def test_paths_are_relative_to_the_file(tmp_path):
     doc = document(store={"path": "data/x.db"}, dashboard={"token_file": "~/token"})
     doc["cameras"][0] |= {
         "testfield": "field.csv",
+        "sensor": SENSOR,
         "recording": "./M1",
         "plain": "M1",
         "options": {"testfield": "../f.csv", "list": [{"a": "./b"}]},
@@ -91,6 +95,8 @@ BAD = [
     (document(store={"pth": "x"}), "store.pth: unknown; is 'path' meant?"),
     (document(store={"path": ""}), "store.path: is ''; must not be empty"),
     (document(store={"xyz": 1}), "store.xyz: unknown; known are: path, durable"),
+    (document(STORE={"path": "x"}), "STORE: unknown; is 'store' meant?"),
+    (document(forward={"station": [1]}), "forward.station: is [1]; must be text"),
     (camera(perod_s=3), "cameras[0].perod_s: unknown; is 'period_s' meant?"),
     (camera(period_s=0.01), "cameras[0].period_s: is 0.01; must be at least 0.05"),
     (camera(period_s="soon"), "cameras[0].period_s: is 'soon'; must be a number, without a unit"),
@@ -106,7 +112,8 @@ BAD = [
     (camera(name="a b"), "cameras[0].name: is 'a b'"),
     (camera(name="../x"), "cameras[0].name: is '../x'"),
     (camera(driver=None), "cameras[0].driver: is empty; must be text"),
-    (camera(testfield="none.csv"), "cameras[0].testfield: there is no file /etc/thermocald/none"),
+    (camera(testfield="f.csv"), "cameras[0]: `testfield` needs `sensor: {width_px: …"),
+    (camera(testfield="none.csv", sensor=SENSOR), "cameras[0].testfield: there is no file /etc/thermocald/none"),
     (camera(thermometers=["lens", "lens"]), "`thermometers` names one twice"),
     (camera(thermometers=["lense"]), "there is no thermometer 'lense'; is 'lens' meant?"),
     (
@@ -159,6 +166,9 @@ def test_options_are_checked_against_the_driver():
         parse(camera(seed="b"), load_driver=load_driver)
     with pytest.raises(ConfigurationError, match=r"\[0\].driver: there is no camera driver"):
         parse(camera(driver="nikon"), load_driver=load_driver)
+    log = {"name": "log", "driver": "jsonl", "path": ""}
+    with pytest.raises(ConfigurationError, match=r"outputs\[0\]: path: is ''; must not be empty"):
+        parse(document(outputs=[log]), load_driver=load_driver)
 
 
 def test_the_comments_of_config_yaml_name_drivers_that_exist():

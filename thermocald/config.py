@@ -99,8 +99,9 @@ def _of_key(key: str, message: str) -> PydanticCustomError:
 
 def nearest(key: str, known: list[str]) -> str:
     """Return the end of a message: the known key that may be meant, or all known keys."""
-    near = difflib.get_close_matches(key, known, 1, 0.5)
-    return f"; is {near[0]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
+    lower = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(key.lower(), lower, 1, 0.5)
+    return f"; is {lower[near[0]]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
 
 
 _LIST = "must be a list: [a, b], or lines that begin with `- `"
@@ -122,6 +123,8 @@ _RULES = {
     "literal_error": "must be {expected}",
     "string_too_short": "must not be empty",
     "string_type": "must be text; put it in quotes",
+    "too_long": "must list at most {max_length}",
+    "too_short": "must list at least {min_length}",
 }
 
 
@@ -143,8 +146,12 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         message = str(context["error"])
     elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
-        if rule := _RULES.get(context.get("pattern") or first["type"]):
+        empty = first["type"] == "too_short" and first["input"] == ""
+        kind = "string_too_short" if empty else first["type"]
+        if rule := _RULES.get(context.get("pattern") or kind):
             message = rule.format(**context)
+            if isinstance(first["input"], list | dict):
+                message = message.removesuffix("; put it in quotes")
         message = f"is {given}; {message[0].lower()}{message[1:]}"
     return f"{place}{where + ': ' if where else ''}{message}{more}"
 
@@ -312,6 +319,8 @@ class CameraConfig(DeviceConfig):
             raise wrong("`thermal_model` needs `thermometers`, the reference first")
         if self.control_points is None and self.control_reference is not None:
             raise wrong("`control_reference` needs `control_points`")
+        if self.testfield is not None and self.sensor is None:
+            raise wrong("`testfield` needs `sensor: {width_px: …, height_px: …, pixel_pitch_mm: …}`")
         return self
 
 
@@ -539,8 +548,8 @@ def _check_options(
         for key in device.options:
             if key not in known:
                 raise ConfigurationError(
-                    f"{where}.{key}: unknown; neither a key of a {kind} nor an option of driver "
-                    f"{device.driver!r}{nearest(key, [*own, *known])}"
+                    f"{where}.{key}: unknown; neither a key of this {kind} nor an option of "
+                    f"driver {device.driver!r}{nearest(key, [*own, *known])}"
                 )
         options.read(device.options, where)
         return

@@ -81,7 +81,9 @@ if TYPE_CHECKING:
 
 TRIES = 3
 PASSED_ON = ("PATH", "HOME", "LANG", "LC_ALL", "TZ")
-Address = Annotated[str, Field(pattern=r"^[^@\s,;<>]+@[^@\s,;<>]+$")]
+Address = Annotated[
+    str, support.like(r"[^@\s,;<>]+@[^@\s,;<>]+", "is not an e-mail address, name@host")
+]
 
 log = logging.getLogger(__name__)
 

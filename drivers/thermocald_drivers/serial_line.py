@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
+FRAMING = "is not data bits, parity (N, E, O) and stop bits, such as 8N1"
 LONGEST_LINE = 512
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
 """Degree signs of other encodings as Latin-1 text: masculine ordinal, 0xF8, 0xDF."""
@@ -124,9 +125,9 @@ class SerialThermometer(support.CheckedThermometer):
             None
         )
         pattern: support.Text
-        command: Annotated[str, Field(pattern=r"^[\x00-\x7f]*$")] = ""
+        command: Annotated[str, support.like(r"[\x00-\x7f]*", "holds more than ASCII")] = ""
         baud: Annotated[int, Field(ge=50, le=4_000_000)] = 9600
-        framing: Annotated[str, Field(pattern="^[5-8][NEO][12]$")] = "8N1"
+        framing: Annotated[str, support.like("[5-8][NEO][12]", FRAMING)] = "8N1"
         unit: Literal["C", "F", "K", "mA"] = "C"
         scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
         offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0

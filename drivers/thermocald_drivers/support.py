@@ -89,6 +89,17 @@ def or_auto(low: float, high: float) -> AfterValidator:
     return AfterValidator(check)
 
 
+def like(pattern: str, words: str) -> AfterValidator:
+    """Return a validator that accepts text that matches as a whole; words: what other text is."""
+
+    def check(text: str) -> str:
+        if not re.fullmatch(pattern, text):
+            raise ConfigurationError(f"{text!r} {words}")
+        return text
+
+    return AfterValidator(check)
+
+
 def automatic_warnings(options: Mapping[str, Any]) -> list[str]:
     """Return a warning for each option that leaves its setting to the camera."""
     return [

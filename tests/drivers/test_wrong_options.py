@@ -48,7 +48,7 @@ WRONG = {
         ({"pattern": r"\d+"}, "name the value"),
         ({"pattern": PATTERN, "checksum": "xor"}, "needs a group"),
         ({"pattern": PATTERN, "unit": "R"}, "unit: is 'R'; must be 'C', 'F'"),
-        ({"pattern": PATTERN, "framing": "9N1"}, "framing: is '9N1'"),
+        ({"pattern": PATTERN, "framing": "9N1"}, "framing: '9N1' is not data bits, parity"),
         ({"pattern": PATTERN, "baud": 3}, "baud: is 3; must be at least"),
         ({"instrument": "acme"}, "instrument: is 'acme'; must be 'papouch-tm'"),
         ({"pattern": PATTERN, "unit": "mA"}, "mA needs scale"),
@@ -79,14 +79,15 @@ WRONG = {
     ("output", "relay"): (RELAY, [
         ({"limit_c": 200}, "limit_c: is 200; must be at most"),
         ({"limit_c": 45}, "hold_c: 45 °C is not below the limit"),
-        ({"programme": []}, "at least 1 item"), ({"pin": 99}, "pin"),
+        ({"programme": []}, "must list at least 1"), ({"pin": 99}, "pin"),
         ({"programme": [{"seconds": 10}]}, r"programme\[0\]"),
     ]),
     # a limit above what a battery survives
     ("output", "android_load"): (LOAD, [({}, "limit_c: is 60; must be at most")]),
     ("output", "mqtt"): ({"host": "x"}, [
         ({"password_file": "y"}, "username"), ({"key": "y"}, "cert")]),
-    ("output", "alert_mail"): (OPEN, [({}, "without TLS")]),
+    ("output", "alert_mail"): (OPEN, [
+        ({}, "without TLS"), ({"recipients": ["x"]}, r"recipients\[0\]: 'x' is not an e-mail")]),
     ("output", "alert_exec"): ({"command": ["true"]}, [
         ({"when": [when]}, "when") for when in (
             {}, "c", {"drift": "A1", "px": 1}, {"drift": "c"}, {"drift": "c", "px": 1, "sds": 2},

@@ -87,11 +87,6 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     sensor, targets = _sensor(one), None
     if one.testfield is not None:
         targets = read_testfield(one.testfield)
-        if sensor is None:
-            raise ConfigurationError(
-                f"camera {one.name!r}: a test field also needs `sensor: {{width_px: …, "
-                "height_px: …, pixel_pitch_mm: …}`"
-            )
     elif (scene := camera.known_scene()) is not None:
         targets, sensor = scene[1], sensor or scene[0]
     _check_size(one, camera, sensor)

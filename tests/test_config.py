@@ -113,7 +113,10 @@ BAD = [
     (camera(name="../x"), "cameras[0].name: is '../x'"),
     (camera(driver=None), "cameras[0].driver: is empty; must be text"),
     (camera(testfield="f.csv"), "cameras[0]: `testfield` needs `sensor: {width_px: …"),
-    (camera(testfield="none.csv", sensor=SENSOR), "cameras[0].testfield: there is no file /etc/thermocald/none"),
+    (
+        camera(testfield="none.csv", sensor=SENSOR),
+        "cameras[0].testfield: there is no file /etc/thermocald/none",
+    ),
     (camera(thermometers=["lens", "lens"]), "`thermometers` names one twice"),
     (camera(thermometers=["lense"]), "there is no thermometer 'lense'; is 'lens' meant?"),
     (

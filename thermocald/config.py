@@ -101,7 +101,9 @@ def nearest(key: str, known: list[str]) -> str:
     """Return the end of a message: the known key that may be meant, or all known keys."""
     lower = {name.lower(): name for name in known}
     near = difflib.get_close_matches(key.lower(), lower, 1, 0.5)
-    return f"; is {lower[near[0]]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
+    return (
+        f"; is {lower[near[0]]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
+    )
 
 
 _LIST = "must be a list: [a, b], or lines that begin with `- `"
@@ -320,7 +322,9 @@ class CameraConfig(DeviceConfig):
         if self.control_points is None and self.control_reference is not None:
             raise wrong("`control_reference` needs `control_points`")
         if self.testfield is not None and self.sensor is None:
-            raise wrong("`testfield` needs `sensor: {width_px: …, height_px: …, pixel_pitch_mm: …}`")
+            raise wrong(
+                "`testfield` needs `sensor: {width_px: …, height_px: …, pixel_pitch_mm: …}`"
+            )
         return self
 
 

@@ -333,8 +333,11 @@ def focus_state(dump: str) -> dict[str, Any]:
 def _changed(names: Iterable[str], first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Return the first difference from the first photograph in words, or ""."""
     for name in names:
-        if name in first and now.get(name) != first[name]:
-            return f"{name} was {first[name]} and is {now.get(name)}"
+        was, found = first.get(name), now.get(name)
+        if name == "digital_zoom":  # phones omit it, or report 0, until it is used
+            was, found = was or 1.0, found or 1.0
+        if was is not None and found != was:
+            return f"{name} was {was} and is {found}"
     return ""
 
 

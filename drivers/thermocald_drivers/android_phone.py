@@ -257,8 +257,8 @@ DUMPS = {"battery": "dumpsys battery", "thermal": "dumpsys thermalservice", "zon
 PHONE_RANGE_C = (-30.0, 125.0)
 STATE_UNIT = "set units: {{{channel}: degC}}, tenths or thousandths"
 NO_BATTERY = (
-    "no battery temperature: no battery, frozen values (`dumpsys battery reset` ends that), or an "
-    "unknown unit ({state})"
+    "no battery temperature: no battery, one above 70 °C, frozen values (`dumpsys battery reset` "
+    "ends that), or an unknown unit ({state})"
 )
 # TemperatureType: CPU 0, GPU, BATTERY, SKIN, USB_PORT, POWER_AMPLIFIER; BCL_VOLTAGE 6, BCL_CURRENT
 # and BCL_PERCENTAGE are none; NPU 9, TPU, DISPLAY, MODEM, SOC, WIFI, CAMERA, FLASHLIGHT, SPEAKER,

@@ -214,6 +214,7 @@ FOCUS_MOVED = FOCUS.replace("0.25", "0.31")
 @pytest.mark.parametrize(
     ("change", "tags", "why"),
     [({"media_camera": FOCUS_MOVED}, {}, "focus_distance_dioptres was 0.25 and is 0.31"),
+     ({}, {"zoom": 2.0}, "digital_zoom was 1.0 and is 2.0"),
      ({}, {"distance": 2.0}, "subject_distance_m was 1.5 and is 2.0"),
      ({"media_camera": FOCUS + "android.control.afState (1): byte[1]\n [PASSIVE_SCAN ]\n"}, {},
       "autofocus is at work")],

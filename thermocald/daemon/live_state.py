@@ -179,7 +179,8 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
     if not document["clock"]["trusted"]:
         found.append("the clock is not synchronised: times may be wrong")
     frames = document["frames"]
-    if frames.get("keep") != "none" and not frames.get("ages_known", True):
+    unaged = document["cameras"] and frames.get("keep") != "none"
+    if unaged and not frames.get("ages_known", True):
         found.append("frames are not deleted for their age until the clock is synchronised")
     for kind in ("camera", "thermometer", "output"):
         for name, device in document[f"{kind}s"].items():

@@ -329,7 +329,7 @@ class Service:
                 raise  # a daemon that takes nothing would look healthy: a restart may help
             text = f"the configuration cannot be reloaded, the old one stays in force: {error}"
             log.error("%s", text, extra={"event": "reload_failed"})
-            self._record("reload_failed", str(error))
+            self._record("reload_failed", text)
         else:
             log.info(text, extra={"event": "reloaded"})
         notify(f"READY=1\nSTATUS={self._line()}")

@@ -36,7 +36,7 @@ def wait_little(monkeypatch) -> None:
 
 
 def photograph(
-    when: float, *, iso=100, distance=None, subsecond="250", size=(96, 64), zone=None
+    when: float, *, iso=100, distance=None, subsecond="250", size=(96, 64), zone=None, zoom=None
 ) -> bytes:
     """Return a JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
     image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
@@ -48,6 +48,8 @@ def photograph(
         sub[0x9291] = subsecond
     if zone is not None:
         sub[0x9011] = zone
+    if zoom is not None:
+        sub[0xA404] = zoom
     if distance is not None:
         sub[0x9206] = distance
     tags[0x010F], tags[0x0110] = "Acme", "Phone 4a"

@@ -82,14 +82,15 @@ function fillCameras() {
 }
 
 function noCamera() {
-  return status.pid ? "this daemon takes no camera's epochs; the devices show its thermometers" : "nothing is stored yet";
+  if (chosen()) return `this daemon does not have camera ${chosen()}; its stored data are shown below`;
+  return status.pid ? "this daemon has no camera; its thermometers are listed under Devices" : "nothing is stored yet";
 }
 
 // What a camera does now, in words, and its class of CSS.
 function verdict(camera, last) {
   if (["out", "failed", "hung"].includes(camera.device)) return [`${camera.device}: ${camera.why || "it does not answer"}`, "failed"];
   if (last.epoch === undefined) {
-    return [!camera.device ? noCamera() : camera.series === "" ? "idle: a session begins a series" : "no epoch yet", ""];
+    return [!camera.device ? noCamera() : camera.series === "" ? "idle until a session begins" : "no epoch yet", ""];
   }
   if (["ok", "predicted", "resected", "last_pose"].includes(last.status)) return [last.online?.sentence || last.state, last.state];
   return [last.status.replaceAll("_", " ") + (last.reason ? `: ${last.reason}` : ""),
@@ -212,7 +213,7 @@ async function refreshCourse() {
     options($("series"), series.filter((s) => s.camera === chosen()).map((s) => s.series).reverse());
     for (const id of ["bar", "course"]) $(id).hidden = !$("series").value;
     if (!$("series").value) {
-      $("course-note").textContent = chosen() ? `no epoch of camera ${chosen()} is stored yet` : noCamera();
+      $("course-note").textContent = chosen() ? `no epoch of camera ${chosen()} is stored yet` : "there is no series yet";
       Plotly.purge("course");
       return;
     }

@@ -169,13 +169,13 @@ class _KernelThermometer(support.CheckedThermometer):
                 for key, label in inputs.items()
             }
         by_label = {label: key for key, label in inputs.items() if label}
-        chosen = {}
-        for channel, key in self.options.channels.items():
-            if key not in inputs and key not in by_label:
-                known = ", ".join([*inputs, *by_label])
-                message = f"{folder}: no input {key!r} for {channel!r}; there is {known}"
-                raise support.absent(message, seen=self.seen)
-            chosen[channel] = key if key in inputs else by_label[key]
+        chosen = {
+            channel: key if key in inputs else by_label.get(key, key)
+            for channel, key in self.options.channels.items()
+        }
+        if inputs.keys().isdisjoint(chosen.values()):  # one that is missing is so in each reading
+            message = f"{folder}: no input {', '.join(chosen.values())}; there is "
+            raise support.absent(message + ", ".join([*inputs, *by_label]), seen=self.seen)
         return chosen
 
     def read(self) -> Reading:

@@ -169,11 +169,6 @@ class MockDevice(Device):
         """Return the seconds since the device was first opened; 0 if it never was."""
         return monotonic - (monotonic if self._started is None else self._started)
 
-    def _programme(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return times (n,) s and temperatures (n,) °C."""
-        times, values = np.array(self.options.programme, dtype=float).T
-        return times, values
-
 
 class MockCamera(MockDevice, Camera):
     """A camera that renders the view of a warming camera; equal times give equal frames."""
@@ -252,7 +247,7 @@ class MockCamera(MockDevice, Camera):
         """Return the true orientation and effects at a time of the monotonic clock."""
         from thermocald.physics.history import History
 
-        times, values = self._programme()
+        times, values = np.array(self.options.programme, dtype=float).T
         at = np.array([self._elapsed(monotonic)])
         history = History(at, times, {"temperature": values}, "temperature", 0.0)
         return self.model.predict(history, self.field)
@@ -274,7 +269,7 @@ class MockThermometer(MockDevice, Thermometer):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._times, self._values = self._programme()
+        self._times, self._values = np.array(self.options.programme, dtype=float).T
         self._last: dict[str, float] = {}
 
     def named_channels(self) -> list[str]:

@@ -142,11 +142,11 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         return [Found({"sensors": dict(zip(channels, ids, strict=True))}, about)]
 
     def open(self) -> None:
-        missing = [rom for rom in self.sensors.values() if not (self.root / rom).is_dir()]
-        if missing:
+        # the others are read: one broken cable does not cost their readings after a restart
+        if not any((self.root / rom).is_dir() for rom in self.sensors.values()):
             there = ", ".join(sorted(p.name for p in self.root.glob("??-*"))) or "no sensor"
             raise support.absent(
-                f"1-wire {', '.join(missing)}: not on the bus, there is {there}; "
+                f"1-wire {', '.join(self.sensors.values())}: not on the bus, there is {there}; "
                 "check dtoverlay=w1-gpio and the wiring",
                 seen=self.seen,
             )
@@ -195,6 +195,6 @@ class Ds18b20Thermometer(support.CheckedThermometer):
             except OSError as error:
                 problem = support.fault(error, f"1-wire {rom}", seen=True)
                 if isinstance(problem, DeviceGone):
-                    raise DeviceGone(f"1-wire {rom}: vanished from the bus") from error
+                    raise DeviceGone(f"1-wire {rom}: is not on the bus") from error
         assert problem is not None
         raise problem

@@ -152,7 +152,7 @@ class Picamera2Camera(Camera):
             )
         found = str(cameras[self.options.camera].get("Model", ""))
         if self.options.model is not None and self.options.model != found:
-            raise WrongDevice(f"{self.where}: this is a {found}, not a {self.options.model}")
+            raise WrongDevice(f"{self.where}: this is {found!r}, not {self.options.model!r}")
         try:
             camera = library.Picamera2(self.options.camera)
         except RuntimeError as error:

@@ -73,7 +73,7 @@ def test_an_input_that_was_missing_is_read_when_it_is_there(sysfs, name):
     if name == "it87":
         sysfs.hwmon(0, name, temp2_input="51000")
         options["channels"] = {"lens": "temp1"}
-        problem = "no input 'temp1' for 'lens'; there is temp2"
+        problem = "no input temp1; there is temp2"
     else:
         sysfs.hwmon(0, name)
         problem = "no temperature input is there"
@@ -85,6 +85,16 @@ def test_an_input_that_was_missing_is_read_when_it_is_there(sysfs, name):
     clock.sleep_until(clock.monotonic() + 20.0)
     assert link.do(lambda: read.append(link.device.read()))
     assert list(read[0].values.values()) == [21.0]
+
+
+def test_an_input_that_is_missing_does_not_take_the_others_along(sysfs):
+    sysfs.hwmon(0, "it87", temp2_input="51000")
+    channels = {"lens": "temp1", "board": "temp2"}
+    with thermometer("hwmon", sysfs, chip="it87", channels=channels) as device:
+        reading = device.read()
+        assert (reading.values, *reading.missing) == ({"board": 51.0}, "lens")
+        sysfs.hwmon(0, "it87", temp1_input="21000")
+        assert device.read().values == {"lens": 21.0, "board": 51.0}
 
 
 def test_a_number_handed_on_to_another_chip_is_noticed(sysfs):

@@ -205,7 +205,7 @@ def test_a_partial_frame(pi):
     [
         ({"cameras": ()}, {}, errors.DeviceNotFound, "ribbon cable"),
         ({"busy": True}, {}, errors.DeviceDenied, "another program"),
-        ({}, {"model": "imx477"}, errors.WrongDevice, "this is a imx219, not a imx477"),
+        ({}, {"model": "imx477"}, errors.WrongDevice, "this is 'imx219', not 'imx477'"),
         ({}, {"width": 64}, errors.WrongDevice, "another interior orientation"),  # scaled
         ({}, {"focus_dioptres": 1.0}, errors.WrongDevice, "cannot be focused"),
     ],

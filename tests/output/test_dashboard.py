@@ -121,7 +121,7 @@ def test_epochs_before_the_clock_was_set_are_counted_and_not_drawn(tmp_path, lat
     """A Raspberry Pi without a battery begins in 1970; a simulated series stays there."""
     times = [10.0 * n + (1.75e9 if n >= 5 - late else 0.0) for n in range(5)]
     add_series(tmp_path / "t.db", "rpi", times)
-    columns = View(tmp_path / "t.db", tmp_path).columns("rpi", "M1", None, None, 100)
+    columns = View(tmp_path / "t.db", tmp_path).columns("rpi", "M1", None, 100)
     assert (columns["epochs"], columns["unset"]) == (shown, 5 - shown)
     assert min(columns["frame_time"]) == (1.75e9 + 20.0 if late else 0.0)
 
@@ -231,7 +231,7 @@ def test_no_path_leads_out(client_of, path):
         "", "camera=rpi", "camera=rpi&series=M2", "camera=rpi&series=M1'--",
         "camera=rpi&series=M1&last=nan", "camera=rpi&series=M1&last=-1",
         "camera=rpi&series=M1&points=1e99", "camera=rpi&series=M1&points=x",
-        "camera=rpi&series=M1&until=inf", "camera=" + "r" * 5000 + "&series=M1",
+        "camera=rpi&series=M1&last=inf", "camera=" + "r" * 5000 + "&series=M1",
         "camera=rpi%00&series=M1", "camera=rpi&series=M1&last=1;drop table epoch",
     ],
 )  # fmt: skip

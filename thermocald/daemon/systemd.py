@@ -74,11 +74,11 @@ def set_up_logging(level: str) -> None:
     root.addHandler(handler)
 
 
-def notify(message: str) -> bool:
-    """Send `KEY=value` lines to the service manager; return False if none listens."""
+def notify(message: str) -> None:
+    """Send `KEY=value` lines to the service manager, if one listens."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
-        return False
+        return
     if address.startswith("@"):  # an abstract socket
         address = "\0" + address[1:]
     with (
@@ -87,8 +87,6 @@ def notify(message: str) -> bool:
     ):
         channel.settimeout(1.0)
         channel.sendto(message.encode(), address)
-        return True
-    return False
 
 
 def watchdog_interval_s() -> float | None:

@@ -282,9 +282,8 @@ async def _stream(request: Request) -> Response:
 def _columns(view: View, request: Request) -> dict[str, Any]:
     camera, series = _camera_and_series(request)
     since = _number(request, "last", 1.0, 1e10)
-    until = _number(request, "until", 0.0, 1e11)
     points = _number(request, "points", 2.0, 2000.0)
-    return view.columns(camera, series, since, until, int(points or 1000))
+    return view.columns(camera, series, since, int(points or 1000))
 
 
 def _csv(view: View, request: Request) -> Response:
@@ -315,7 +314,7 @@ _ANSWERS: dict[str, Callable[[View, Request], Any]] = {
     "/api/series": lambda view, _: view.series(),
     "/api/series.csv": _csv,
     "/api/columns": _columns,
-    "/api/events": lambda view, r: view.events(_number(r, "since", 0.0, 1e11) or 0.0),
+    "/api/events": lambda view, _: view.events(),
     "/api/cameras/{camera}/epoch": lambda view, r: view.last_epoch(r.path_params["camera"]),
     "/api/cameras/{camera}/frame": lambda view, r: Response(
         view.last_frame(r.path_params["camera"]), media_type="image/jpeg"

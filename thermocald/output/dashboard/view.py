@@ -154,15 +154,15 @@ class View:
             ]
 
     def columns(
-        self, camera: str, series: str, since_s: float | None, until: float | None, points: int
+        self, camera: str, series: str, since_s: float | None, points: int
     ) -> dict[str, Any]:
         """Return columns for the charts: means over at most `points` bins with equal numbers of
         epochs.
 
-        points: at least 1; until: UTC, s, by default the last epoch; since_s: only this many s
-        before `until`, None: all. A standard deviation is the mean of those of the bin's epochs,
-        hence larger than that of the bin's mean. Epochs taken before the machine knew the time,
-        which `unset` counts, are left out if the series has later ones.
+        points: at least 1; since_s: only the last so many s, None: all. A standard deviation is the
+        mean of those of the bin's epochs, hence larger than that of the bin's mean. Epochs taken
+        before the machine knew the time, which `unset` counts, are left out if the series has later
+        ones.
         """
         names = ["sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
         with Store.open(self.store) as store:
@@ -173,8 +173,6 @@ class View:
             chosen = times >= NOT_BEFORE
             unset = int((~chosen).sum()) if chosen.any() else 0
             chosen |= unset == 0  # a simulated series begins in 1970
-            if until is not None:
-                chosen &= times <= until
             if since_s is not None and chosen.any():
                 chosen &= times >= times[chosen].max() - since_s
             rows = np.flatnonzero(chosen)
@@ -192,10 +190,10 @@ class View:
             **averaged,
         }
 
-    def events(self, since: float) -> list[dict[str, Any]]:
-        """Return the events since a UTC time, s, newest first, at most 200."""
+    def events(self) -> list[dict[str, Any]]:
+        """Return the latest events, newest first, at most 200."""
         with Store.open(self.store) as store:
-            found = store.events(since_utc=since)[-200:]
+            found = store.events()[-200:]
         shown = ("utc", "kind", "text", "epoch")
         return [{name: getattr(event, name) for name in shown} for event in reversed(found)]
 

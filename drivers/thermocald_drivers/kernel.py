@@ -238,10 +238,10 @@ class HwmonThermometer(_KernelThermometer):
         fault = folder / f"{key}_fault"
         if fault.exists() and _number(fault) != 0:
             raise BadReading(f"{folder.name} {key}: the chip reports a broken sensor (fault flag)")
-        number = _number(folder / f"{key}_input")
-        if not number.is_integer():
-            raise BadReading(f"{folder.name} {key}: {number:g} is not a whole number of 1/1000 °C")
-        value = number / 1000.0
+        text = support.read_line(folder / f"{key}_input")
+        value = support.parse_number(text) / 1000.0
+        if not text.lstrip("+-").isdecimal():
+            raise BadReading(f"{folder.name} {key}: {text} is not a whole number of 1/1000 °C")
         if self._name.startswith("w1_") and value in chips.idle_celsius("ds18b20"):
             raise BadReading(
                 f"{folder.name} {key}: {value:g} °C is a 1-wire power-on value; use driver: "

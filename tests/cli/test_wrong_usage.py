@@ -59,6 +59,8 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
             ("simulate", "--preset", "rpi-v2.1-heating", "--out", "o", "--series", "a/b"),
             "series: 'a/b' cannot be part of a file's name",
         ),
+        (("run", "--config", "idle.yaml", "--epochs", "2"), "--epochs: no camera of the config"),
+        (("doctor", "--root", "/nowhere"), "--root /nowhere: there is no such folder"),
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),
@@ -69,8 +71,9 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
     ],
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
 )
-def test_it_is_one_line(words, said):
-    status, lines = _typed(*words)
+def test_it_is_one_line(words, said, tmp_path):
+    (tmp_path / "idle.yaml").write_text("cameras: [{name: a, driver: mock, series: null}]")
+    status, lines = _typed(*words, folder=tmp_path)
     assert status == 2
     assert len(lines) == 1
     assert re.search(said, lines[0])

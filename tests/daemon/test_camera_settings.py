@@ -114,6 +114,7 @@ def test_a_start_is_refused_only_for_other_thermometers_or_targets(tmp_path, bef
         names = [one["name"] for one in thermometers]
         document = {"cameras": [replayed_camera(recording, name="r", thermometers=names)],
                     "thermometers": devices, "frames": {"keep": "none"}}  # fmt: skip
+        document["cameras"].append({**document["cameras"][0], "name": "idle", "series": None})
         config = parse_config(document, tmp_path / "config.yaml")
         assert Service(config, fast=True, epochs=1, until_finished=True).run()
 

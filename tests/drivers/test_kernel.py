@@ -33,7 +33,8 @@ READ = [
     ("hwmon", "it87", {"temp1_input": "85000"}, {}, {"temperature": 85.0}),
     ("hwmon", "w1_slave_temp", {"temp1_input": "85000"}, {}, "power-on"),
     ("hwmon", "lm90", {"temp1_input": "21000", "temp1_fault": "1"}, {}, "fault"),
-    ("hwmon", "lm75", {"temp1_input": "31.5"}, {}, "31.5 is not a whole number of 1/1000 °C"),
+    *(("hwmon", "lm75", {"temp1_input": text}, {}, f"{text} is not a whole number of 1/1000 °C")
+      for text in ("31.5", "31.0")),
     *(("hwmon", "lm75", {"temp1_input": text}, {}, "not a number") for text in ("", "٢٨٠٠٠")),
     # bmp280 family: raw only; ABI: (raw + offset) * scale in m°C
     ("iio", "tmp006", {"in_temp_ambient_raw": "731", "in_temp_scale": "31.25",

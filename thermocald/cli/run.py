@@ -85,6 +85,8 @@ def run(
         read = recording_config(recording, store)
     else:
         read = mock_config()
+    if epochs and not any(camera.series for camera in read.cameras):
+        raise UsageError("--epochs: no camera of the configuration takes a series, so none counts")
     set_up_logging(read.logging.level)
     service = Service(
         with_options(read),
@@ -260,6 +262,8 @@ def doctor(
     """
     from thermocald.machine import Machine, finding_lines
 
+    if not root.is_dir():
+        raise UsageError(f"--root {root}: there is no such folder")
     findings = Machine.here(root).findings()
     document = {"format": "thermocald-doctor/1", "findings": findings}
     show(document, json, *finding_lines(findings))

@@ -268,9 +268,10 @@ class Station:
 
     @property
     def finished(self) -> bool:
-        """Whether no camera will take another epoch and all epochs are stored."""
-        return bool(self.cameras) and all(
-            camera.loop.join(0.0) and not camera.waiting() for camera in self.cameras
+        """Whether no camera with a series will take another epoch and all epochs are stored."""
+        taking = [camera for camera in self.cameras if camera.run is not None]
+        return bool(taking) and all(
+            camera.loop.join(0.0) and not camera.waiting() for camera in taking
         )
 
     def line(self, camera: str) -> CameraLine | None:

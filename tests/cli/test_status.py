@@ -126,9 +126,7 @@ def test_top_in_a_pipe_writes_lines_until_it_ends(monkeypatch, capsys):
     assert "\x1b" not in said
 
 
-@pytest.mark.parametrize(
-    "words", ["run --help", "session start --help", "status --store absent.db"]
-)
+@pytest.mark.parametrize("words", ["session start --help", "status --store absent.db"])
 def test_a_command_that_calculates_nothing_starts_without_numpy(words, tmp_path):
     program = (
         f"import sys; from thermocald.cli import main; sys.argv[1:] = {words.split()}\n"

@@ -27,7 +27,7 @@ HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 def store(tmp_path_factory, forker):
     """The store of one daemon with five cameras that see the same until epoch 13."""
     folder = tmp_path_factory.mktemp("changes")
-    taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4, interval=10.0))
+    taken = read_recording(make_recording(folder / "taken", EPOCHS, interval=10.0))
     field, sensor = taken.testfield, taken.camera.sensor
     model = demonstration_model(demonstration_field("markers"))
     iop, eop = model.interior.as_array(), model.exterior.as_array()

@@ -305,7 +305,7 @@ LABORATORY = {
     },
     ("thermometer", "ds18b20"): on_tree(
         lambda tree, k: tree.w1(ROM, w1_slave(21.5 + 0.0625 * k)).parent,
-        "vanished",
+        "is not on the bus",
         sensors={"temperature": ROM},
     ),
     ("thermometer", "hwmon"): on_tree(

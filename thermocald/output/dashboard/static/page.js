@@ -78,6 +78,7 @@ function chosen() { return $("camera").value; }
 
 function fillCameras() {
   const names = [...Object.keys(status.cameras || {}), ...series.map((s) => s.camera).reverse()];
+  $("camera").parentElement.hidden = !names.length;
   if (names.length) options($("camera"), [...new Set(names)]);
 }
 
@@ -114,7 +115,7 @@ function showCamera(camera) {
   figures.push(["σ₀", fixed(last.sigma0, 3), `${counted(last.n_observations, "target")}, ${last.n_rejected} rejected`]);
   if (online.orientation) figures.push(["Camera", online.orientation, ""]);
   const session = (status.sessions || {})[chosen()];
-  if (session) figures.push(["Session", `${session.series}: ${session.taken} of ${session.epochs} epochs, ${session.state}`, session.why]);
+  if (session) figures.push(["Session", `${session.series}: ${session.taken} of ${session.epochs} epochs, ${session.state}${session.why && ":"}`, session.why]);
   rows("figures", figures.flatMap(([name, value, more]) => {
     const dd = element("dd", value + " ");
     dd.append(element("small", more));

@@ -109,21 +109,21 @@ class HeatingOutput(Output):
     def _decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
         """Return whether to heat now; set `tripped` (a sentence) when the limit is reached."""
         limit = self.options.limit_c
-        if temperature_c is not None and not math.isfinite(temperature_c):
-            temperature_c = None
-        if temperature_c is not None and temperature_c >= limit:
+        if temperature_c is None or not math.isfinite(temperature_c):
+            temperature_c = math.nan
+        if temperature_c >= limit:
             self.tripped = f"{self.channel} {temperature_c:.2f} °C reached the limit {limit:g} °C"
         steps = self.options.programme
         ends = itertools.accumulate(step.seconds for step in steps)
         hold_c = next(
             (s.hold_c for s, end in zip(steps, ends, strict=True) if elapsed_s < end), None
         )
-        if temperature_c is not None:
+        if known := not math.isnan(temperature_c):
             self._known_at = elapsed_s
         half = self.options.hysteresis_k / 2
         if self.tripped or hold_c is None:
             self.heating = False
-        elif temperature_c is None:  # an occasional missing value does not stop a warm-up
+        elif not known:  # an occasional missing value does not stop a warm-up
             self.heating = self.heating and elapsed_s - self._known_at < self.options.unknown_s
         elif temperature_c >= hold_c + half or temperature_c <= hold_c - half:
             self.heating = temperature_c < hold_c

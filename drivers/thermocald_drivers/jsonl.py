@@ -79,7 +79,11 @@ class JsonLinesOutput(Output):
         self.opened()
         line = encode(result) + b"\n"
         try:
-            self._reopen_if_moved()
+            mine, here = os.fstat(self.handle.fileno()), None
+            with contextlib.suppress(FileNotFoundError):
+                here = self.path.stat()
+            if here is None or not os.path.samestat(here, mine):  # moved, or deleted
+                self.open()
             self._write(line)
         except BrokenPipeError as error:
             raise DeviceGone(f"{self.path}: no program reads the pipe any longer") from error
@@ -105,15 +109,6 @@ class JsonLinesOutput(Output):
                 os.ftruncate(file_number, size - len(half))
             elif half:
                 os.write(file_number, b"\n")
-
-    def _reopen_if_moved(self) -> None:
-        try:
-            here = self.path.stat()
-        except FileNotFoundError:
-            here = None
-        mine = os.fstat(self.handle.fileno())
-        if here is None or (here.st_ino, here.st_dev) != (mine.st_ino, mine.st_dev):
-            self.open()
 
     def _write(self, line: bytes) -> None:
         """Write the whole line; on failure, remove the part that was written."""

@@ -85,7 +85,8 @@ WRONG = {
     # a limit above what a battery survives
     ("output", "android_load"): (LOAD, [({}, "limit_c: is 60; must be at most")]),
     ("output", "mqtt"): ({"host": "x"}, [
-        ({"password_file": "y"}, "username"), ({"key": "y"}, "cert")]),
+        ({"password_file": "y"}, "username"), ({"key": "y"}, "cert"),
+        *(({"topic": topic}, "is not a topic") for topic in ("", "/$SYS", "a/#"))]),
     ("output", "alert_mail"): (OPEN, [
         ({}, "without TLS"), ({"recipients": ["x"]}, r"recipients\[0\]: 'x' is not an e-mail")]),
     ("output", "alert_exec"): ({"command": ["true"]}, [

@@ -49,14 +49,8 @@ class FrameFolder:
 
     def wanted(self, number: int, eventful: bool) -> bool:
         """Return whether the frame of an epoch is to be kept by the configuration."""
-        match self.config.keep:
-            case "all":
-                return True
-            case "every_n":
-                return number % self.config.every_n == 0
-            case "events":
-                return eventful
-        return False
+        kinds = {"all": True, "every_n": number % self.config.every_n == 0, "events": eventful}
+        return kinds.get(self.config.keep, False)
 
     def keep(self, camera: str, series: str, number: int, frame: Frame) -> Path | None:
         """Write a frame; return its path relative to the folder, None if it cannot be written.

@@ -59,19 +59,12 @@ class JournalHandler(logging.Handler):
 
 def set_up_logging(level: str) -> None:
     """Log to the journal under systemd, to standard error otherwise."""
-    root = logging.getLogger()
-    root.setLevel(level.upper())
-    for old in list(root.handlers):
-        root.removeHandler(old)
-        old.close()
-    handler: logging.Handler
+    handler: logging.Handler = logging.StreamHandler(sys.stderr)
+    form = "%(asctime)s %(levelname)s %(name)s: %(message)s"
     if os.environ.get("JOURNAL_STREAM") and os.path.exists(_SOCKET):
-        handler = JournalHandler()
-        handler.setFormatter(CleanFormatter("%(message)s"))
-    else:
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(CleanFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    root.addHandler(handler)
+        handler, form = JournalHandler(), "%(message)s"
+    handler.setFormatter(CleanFormatter(form))
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
 
 
 def notify(message: str) -> None:

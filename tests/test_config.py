@@ -170,7 +170,7 @@ def test_options_are_checked_against_the_driver():
     with pytest.raises(ConfigurationError, match=r"\[0\].driver: there is no camera driver"):
         parse(camera(driver="nikon"), load_driver=load_driver)
     log = {"name": "log", "driver": "jsonl", "path": ""}
-    with pytest.raises(ConfigurationError, match=r"outputs\[0\]: path: is ''; must not be empty"):
+    with pytest.raises(ConfigurationError, match=r"outputs\[0\]: path: '' is empty or holds a NUL"):
         parse(document(outputs=[log]), load_driver=load_driver)
 
 

@@ -148,9 +148,7 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         message = str(context["error"])
     elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
-        empty = first["type"] == "too_short" and first["input"] == ""
-        kind = "string_too_short" if empty else first["type"]
-        if rule := _RULES.get(context.get("pattern") or kind):
+        if rule := _RULES.get(context.get("pattern") or first["type"]):
             message = rule.format(**context)
             if isinstance(first["input"], list | dict):
                 message = message.removesuffix("; put it in quotes")

@@ -186,16 +186,16 @@ class _Broker(Output):
             kind = DeviceGone if error.verify_code == _NOT_YET_VALID else DeviceDenied
             raise kind(f"{self.where}: {support.reason(error)}; check ca") from error
         except (OSError, ValueError) as error:
-            why = support.reason(error)
-            raise DeviceGone(f"{self.where}: cannot connect ({why})") from error
+            raise DeviceGone(f"{self.where}: cannot connect ({support.reason(error)})") from error
         self.handle = client
         client.loop_start()
         try:
             code = answered.result(self.options.timeout_s)
         except TimeoutError:
             _Broker.close(self)
-            why = f"no answer in {self.options.timeout_s:g} s"
-            raise DeviceTimeout(f"{self.where}: {why}") from None
+            raise DeviceTimeout(
+                f"{self.where}: no answer in {self.options.timeout_s:g} s"
+            ) from None
         if code.is_failure:
             _Broker.close(self)
             if code.value == _UNAVAILABLE:

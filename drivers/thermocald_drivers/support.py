@@ -45,14 +45,25 @@ if TYPE_CHECKING:
     Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 
+def like(pattern: str, words: str) -> AfterValidator:
+    """Return a validator that accepts text that matches as a whole; words: what other text is."""
+
+    def check(text: str) -> str:
+        if not re.fullmatch(pattern, text):
+            raise ConfigurationError(f"{text!r:.60} {words}")
+        return text
+
+    return AfterValidator(check)
+
+
 AUTO = "auto"
 """The value that leaves a setting to the camera."""
 Text = Annotated[
     str,
     BeforeValidator(lambda v: str(v) if type(v) is int else v),
-    Field(min_length=1, pattern=r"^[^\x00]*$"),
+    like(r"[^\0]+", "is empty or holds a NUL"),
 ]
-"""A text option, without NUL; a whole number is accepted as the text that was written."""
+"""A text option; a whole number is accepted as the text that was written."""
 Seconds = Annotated[float, Field(ge=0.01, le=600.0)]
 """A time-out."""
 Celsius = Annotated[float, Field(ge=-273.15, le=3000.0)]
@@ -85,17 +96,6 @@ def or_auto(low: float, high: float) -> AfterValidator:
         if isinstance(value, int | float) and not low <= value <= high:
             raise ConfigurationError(f"{value:g} is not within {low:g} … {high:g}")
         return value
-
-    return AfterValidator(check)
-
-
-def like(pattern: str, words: str) -> AfterValidator:
-    """Return a validator that accepts text that matches as a whole; words: what other text is."""
-
-    def check(text: str) -> str:
-        if not re.fullmatch(pattern, text):
-            raise ConfigurationError(f"{text!r} {words}")
-        return text
 
     return AfterValidator(check)
 

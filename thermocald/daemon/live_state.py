@@ -174,20 +174,19 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
         found.append(f"store: {store['notice']}")
     if document.get("dashboard", {}).get("why"):
         found.append(document["dashboard"]["why"])
-    if document["frames"]["paused"]:
-        found.append(document["frames"]["paused"])
+    frames, cameras = document["frames"], document["cameras"]
+    if frames["paused"]:
+        found.append(frames["paused"])
     if not document["clock"]["trusted"]:
         found.append("the clock is not synchronised: times may be wrong")
-    frames = document["frames"]
-    unaged = document["cameras"] and frames.get("keep") != "none"
-    if unaged and not frames.get("ages_known", True):
+    if cameras and frames.get("keep") != "none" and not frames.get("ages_known", True):
         found.append("frames are not deleted for their age until the clock is synchronised")
     for kind in ("camera", "thermometer", "output"):
         for name, device in document[f"{kind}s"].items():
             found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]
             if device["why"]:
                 found.append(f"{kind} {name}: {device['why']}")
-    for name, camera in document["cameras"].items():
+    for name, camera in cameras.items():
         if camera["deferred"] > camera["caught_up"]:
             found.append(
                 f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "

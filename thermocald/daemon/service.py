@@ -85,8 +85,7 @@ class DashboardProcess:
         command = [sys.executable, "-m", "thermocald", "dashboard"]
         command += ["--store", str(self._store), "--live", str(self._live)]
         command += ["--host", config.host, "--port", str(config.port)]
-        for name in config.names:
-            command += ["--name", name]
+        command += [word for name in config.names for word in ("--name", name)]
         if config.token_file is not None:
             command += ["--token-file", str(config.token_file)]
         environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
@@ -359,13 +358,11 @@ class Service:
         return text
 
     def _report_stalled(self, stalled: list[str]) -> None:
-        for text in stalled:
-            if text not in self._stalled:
-                log.error(text, extra={"event": "hung"})
-                self._record("hung", text)
-        for text in self._stalled:
-            if text not in stalled:
-                log.info("%s no longer", text, extra={"event": "hung_no_more"})
+        for text in set(stalled).difference(self._stalled):
+            log.error(text, extra={"event": "hung"})
+            self._record("hung", text)
+        for text in set(self._stalled).difference(stalled):
+            log.info("%s no longer", text, extra={"event": "hung_no_more"})
         self._stalled = stalled
 
     def _record(self, kind: str, text: str) -> None:

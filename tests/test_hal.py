@@ -14,14 +14,6 @@ from thermocald.errors import BadReading, ConfigurationError, DriverMissing, The
 from thermocald.hal import Frame, Reading, SystemClock, VirtualClock, load_driver
 
 
-@pytest.mark.parametrize("name", ["v4l2", "android"])
-def test_a_camera_states_the_size_of_its_frames(name):
-    place = {"v4l2": {"device": "/dev/video0", "pixel_format": "GREY"}, "android": {"serial": "a"}}
-    size = {"width": 640, "height": 480}
-    camera = hal.open_device("camera", name, {**place[name], **size}, VirtualClock())
-    assert camera.frame_size() == (640, 480)
-
-
 def test_a_frame_cannot_be_changed_and_holds_something():
     frame = Frame(np.zeros((4, 5), dtype=np.uint8), 1.0, 2.0)
     with pytest.raises(ValueError, match="read-only"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,8 +24,6 @@ from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Frame, VirtualClock
 from thermocald.photogrammetry.epoch.adjustment import failed
-from thermocald.physics.testfields import demonstration_field
-from thermocald.store.recording.testfield_file import write_testfield
 from thermocald.store.series import EpochResult
 
 CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}
@@ -151,10 +148,3 @@ def test_a_sensor_of_another_size_than_the_driver_is_refused():
     assert plan_of(sensor=sensor).sensor.width == 64
     with pytest.raises(ConfigurationError, match=r"sensor has 1920×1080 px.* have 64×48 px"):
         plan_of(sensor={**sensor, "width_px": 1920, "height_px": 1080})
-
-
-def test_a_test_field_without_a_sensor_names_the_missing_keys(tmp_path):
-    write_testfield(tmp_path / "field.csv", demonstration_field())
-    example = "sensor: {width_px: …, height_px: …, pixel_pitch_mm: …}"
-    with pytest.raises(ConfigurationError, match=re.escape(f"`{example}`")):
-        plan_of(testfield=str(tmp_path / "field.csv"))

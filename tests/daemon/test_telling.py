@@ -57,16 +57,6 @@ def log(journal, monkeypatch):
     handler.close()
 
 
-@pytest.mark.parametrize(("level", "priority"), [
-    (logging.DEBUG, "7"), (logging.INFO, "6"), (logging.WARNING, "4"), (logging.ERROR, "3"),
-])  # fmt: skip
-def test_levels_are_the_journals(log, journal, level, priority):
-    log.log(level, "x")
-    entry = journal.entry()
-    assert entry["PRIORITY"] == priority
-    assert "THERMOCALD_EVENT" not in entry
-
-
 def test_lines_and_forged_fields_in_a_message_stay_in_the_message(log, journal):
     """A device's answer must not write fields."""
     message = "first\nPRIORITY=0\nMESSAGE=forged = yes\nlast"
@@ -76,6 +66,8 @@ def test_lines_and_forged_fields_in_a_message_stay_in_the_message(log, journal):
     assert entry["PRIORITY"] == "3"
     assert entry["THERMOCALD_DEVICE"] == "a\nTHERMOCALD_EVENT=forged"
     assert "THERMOCALD_EVENT" not in entry
+    log.debug("x")
+    assert journal.entry()["PRIORITY"] == "7"
 
 
 def test_without_a_journal_it_goes_to_standard_error(log, journal, capsys):

@@ -16,7 +16,7 @@ from thermocald.photogrammetry.field.testfield import (
 
 @pytest.mark.parametrize(
     "layout",
-    [{}, {"per_side": 3}, {"per_side": 4, "inset": 20.0}, {"per_side": 4, "inset": 3.0}],
+    [{}, {"per_side": 3}, {"per_side": 4, "inset": 20.0}, {"per_side": 3, "inset": 3.0}],
     ids=["7", "3", "near the edge", "at the edge"],
 )
 def test_the_sheets_of_a_corner_are_separated(layout):

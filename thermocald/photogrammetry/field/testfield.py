@@ -293,6 +293,7 @@ _ITERATIONS = 20
 _EXCHANGES = 5
 _SIGMAS = 4.0  # tolerance, in standard deviations of the coordinates
 _APART = 2.5  # times the distance between neighbours; farther is another board
+_AROUND = 0.5  # share of a target's nearest that are on the same board, at least
 _SEEDS = 60
 _LOCAL = 8  # nearest targets on a board, for a normal
 _PLATE = 4  # targets of a small plate, or at the rim of a board
@@ -439,9 +440,13 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
                 count += 1
     taken = labels.copy()
     _exchange(points, labels, _APART * spacing, max(_CREASE * spacing, least))
-    for back in (taken, np.full_like(labels, -1)):  # parts too small for a board
-        small = np.bincount(labels + 1)[labels + 1] < FEWEST_ON_A_SHEET
-        labels[small] = back[small]
+    for back in (taken, np.full_like(labels, -1)):
+        count = np.bincount(labels + 1)
+        around = np.mean(labels[near[:, 1 : _PLATE + 1]] == labels[:, None], axis=1)
+        # targets that are in a plane by chance have others nearer
+        chance = np.bincount(labels + 1, around) < _AROUND * count
+        none = (chance | (count < FEWEST_ON_A_SHEET))[labels + 1]
+        labels[none] = back[none]
     return np.unique(labels, return_inverse=True)[1] - (labels.min() < 0)
 
 

@@ -28,7 +28,7 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField, f
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
-from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.circle import fit_circles, unknown_tilt
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.targets.markers import corners_turned_deg, is_marker, locate_markers
@@ -59,7 +59,7 @@ def predict_circles(
     """Predict the outlines of the field's circles that face the camera and lie in the image.
 
     normals (n, 3): of the targets, by default from the planes of the field. A circle without a
-    normal is assumed to face the camera, and has no eccentricity. Returns rows and maps.
+    normal is assumed to face the camera (`add_unknown_tilts`). Returns rows and maps.
     """
     rows = np.nonzero(testfield.circles & np.isfinite(testfield.diameters))[0]
     points = testfield.points[rows]
@@ -76,6 +76,21 @@ def predict_circles(
         & (cosine > _LARGEST_TILT_COSINE)
     )
     return rows[visible], maps.select(visible)
+
+
+def add_unknown_tilts(
+    covariances: Array,
+    testfield: TestField,
+    camera: CameraModel,
+    rows: NDArray[np.int64],
+    maps: LocalMap,
+    parameters: Array,
+) -> None:
+    """Add to covariances (n, 2, 2) px² of rows (n,) of a field what unknown normals cause."""
+    loose = np.isnan(field_normals(testfield)[rows, 0])
+    if loose.any():
+        c_px = camera.interior.c / camera.sensor.pixel_pitch
+        covariances[loose] += unknown_tilt(maps.select(loose), parameters[loose], c_px)
 
 
 _FEWEST = 4
@@ -245,13 +260,14 @@ class _Frame:
             start = fit.parameters if same and good.all() else None
             if same:
                 new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
-            rows = new_rows
-            fit = fit_circles(image, new_maps, have_rings(field, rows), blur, None, start)
+            rows, maps = new_rows, new_maps
+            fit = fit_circles(image, maps, have_rings(field, rows), blur, None, start)
         # a circle far from the predicted place is not the target
         predicted = better.camera.project(better.exterior, field.points[rows])
         off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
         limit = max(_GROSS_PX, _GROSS_SD * min(better.scatter, 1.0))
         fit.reasons[fit.good & (off > limit)] = "not where the target must be"
+        add_unknown_tilts(fit.covariances, field, better.camera, rows, maps, fit.parameters)
         return fit.observations(rows, fit.good), fit.missed(rows), better
 
     def _finish(

@@ -195,6 +195,7 @@ def numbered_rings(
 
 _CODE = re.compile(r"CHESS:(\d{1,3})x(\d{1,3}):(\d{1,5})")
 _QUIET_SHARE = 0.45  # of the distance between corners, if no marker is nearer
+_QUADRANGLES_PIXELS = 700_000  # a search without a board takes minutes in a larger image
 
 
 def chess_code(columns: int, rows: int, number: int) -> str:
@@ -244,11 +245,13 @@ def locate_chessboards(
 
 def _find_board(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Return a board's inner corners (rows, columns, 2) px, right-handed, from its black corner."""
-    scale = 2 if grey.size > LARGE_PIXELS else 1
-    small = halved(grey) if scale > 1 else grey
-    size = (columns, rows)
+    scale, small, size = 1, grey, (columns, rows)
+    if grey.size > LARGE_PIXELS:
+        scale, small = 2, halved(grey)
     done, corners = cv2.findChessboardCornersSB(small, size, flags=0)
     if not done:  # an oblique or blurred board: by its quadrangles
+        while small.size > _QUADRANGLES_PIXELS:
+            scale, small = 2 * scale, halved(small)
         done, corners = cv2.findChessboardCorners(small, size)
     if not done:
         return None

@@ -20,7 +20,7 @@ from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
 from thermocald.names import tell_apart
-from thermocald.numbers import percent, typeset_powers, with_sd
+from thermocald.numbers import percent, plain, typeset_powers, with_sd
 from thermocald.output.study.report import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
@@ -225,7 +225,7 @@ class Calibration(Photographs, Result):
             line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
             if p["exterior"] is not None:
                 e = p["exterior"]
-                line += f", {p['rms_px']:.2f} px, at " + ", ".join(
+                line += f", {plain(p['rms_px'], 'px', 2)}, at " + ", ".join(
                     with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
                 )
                 line += " mm"

@@ -95,8 +95,8 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     more = (
         (
             f"{len(posed)} of {len(result.photographs)} photographs, {len(points)} image points, "
-            f"{left_out} left out; residuals of {rms:.3f} px (RMS per coordinate){fit}. The points "
-            f"cover {percent(covered)} of the image."
+            f"{left_out} left out; residuals of {plain(rms, 'px', 3)} (RMS per coordinate){fit}. "
+            f"The points cover {percent(covered)} of the image."
         ),
     )
     if covered < _LITTLE_COVERED:
@@ -271,7 +271,7 @@ def _photographs(result: Photographs) -> Table:
             "result": lambda p: _outcome(p, ": "),
             "targets": lambda p: str(p.n_targets),
             "left out": lambda p: str(len(p.rejected)),
-            "RMS px": lambda p: f"{p.rms_px:.3f}" if np.isfinite(p.rms_px) else "–",
+            "RMS px": lambda p: plain(p.rms_px, digits=3),
             "X0, Y0, Z0 mm ± sd": place,
         },
     )

@@ -441,13 +441,14 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
     taken = labels.copy()
     _exchange(points, labels, _APART * spacing, max(_CREASE * spacing, least))
     for back in (taken, np.full_like(labels, -1)):
-        count = np.bincount(labels + 1)
+        size = np.bincount(labels + 1)
         around = np.mean(labels[near[:, 1 : _PLATE + 1]] == labels[:, None], axis=1)
         # targets that are in a plane by chance have others nearer
-        chance = np.bincount(labels + 1, around) < _AROUND * count
-        none = (chance | (count < FEWEST_ON_A_SHEET))[labels + 1]
+        chance = np.bincount(labels + 1, around) < _AROUND * size
+        none = (chance | (size < FEWEST_ON_A_SHEET))[labels + 1]
         labels[none] = back[none]
-    return np.unique(labels, return_inverse=True)[1] - (labels.min() < 0)
+    compact = np.unique(labels, return_inverse=True)[1]
+    return compact - int(labels.min() < 0)
 
 
 def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:

@@ -149,8 +149,9 @@ def unknown_tilt(maps: LocalMap, parameters: Array, c_px: float) -> Array:
     linear = maps.linear @ inverse_2x2(parameters[:, [[2, 3], [3, 4]]] + np.eye(2))
     squares, axes = np.linalg.eigh(linear @ np.swapaxes(linear, 1, 2))
     minor, major = squares.T
-    square: Array = (minor * (major - minor))[:, None, None] / c_px**2
-    return square * axes[:, :, :1] @ np.swapaxes(axes[:, :, :1], 1, 2)
+    off = np.sqrt(minor * (major - minor))[:, None] / c_px * axes[:, :, 0]
+    covariances: Array = off[:, :, None] * off[:, None]
+    return covariances
 
 
 _SMALLEST_SEMI_AXIS_PX = 1.8

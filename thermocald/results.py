@@ -169,6 +169,15 @@ class Calibration(Photographs, Result):
         c, x0, y0 = self.interior.as_array()[:3].tolist()
         return found + interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 
+    @property
+    def _notes(self) -> list[str]:
+        """The doubts and what was assumed, for text and report."""
+        assumed = (
+            "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths of "
+            "px; give --pixel-pitch or --camera"
+        )
+        return doubt_lines(self.doubts) + [assumed] * self.pitch_assumed
+
     @cached_property
     def camera(self) -> Camera:
         """The camera, with its covariance if it was estimated.
@@ -213,12 +222,7 @@ class Calibration(Photographs, Result):
             lines += [
                 "  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows
             ]
-            lines += doubt_lines(document["doubts"])
-            if document["camera"]["pixel_pitch_assumed"]:
-                lines.append(
-                    "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are "
-                    "thousandths of px; give --pixel-pitch or --camera"
-                )
+            lines += self._notes
         else:
             lines.append(f"not calibrated: {document['reason']}")
         for p in document["photographs"]:
@@ -239,7 +243,7 @@ class Calibration(Photographs, Result):
         from thermocald.output.calibration import render_calibration
 
         name = title or self.file.name
-        return render_calibration(self, self.file.sensor, name, self.doubts)
+        return render_calibration(self, self.file.sensor, name, self._notes)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""

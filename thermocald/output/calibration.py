@@ -28,7 +28,6 @@ from thermocald.numbers import (
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
-from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -46,9 +45,9 @@ _FEW_NAMES = 3  # for which a legend or a line has room
 
 
 def render_calibration(
-    result: Photographs, sensor: Sensor, name: str, doubts: Sequence[str] = ()
+    result: Photographs, sensor: Sensor, name: str, notes: Sequence[str] = ()
 ) -> str:
-    """Return the report as HTML text; doubts: probable mistakes in the estimated camera."""
+    """Return the report as HTML text; notes: doubts of the estimated camera, and assumptions."""
     posed = [p for p in result.photographs if len(p.points)]
     tables = (interior_table(result, sensor), _correlations(result))
     sections = (
@@ -61,7 +60,7 @@ def render_calibration(
         _answer(result, posed, sensor),
         tuple(s for s in sections if s.figures or s.tables),
         (f"{name}, {sensor}.",),
-        tuple(map(as_sentence, doubt_lines(doubts))),
+        tuple(map(as_sentence, notes)),
     ).page()
 
 

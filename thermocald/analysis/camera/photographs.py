@@ -189,7 +189,7 @@ def calibrate_observations(
             held = "" if camera.interior else ", and no --camera gives it"
             raise GeometryError(f"the interior orientation is held (--free none){held}")
         if not usable:
-            raise GeometryError(_NO_TARGETS)
+            raise GeometryError(_NO_TARGETS if seen else "none can be read")
         rows, together = _adjust_together(usable, testfield, camera, settings)
         left_out = together.left_out
         failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
@@ -204,8 +204,7 @@ def calibrate_observations(
         poses = {}
         for k in seen.keys() - failures.keys():
             if interior is None:
-                why = f"without an interior orientation there is no pose: {reason}"
-                failures[k] = (status, why)
+                failures[k] = status, "without an interior orientation there is no pose"
                 continue
             pose = pose_only(camera.sensor, testfield, seen[k], interior, settings)
             if pose.ok:
@@ -305,7 +304,10 @@ def images_of(given: Sequence[Path]) -> list[Path]:
             continue
         if not path.is_dir():
             raise UsageError(f"{path}: there is no such file")
-        found = sorted(p for p in path.iterdir() if p.suffix.lower() in _IMAGES)
+        # macOS leaves ._IMG_1.jpg, which is no image, beside IMG_1.jpg
+        found = sorted(
+            p for p in path.iterdir() if p.suffix.lower() in _IMAGES and p.name[0] != "."
+        )
         if not found:
             raise UsageError(f"{path}: the folder holds no image ({', '.join(sorted(_IMAGES))})")
         images += found

@@ -25,10 +25,10 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
-from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.photogrammetry.linalg import inverse_2x2, mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
-from thermocald.photogrammetry.targets.circle import fit_circles, unknown_tilt
+from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.targets.markers import corners_turned_deg, is_marker, locate_markers
@@ -79,18 +79,22 @@ def predict_circles(
 
 
 def add_unknown_tilts(
-    covariances: Array,
-    testfield: TestField,
-    camera: CameraModel,
-    rows: NDArray[np.int64],
-    maps: LocalMap,
-    parameters: Array,
-) -> None:
-    """Add to covariances (n, 2, 2) px² of rows (n,) of a field what unknown normals cause."""
+    covariances: Array, testfield: TestField, camera: CameraModel, rows: NDArray[np.int64],
+    maps: LocalMap, parameters: Array,
+) -> None:  # fmt: skip
+    """Add to covariances (n, 2, 2) px² of rows (n,) of a field what unknown normals cause.
+
+    A circle without a normal was taken to face the camera. The axes a, b of its ellipse give its
+    tilt, not the sense, so that the centre is off by the eccentricity b √(a² − b²)/c along the
+    minor axis, one way or the other. parameters (n, 10): fitted with the maps.
+    """
     loose = np.isnan(field_normals(testfield)[rows, 0])
-    if loose.any():
-        c_px = camera.interior.c / camera.sensor.pixel_pitch
-        covariances[loose] += unknown_tilt(maps.select(loose), parameters[loose], c_px)
+    shapes = parameters[loose][:, [[2, 3], [3, 4]]] + np.eye(2)
+    linear = maps.linear[loose] @ inverse_2x2(shapes)
+    squares, axes = np.linalg.eigh(linear @ np.swapaxes(linear, 1, 2))
+    minor, major = squares.T * (camera.sensor.pixel_pitch / camera.interior.c)
+    off = np.sqrt(minor * (major - minor))[:, None] * axes[:, :, 0]
+    covariances[loose] += off[:, :, None] * off[:, None]
 
 
 _FEWEST = 4

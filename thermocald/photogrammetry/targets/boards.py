@@ -28,6 +28,7 @@ from thermocald.photogrammetry.targets.markers import (
     halved,
     marker_rows,
     parse_marker,
+    refuse_duplicate,
     to_8_bit,
 )
 from thermocald.photogrammetry.targets.markers import dictionary as markers_of
@@ -225,7 +226,8 @@ def locate_chessboards(
                 f"{code!r}: a board has at least 3 × 3 inner corners, numbered from 0"
             )
         chess_code(columns, rows, number)  # refuses a board that looks the same upside down
-        boards.setdefault((columns, rows), {})[number] = row
+        known = boards.setdefault((columns, rows), {})
+        refuse_duplicate(testfield, known.setdefault(number, row), row)
     found = Corners.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():

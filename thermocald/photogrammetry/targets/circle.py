@@ -139,21 +139,6 @@ def blurred_disc(
     return reflect * light, j
 
 
-def unknown_tilt(maps: LocalMap, parameters: Array, c_px: float) -> Array:
-    """Return the covariances (n, 2, 2) px² of centres of targets whose normals are unknown.
-
-    They were taken to face the camera. The axes a, b of the ellipse give the tilt, not its sense,
-    so that the centre is off by the eccentricity b √(a² − b²)/c along the minor axis, one way or
-    the other. parameters (n, 10): fitted with the maps; c_px: principal distance, px.
-    """
-    linear = maps.linear @ inverse_2x2(parameters[:, [[2, 3], [3, 4]]] + np.eye(2))
-    squares, axes = np.linalg.eigh(linear @ np.swapaxes(linear, 1, 2))
-    minor, major = squares.T
-    off = np.sqrt(minor * (major - minor))[:, None] / c_px * axes[:, :, 0]
-    covariances: Array = off[:, :, None] * off[:, None]
-    return covariances
-
-
 _SMALLEST_SEMI_AXIS_PX = 1.8
 _LARGEST_SATURATION = 0.05
 _LARGEST_MOVE = 0.6  # of the minor semi-axis, and at least two px

@@ -278,43 +278,13 @@ def _photographs(result: Photographs) -> Table:
 
 def render_field_check(result: FieldCheck, title: str = "") -> str:
     """Return the report as HTML text."""
-    field, model = result.field, result.camera
-    sds = result.sds_px
-    expected, stated = (
-        ", ".join(f"{parameter_label(n)} to ± {_sd(row[k])}" for n, row in sds.items())
-        for k in (0, -1)
+    rows = tuple(
+        (parameter_label(n), *(_sd(value) for value in row)) for n, row in result.sds_px.items()
     )
-    surveyed = f"gives {expected}, for image points of ± {result.sigma_px:g} px."
-    dominated = max(field / one for one, _, field in sds.values()) > _FIELD_DOMINATES
-    if result.weak:
-        sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
-    elif dominated:
-        sentence = f"With the stated errors of the targets' coordinates one image gives {stated}."
-    else:
-        sentence = f"One image {surveyed}"
-    X, Y, Z = result.station.centre
-    more = (
-        f"{len(result.visible)} of {len(field)} targets are visible from ({X:.0f}, {Y:.0f}, "
-        f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
-        f"image, and their depth spans {percent(result.depth_relief)} of the distance."
-    )
-    if dominated and not result.weak:
-        more += f" With exact coordinates one image {surveyed}"
-    rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
     return Chapter(
         title or "Check of a test field",
-        Answer(
-            sentence,
-            seen_figure(result),
-            (more,),
-            tuple(map(as_sentence, result.advice))
-            or ("No addition would improve it by a seventh: mount it.",),
-            (
-                "Blur, shadow, glare and paper that is not flat: look at the first frames.",
-                "Errors of the camera model, which cannot be predicted from a test field.",
-            ),
-        ),
+        _field_answer(result),
         (
             Section(
                 "How precise",
@@ -333,8 +303,43 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
                 text=() if reasons else ("All are seen.",),
             ),
         ),
-        (f"{model.sensor}.",),
+        (f"{result.camera.sensor}.",),
     ).page()
+
+
+def _field_answer(result: FieldCheck) -> Answer:
+    sds = result.sds_px
+    expected, stated = (
+        ", ".join(f"{parameter_label(n)} to ± {_sd(row[k])}" for n, row in sds.items())
+        for k in (0, -1)
+    )
+    surveyed = f"gives {expected}, for image points of ± {result.sigma_px:g} px."
+    dominated = max(field / one for one, _, field in sds.values()) > _FIELD_DOMINATES
+    if result.weak:
+        sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
+    elif dominated:
+        sentence = f"With the stated errors of the targets' coordinates one image gives {stated}."
+    else:
+        sentence = f"One image {surveyed}"
+    X, Y, Z = result.station.centre
+    more = (
+        f"{len(result.visible)} of {len(result.field)} targets are visible from ({X:.0f}, {Y:.0f}, "
+        f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
+        f"image, and their depth spans {percent(result.depth_relief)} of the distance."
+    )
+    if dominated and not result.weak:
+        more += f" With exact coordinates one image {surveyed}"
+    return Answer(
+        sentence,
+        seen_figure(result),
+        (more,),
+        tuple(map(as_sentence, result.advice))
+        or ("No addition would improve it by a seventh: mount it.",),
+        (
+            "Blur, shadow, glare and paper that is not flat: look at the first frames.",
+            "Errors of the camera model, which cannot be predicted from a test field.",
+        ),
+    )
 
 
 def _sd(value: float) -> str:

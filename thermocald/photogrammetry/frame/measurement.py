@@ -90,9 +90,10 @@ def add_unknown_tilts(
     """
     loose = np.isnan(field_normals(testfield)[rows, 0])
     shapes = parameters[loose][:, [[2, 3], [3, 4]]] + np.eye(2)
-    linear = maps.linear[loose] @ inverse_2x2(shapes)
+    # a fit that failed may have no ellipse
+    linear = np.nan_to_num(maps.linear[loose] @ inverse_2x2(shapes), posinf=0.0, neginf=0.0)
     squares, axes = np.linalg.eigh(linear @ np.swapaxes(linear, 1, 2))
-    minor, major = squares.T * (camera.sensor.pixel_pitch / camera.interior.c)
+    minor, major = np.maximum(squares.T, 0.0) * (camera.sensor.pixel_pitch / camera.interior.c)
     off = np.sqrt(minor * (major - minor))[:, None] * axes[:, :, 0]
     covariances[loose] += off[:, :, None] * off[:, None]
 

@@ -20,7 +20,7 @@ from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
 from thermocald.names import tell_apart
-from thermocald.numbers import percent, typeset_powers, with_sd
+from thermocald.numbers import percent, plain, typeset_powers, with_sd
 from thermocald.output.study.report import study_document, study_lines
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
@@ -169,6 +169,15 @@ class Calibration(Photographs, Result):
         c, x0, y0 = self.interior.as_array()[:3].tolist()
         return found + interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 
+    @property
+    def _notes(self) -> list[str]:
+        """The doubts and what was assumed, for text and report."""
+        assumed = (
+            "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths of "
+            "px; give --pixel-pitch or --camera"
+        )
+        return doubt_lines(self.doubts) + [assumed] * self.pitch_assumed
+
     @cached_property
     def camera(self) -> Camera:
         """The camera, with its covariance if it was estimated.
@@ -213,19 +222,14 @@ class Calibration(Photographs, Result):
             lines += [
                 "  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows
             ]
-            lines += doubt_lines(document["doubts"])
-            if document["camera"]["pixel_pitch_assumed"]:
-                lines.append(
-                    "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are "
-                    "thousandths of px; give --pixel-pitch or --camera"
-                )
+            lines += self._notes
         else:
             lines.append(f"not calibrated: {document['reason']}")
         for p in document["photographs"]:
             line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
             if p["exterior"] is not None:
                 e = p["exterior"]
-                line += f", {p['rms_px']:.2f} px, at " + ", ".join(
+                line += f", {plain(p['rms_px'], 'px', 2)}, at " + ", ".join(
                     with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
                 )
                 line += " mm"
@@ -239,7 +243,7 @@ class Calibration(Photographs, Result):
         from thermocald.output.calibration import render_calibration
 
         name = title or self.file.name
-        return render_calibration(self, self.file.sensor, name, self.doubts)
+        return render_calibration(self, self.file.sensor, name, self._notes)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""

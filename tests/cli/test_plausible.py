@@ -60,6 +60,11 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
     assert len(calibration.as_dict()["doubts"]) == doubts
     said = str(calibration)
     assert ("doubtful: the principal distance is" in said) == bool(doubts)
+    assumed = replace(calibration, pitch_assumed=True)
+    assert "pixel pitch is not known" in str(assumed)
+    assert "pixel pitch is not known" in assumed.page()
+    small = replace(found.photographs[0], rms_px=0.00123)
+    assert "0.0012 px" in str(replace(calibration, photographs=(small,)))
     # the camera file has priority over EXIF
     stated = CameraSpec("camera", model.sensor, found.interior.c)
     assert replace(calibration, file=stated).as_dict()["doubts"] == []

@@ -119,12 +119,14 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     for name, image in others.items():
         cv2.imwrite(str(folder / f"{name}.jpg"), image)
     (folder / "f_text.jpg").write_text("no image")
+    (folder / "._f090.jpg").write_text("of macOS")
     board = tmp_path / "board.csv"
     run("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
     report = tmp_path / "report.html"
     paths = ("--testfield", board, "--report", report)
     found = document("calibrate", folder, *paths, "--pixel-pitch", 0.003)
     status = {p["image"].rsplit("/", 1)[1]: p["status"] for p in found["photographs"]}
+    assert "._f090.jpg" not in status
     assert sum(status[n] == "ok" for n in images) >= len(opencv) == 9
     assert all(status[n] == "ok" for n in opencv)
     assert 915 < found["interior"]["c"] / 0.003 < 975

@@ -37,11 +37,11 @@ def test_a_printed_field_is_not_overwritten(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "calibrates"), [((), True), (("--paper", "A4"), True), (("--flat",), False)]
 )
-def test_check_says_before_printing_whether_a_series_gets_a_result(arguments, calibrates):
+def test_check_says_before_printing_whether_a_series_gets_a_result(tmp_path, arguments, calibrates):
     """The same bounds as the adjustment's, on what `print` would draw."""
-    result = run("testfield", "check", *arguments)
+    result = run("testfield", "check", *arguments, "--json", tmp_path / "found.json")
     assert ("NOT ENOUGH" in result.stdout) is not calibrates
-    found = document("testfield", "check", *arguments)
+    found = json.loads((tmp_path / "found.json").read_text())
     assert found["calibrates"] is calibrates
     if not calibrates:
         assert any("correlate at" in reason for reason in found["weak"])

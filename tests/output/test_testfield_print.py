@@ -42,6 +42,7 @@ def printed(tmp_path_factory):
     return print_once
 
 
+raster = cache(rasterised)
 CORNER = Design(paper_size("A3"), 14.0, sheets=3)
 
 
@@ -81,7 +82,7 @@ def test_rasterised_discs_are_where_the_csv_says(printed, paper, options):
     design = Design(page, 7.0, **options)
     folder, _ = printed(design)
     field = read_testfield(folder / "testfield.csv")
-    image = rasterised(folder / "testfield.pdf", 0, DPI)
+    image = raster(folder / "testfield.pdf", 0, DPI)
     assert image.shape == pytest.approx((page[1] * MM, page[0] * MM), abs=1.01)
     circles = np.flatnonzero(field.circles)
     assert len(circles) >= 30
@@ -99,7 +100,7 @@ def test_rasterised_rings_carry_the_code_of_the_csv(printed, bits):
     page = paper_size("A4")
     folder, _ = printed(Design(page, 7.0, bits=bits))
     field = read_testfield(folder / "testfield.csv")
-    image = rasterised(folder / "testfield.pdf", 0, DPI)
+    image = raster(folder / "testfield.pdf", 0, DPI)
     coded = [i for i, code in enumerate(field.codes) if code]
     assert len({field.codes[i] for i in coded}) == len(coded) >= 20
     middle = 0.5 * (ring_code.RING_INNER + ring_code.RING_OUTER) * 3.5 * MM
@@ -113,10 +114,10 @@ def test_rasterised_rings_carry_the_code_of_the_csv(printed, bits):
 
 
 def test_markers_are_found_by_opencv_where_the_csv_says(printed):
-    page = paper_size("250x330")
+    page = paper_size("200x250")
     folder, _ = printed(Design(page, 7.0, dictionary="DICT_APRILTAG_36h11"))
     field = read_testfield(folder / "testfield.csv")
-    image = rasterised(folder / "testfield.pdf", 0, DPI)
+    image = raster(folder / "testfield.pdf", 0, DPI)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
     found = {
@@ -133,7 +134,7 @@ def test_markers_are_found_by_opencv_where_the_csv_says(printed):
 
 def test_rulers_are_as_long_as_they_say(printed):
     folder, _ = printed(Design(paper_size("A4"), 7.0, bits=12))
-    image = rasterised(folder / "testfield.pdf", 0, 600)
+    image = raster(folder / "testfield.pdf", 0, 600)
     mm = 600 / 25.4
     dark = image < 128
     for lengthwise in (dark, np.rot90(dark, k=-1)):  # the second: the left edge becomes the top

@@ -143,10 +143,3 @@ def test_a_target_that_cannot_be_measured_has_a_reason(reason, case):
     # One target alone cannot separate a frame's noise from disturbances
     fit = fit_circles(*_one(**case), noise=KNOWN_NOISE)
     assert (reason in fit.reasons[0]) if reason else fit.good.tolist() == [True]
-
-
-def test_no_circles_no_fit():
-    frame, maps = _one()
-    fit = fit_circles(frame, maps.select(np.zeros(1, dtype=bool)))
-    assert fit.points.shape == (0, 2)
-    assert len(fit.reasons) == 0

@@ -12,8 +12,9 @@ from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
 from tests.photogrammetry.fields import PI_CAMERA, SMALL_CAMERA, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.corner import measure_corners
-from thermocald.photogrammetry.targets.markers import locate_markers, marker_rows, parse_marker
+from thermocald.photogrammetry.targets.markers import locate_markers, parse_marker
 
 
 def measure_markers(image, field, missed=None):
@@ -132,12 +133,20 @@ def test_other_texts_than_marker_codes_are_refused(code):
         parse_marker(code)
 
 
-def test_a_duplicated_code_is_refused():
-    field = TestField.build(
-        ["a", "b"], np.zeros((2, 3)), kinds="marker_corner", codes="DICT_4X4_50:1:0"
-    )
-    with pytest.raises(TestFieldError, match="is duplicated"):
-        marker_rows(field)
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        ("marker_corner", "DICT_4X4_50:1:0"),
+        ("circle", "RING12:65"),
+        ("chess_corner", "CHESS:9x6:0"),
+    ],
+)
+def test_a_duplicated_code_is_refused(kind, code):
+    """Of rings and squares the last was measured, and the first never."""
+    points = np.random.default_rng(1).uniform(0, 100, (5, 3))
+    field = TestField.build(list("abcde"), points, 0.1, 10.0, kind, code)
+    with pytest.raises(TestFieldError, match="is duplicated in the test field, at targets 'a' and"):
+        measure(_frontal(1), field)
 
 
 def test_photographs_of_apriltags(shared):

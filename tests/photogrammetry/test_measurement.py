@@ -19,8 +19,10 @@ from tests.photogrammetry.fields import (
     station,
 )
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
-from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
 from thermocald.photogrammetry.frame.measurement import frame_figures, measure
+from thermocald.photogrammetry.frame.tracking import Tracker
+from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.boards import chessboard
 from thermocald.photogrammetry.targets.outline import local_maps
 
@@ -144,6 +146,30 @@ def test_four_large_targets_on_each_wall_are_measured(planes):
     found = measure(noisy(image, np.random.default_rng(3), 1.0), field).observations
     assert len(found) == len(field)
     assert np.sqrt(np.mean(_z(found, _truth(exterior, field)) ** 2)) < 1.3
+
+
+def test_tilted_circles_on_no_plane_have_true_sds():
+    """Regression: their centres were off by the eccentricity, up to eight standard deviations."""
+    rng = np.random.default_rng(7)
+    points = np.stack(np.meshgrid(np.arange(8), np.arange(5), 0.0), axis=-1).reshape(-1, 3) * 75
+    points += rng.uniform(-30, 30, points.shape) * [0.3, 0.3, 5.0]
+    place = np.array([260.0, 150.0, 850.0])
+    exterior = look_at(place, place * [1, 1, 0])
+    view, across = place - points, rng.normal(size=points.shape)
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    across -= np.sum(view * across, axis=1, keepdims=True) * view
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    normals = view + rng.uniform(0, 0.6, (40, 1)) * across
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    codes = [f"RING14:{n}" if i % 3 else "" for i, n in enumerate(ring_code.codes(14)[:40])]
+    field = TestField.build([str(i) for i in range(40)], points, 0.01, 14.0, "circle", codes)
+    image = draw(field, normals).render(SMALL_CAMERA, exterior)
+    tracker = Tracker(field, CameraSpec("", SMALL_SENSOR, 3.04))
+    for _ in range(2):
+        found = tracker.measure(noisy(image, rng)).observations
+        loose = np.isnan(field_normals(field)[found.targets, 0])
+        assert loose.sum() >= 20
+        assert 0.7 <= np.sqrt(np.mean(_z(found, _truth(exterior, field))[loose] ** 2)) <= 1.3
 
 
 def test_two_targets_are_too_few(frame):

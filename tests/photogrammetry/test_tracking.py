@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -42,14 +44,19 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(21)
 
 
-@pytest.fixture
-def tracker(clean, rng) -> Tracker:
-    """Return a tracker that has measured the first frame."""
+@pytest.fixture(scope="module")
+def begun(clean) -> Tracker:
     tracker = Tracker(FIELD, CameraSpec("", SMALL_SENSOR))
-    first = tracker.measure(noisy(clean, rng))
+    first = tracker.measure(noisy(clean, np.random.default_rng(20)))
     assert first.status.ok
     assert first.searched
     return tracker
+
+
+@pytest.fixture
+def tracker(begun) -> Tracker:
+    """Return a tracker that has measured the first frame; it replaces its state, never fills it."""
+    return copy(begun)
 
 
 def _z(measured, camera=SMALL_CAMERA, exterior=STATION) -> np.ndarray:
@@ -69,15 +76,14 @@ def no_search(monkeypatch):
 
 def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search):
     z = []
-    for _ in range(15):
+    for _ in range(10):
         measured = tracker.measure(noisy(clean, rng))
         assert measured.status.ok
-        assert not measured.searched
         assert len(measured.observations) >= 100
         z.append(_z(measured))
     assert 0.93 <= rms(np.array(z)) <= 1.07
     # Fixed weights add no error that epochs have in common
-    assert rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(15)
+    assert rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(10)
 
 
 @pytest.mark.slow

@@ -28,7 +28,6 @@ from thermocald.numbers import (
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
-from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -46,9 +45,9 @@ _FEW_NAMES = 3  # for which a legend or a line has room
 
 
 def render_calibration(
-    result: Photographs, sensor: Sensor, name: str, doubts: Sequence[str] = ()
+    result: Photographs, sensor: Sensor, name: str, notes: Sequence[str] = ()
 ) -> str:
-    """Return the report as HTML text; doubts: probable mistakes in the estimated camera."""
+    """Return the report as HTML text; notes: doubts of the estimated camera, and assumptions."""
     posed = [p for p in result.photographs if len(p.points)]
     tables = (interior_table(result, sensor), _correlations(result))
     sections = (
@@ -61,7 +60,7 @@ def render_calibration(
         _answer(result, posed, sensor),
         tuple(s for s in sections if s.figures or s.tables),
         (f"{name}, {sensor}.",),
-        tuple(map(as_sentence, doubt_lines(doubts))),
+        tuple(map(as_sentence, notes)),
     ).page()
 
 
@@ -95,8 +94,8 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     more = (
         (
             f"{len(posed)} of {len(result.photographs)} photographs, {len(points)} image points, "
-            f"{left_out} left out; residuals of {rms:.3f} px (RMS per coordinate){fit}. The points "
-            f"cover {percent(covered)} of the image."
+            f"{left_out} left out; residuals of {plain(rms, 'px', 3)} (RMS per coordinate){fit}. "
+            f"The points cover {percent(covered)} of the image."
         ),
     )
     if covered < _LITTLE_COVERED:
@@ -271,7 +270,7 @@ def _photographs(result: Photographs) -> Table:
             "result": lambda p: _outcome(p, ": "),
             "targets": lambda p: str(p.n_targets),
             "left out": lambda p: str(len(p.rejected)),
-            "RMS px": lambda p: f"{p.rms_px:.3f}" if np.isfinite(p.rms_px) else "–",
+            "RMS px": lambda p: plain(p.rms_px, digits=3),
             "X0, Y0, Z0 mm ± sd": place,
         },
     )
@@ -279,43 +278,13 @@ def _photographs(result: Photographs) -> Table:
 
 def render_field_check(result: FieldCheck, title: str = "") -> str:
     """Return the report as HTML text."""
-    field, model = result.field, result.camera
-    sds = result.sds_px
-    expected, stated = (
-        ", ".join(f"{parameter_label(n)} to ± {_sd(row[k])}" for n, row in sds.items())
-        for k in (0, -1)
+    rows = tuple(
+        (parameter_label(n), *(_sd(value) for value in row)) for n, row in result.sds_px.items()
     )
-    surveyed = f"gives {expected}, for image points of ± {result.sigma_px:g} px."
-    dominated = max(field / one for one, _, field in sds.values()) > _FIELD_DOMINATES
-    if result.weak:
-        sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
-    elif dominated:
-        sentence = f"With the stated errors of the targets' coordinates one image gives {stated}."
-    else:
-        sentence = f"One image {surveyed}"
-    X, Y, Z = result.station.centre
-    more = (
-        f"{len(result.visible)} of {len(field)} targets are visible from ({X:.0f}, {Y:.0f}, "
-        f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
-        f"image, and their depth spans {percent(result.depth_relief)} of the distance."
-    )
-    if dominated and not result.weak:
-        more += f" With exact coordinates one image {surveyed}"
-    rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
     return Chapter(
         title or "Check of a test field",
-        Answer(
-            sentence,
-            seen_figure(result),
-            (more,),
-            tuple(map(as_sentence, result.advice))
-            or ("No addition would improve it by a seventh: mount it.",),
-            (
-                "Blur, shadow, glare and paper that is not flat: look at the first frames.",
-                "Errors of the camera model, which cannot be predicted from a test field.",
-            ),
-        ),
+        _field_answer(result),
         (
             Section(
                 "How precise",
@@ -334,8 +303,43 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
                 text=() if reasons else ("All are seen.",),
             ),
         ),
-        (f"{model.sensor}.",),
+        (f"{result.camera.sensor}.",),
     ).page()
+
+
+def _field_answer(result: FieldCheck) -> Answer:
+    sds = result.sds_px
+    expected, stated = (
+        ", ".join(f"{parameter_label(n)} to ± {_sd(row[k])}" for n, row in sds.items())
+        for k in (0, -1)
+    )
+    surveyed = f"gives {expected}, for image points of ± {result.sigma_px:g} px."
+    dominated = max(field / one for one, _, field in sds.values()) > _FIELD_DOMINATES
+    if result.weak:
+        sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
+    elif dominated:
+        sentence = f"With the stated errors of the targets' coordinates one image gives {stated}."
+    else:
+        sentence = f"One image {surveyed}"
+    X, Y, Z = result.station.centre
+    more = (
+        f"{len(result.visible)} of {len(result.field)} targets are visible from ({X:.0f}, {Y:.0f}, "
+        f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
+        f"image, and their depth spans {percent(result.depth_relief)} of the distance."
+    )
+    if dominated and not result.weak:
+        more += f" With exact coordinates one image {surveyed}"
+    return Answer(
+        sentence,
+        seen_figure(result),
+        (more,),
+        tuple(map(as_sentence, result.advice))
+        or ("No addition would improve it by a seventh: mount it.",),
+        (
+            "Blur, shadow, glare and paper that is not flat: look at the first frames.",
+            "Errors of the camera model, which cannot be predicted from a test field.",
+        ),
+    )
 
 
 def _sd(value: float) -> str:

@@ -25,7 +25,7 @@ from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated,
 from thermocald.photogrammetry.linalg import correlations
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
-from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey
 from thermocald.result import with_sds
 from thermocald.store.logger.photographs import find_copies, known_photograph
 
@@ -181,80 +181,99 @@ def calibrate_observations(
     settings: AdjustmentSettings,
 ) -> Photographs:
     """Calibrate from image points; failures: {position: (status, reason)} of unusable ones."""
-    sensor, failures = camera.sensor, dict(failures)
+    failures = dict(failures)
     seen = {k: o for k, o in enumerate(measured) if o is not None}
     usable = {k: o for k, o in seen.items() if k not in failures}
-    rows: list[int] = []
-    together: CommonInterior | None = None
-    reason = (
-        "no photograph shows enough targets: do they show this test field, and is its number of "
-        "corners or markers right?"
-    )
-    if not settings.free:
-        reason = "the interior orientation is held (--free none)"
-        if camera.interior is None:
-            reason += ", and no --camera gives it"
-    elif usable:
-        try:
-            start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
-            oriented = {}
-            for k, o in usable.items():
-                with suppress(GeometryError):
-                    points = testfield.points[o.targets]
-                    _, oriented[k], _ = approximate_orientation(
-                        sensor, points, o.points, interior=start
-                    )
-            if not oriented:
-                raise GeometryError("no pose explains the targets of any photograph")
-            rows, poses = list(oriented), list(oriented.values())
-            chosen = [usable[k] for k in rows]
-            together = adjust_common_interior(sensor, testfield, chosen, start, poses, settings)
-            left_out = together.left_out
-            failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
-            rows = [k for i, k in enumerate(rows) if i not in left_out]
-            reason = "; ".join(together.reasons)
-        except GeometryError as error:
-            reason = str(error)
-    found: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
-    if together is None or reason:
-        # the given camera is held
-        status, interior = "weak_geometry" if settings.free else "held", camera.interior
+    try:
+        if not settings.free:
+            held = "" if camera.interior else ", and no --camera gives it"
+            raise GeometryError(f"the interior orientation is held (--free none){held}")
+        if not usable:
+            raise GeometryError(_NO_TARGETS if seen else "none can be read")
+        rows, together = _adjust_together(usable, testfield, camera, settings)
+        left_out = together.left_out
+        failures |= {rows[i]: ("large_residuals", why) for i, why in left_out.items()}
+        if together.reasons:
+            raise GeometryError("; ".join(together.reasons))
+    except GeometryError as error:
+        status, reason, interior = "weak_geometry", str(error), camera.interior
         result = Photographs(
-            status, reason, interior, False, np.zeros((16, 16)), float("nan"), 0, ()
-        )
+            status if settings.free else "held", reason, interior, False, np.zeros((16, 16)),
+            float("nan"), 0, (),
+        )  # fmt: skip
+        poses = {}
         for k in seen.keys() - failures.keys():
             if interior is None:
-                why = f"without an interior orientation there is no pose: {reason}"
-                failures[k] = ("weak_geometry", why)
+                failures[k] = status, "without an interior orientation there is no pose"
                 continue
-            pose = pose_only(sensor, testfield, seen[k], interior, settings)
+            pose = pose_only(camera.sensor, testfield, seen[k], interior, settings)
             if pose.ok:
                 used = ~np.isin(pose.targets, pose.rejected)
-                found[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
+                poses[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
             else:
                 failures[k] = (pose.status, pose.reason)
     else:
         result = Photographs(
-            "ok", reason, together.interior, True, together.covariance, together.sigma0,
+            "ok", "", together.interior, True, together.covariance, together.sigma0,
             together.redundancy, (), together.disagreement,
         )  # fmt: skip
         sds = np.sqrt(np.diagonal(together.exterior_covariances, axis1=1, axis2=2))
         each = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
-        found = dict(zip(rows, each, strict=True))
-    results = []
-    for k, name in enumerate(names):
-        n = len(seen[k]) if k in seen else 0
-        if k not in found:
-            word, why = failures.get(k, ("no_orientation", "no pose explains its targets"))
-            results.append(PhotographResult(name, word, why, n))
-            continue
-        o, (used, rest, exterior, sd) = seen[k], found[k]
-        rms = float(np.sqrt(np.mean(rest[used] ** 2)))
-        rejected = tuple(testfield.names[t] for t in o.targets[~used])
-        results.append(
-            PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, rest, used)
-        )
-    return replace(result, photographs=tuple(results))
+        rows = [k for i, k in enumerate(rows) if i not in left_out]
+        poses = dict(zip(rows, each, strict=True))
+    photographs = [
+        _photograph(name, seen[k], testfield.names, *poses[k])
+        if k in poses
+        else PhotographResult(name, *failures.get(k, _NO_POSE), len(seen[k]) if k in seen else 0)
+        for k, name in enumerate(names)
+    ]
+    return replace(result, photographs=tuple(photographs))
+
+
+_NO_TARGETS = (
+    "no photograph shows enough targets: do they show this test field, and is its number of "
+    "corners or markers right?"
+)
+_NO_POSE = "no_orientation", "no pose explains its targets"
+
+
+def _adjust_together(
+    usable: dict[int, Observations],
+    testfield: TestField,
+    camera: CameraSpec,
+    settings: AdjustmentSettings,
+) -> tuple[list[int], CommonInterior]:
+    """Adjust all photographs that have a pose; return their positions too. Else GeometryError."""
+    start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
+    oriented = {}
+    for k, o in usable.items():
+        with suppress(GeometryError):
+            points = testfield.points[o.targets]
+            _, oriented[k], _ = approximate_orientation(
+                camera.sensor, points, o.points, interior=start
+            )
+    if not oriented:
+        raise GeometryError("no pose explains the targets of any photograph")
+    chosen = [usable[k] for k in oriented]
+    return list(oriented), adjust_common_interior(
+        camera.sensor, testfield, chosen, start, list(oriented.values()), settings
+    )
+
+
+def _photograph(
+    name: str,
+    o: Observations,
+    targets: Sequence[str],
+    used: Mask,
+    residuals: Array,
+    exterior: ExteriorOrientation | None,
+    sd: Array,
+) -> PhotographResult:
+    rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
+    rejected = tuple(targets[t] for t in o.targets[~used])
+    return PhotographResult(
+        name, "ok", "", len(o), rejected, rms, exterior, sd, o.points, residuals, used
+    )
 
 
 def _first_camera(
@@ -285,7 +304,10 @@ def images_of(given: Sequence[Path]) -> list[Path]:
             continue
         if not path.is_dir():
             raise UsageError(f"{path}: there is no such file")
-        found = sorted(p for p in path.iterdir() if p.suffix.lower() in _IMAGES)
+        # macOS leaves ._IMG_1.jpg, which is no image, beside IMG_1.jpg
+        found = sorted(
+            p for p in path.iterdir() if p.suffix.lower() in _IMAGES and p.name[0] != "."
+        )
         if not found:
             raise UsageError(f"{path}: the folder holds no image ({', '.join(sorted(_IMAGES))})")
         images += found
@@ -304,9 +326,10 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
     sizes: Counter[tuple[int, ...]] = Counter()
     for path in images:
         with suppress(ImageError):
-            sizes[decode_grey(path).shape] += 1
+            image = EncodedImage(path)
+            sizes[image.size or image.whole().shape[::-1]] += 1
     if not sizes:
         decode_grey(images[0])
-    height, width = sizes.most_common(1)[0][0]
+    width, height = sizes.most_common(1)[0][0]
     pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
     return CameraSpec("camera", Sensor(width, height, pitch))

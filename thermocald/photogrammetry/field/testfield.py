@@ -288,11 +288,12 @@ FEWEST_ON_A_SHEET = 6
 
 _SEED = 12  # nearest targets, for a first plane
 _FLATNESS = 0.05  # of the distance between neighbours
-_CREASE = 0.01  # of the distance between neighbours: targets this far out may be another board's
-_FARTHER = 6.0  # times the median distance of a board's targets from its plane
+_CREASE = 0.01  # of the distance between neighbours; farther out it may be another board's
 _ITERATIONS = 20
+_EXCHANGES = 5
 _SIGMAS = 4.0  # tolerance, in standard deviations of the coordinates
 _APART = 2.5  # times the distance between neighbours; farther is another board
+_AROUND = 0.5  # share of a target's nearest that are on the same board, at least
 _SEEDS = 60
 _LOCAL = 8  # nearest targets on a board, for a normal
 _PLATE = 4  # targets of a small plate, or at the rim of a board
@@ -424,28 +425,30 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
     near, spacing = _neighbours(points)
     tolerance = max(_FLATNESS * spacing, least)
     left = np.ones(len(points), dtype=bool)
-    count, whole = 0, []
-    while left.sum() >= FEWEST_ON_A_SHEET:
+    count = 0
+    while left.sum() >= _PLATE:
         rest = np.flatnonzero(left)
         seeds = rest[:: max(len(rest) // _SEEDS, 1)]
         planes = [_plane(points, near[s], left, tolerance) for s in seeds]
         best = max(planes, key=len, default=np.zeros(0, dtype=np.int64))
-        whole.append(best)
-        best = _of_one_plane(points, best, max(_CREASE * spacing, least))
-        if len(best) < FEWEST_ON_A_SHEET:
+        if len(best) < _PLATE:
             break
         left[best] = False
         for board in _apart(points, best, _APART * spacing):
-            if len(board) >= FEWEST_ON_A_SHEET:
+            if len(board) >= _PLATE:
                 labels[board] = count
                 count += 1
-    for plane in whole:  # what no other board has is back on its own
-        for row in plane[labels[plane] < 0]:
-            away = np.linalg.norm(points[plane] - points[row], axis=1)
-            away[labels[plane] < 0] = np.inf
-            if away.min() <= _APART * spacing:
-                labels[row] = labels[plane[away.argmin()]]
-    return labels
+    taken = labels.copy()
+    _exchange(points, labels, _APART * spacing, max(_CREASE * spacing, least))
+    for back in (taken, np.full_like(labels, -1)):
+        size = np.bincount(labels + 1)
+        around = np.mean(labels[near[:, 1 : _PLATE + 1]] == labels[:, None], axis=1)
+        # targets that are in a plane by chance have others nearer
+        chance = np.bincount(labels + 1, around) < _AROUND * size
+        none = (chance | (size < FEWEST_ON_A_SHEET))[labels + 1]
+        labels[none] = back[none]
+    compact = np.unique(labels, return_inverse=True)[1]
+    return compact - int(labels.min() < 0)
 
 
 def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:
@@ -491,16 +494,33 @@ def _plane(
     return found
 
 
-def _of_one_plane(points: Array, rows: NDArray[np.int64], least: float) -> NDArray[np.int64]:
-    """Return the rows without those of a board that begins near an edge of theirs: by a fit of
-    least absolute distances, from which they are farther than `least` mm and than others.
+def _exchange(points: Array, labels: NDArray[np.int64], reach: float, least: float) -> None:
+    """Give a board's targets farther than `least` mm from its plane to one whose plane is nearer.
+
+    So a board that was found first gives back the rows of others that begin near an edge of it. The
+    nearer plane must be twice as near, and a target of its board within `reach` mm. The planes are
+    those of least absolute distances; labels (n,) are changed in place.
     """
-    off = np.ones(len(rows))
-    for _ in range(_ITERATIONS if len(rows) else 0):
-        root = np.sqrt(1.0 / np.maximum(off, 0.1 * least))[:, None]
-        reduced = points[rows] - (root**2 * points[rows]).sum(axis=0) / (root**2).sum()
-        off = np.abs(reduced @ np.linalg.svd(root * reduced, full_matrices=False)[2][2])
-    return rows[off <= max(_FARTHER * float(np.median(off)), least)] if len(rows) else rows
+    rows = np.flatnonzero(labels >= 0)
+    for _ in range(_EXCHANGES if len(rows) else 0):
+        off = np.full((labels.max() + 1, len(rows)), np.inf)
+        for label in np.unique(labels[rows]):
+            mine = points[labels == label]
+            weight = np.ones((len(mine), 1))
+            for _ in range(_ITERATIONS):
+                centre = (weight * mine).sum(axis=0) / weight.sum()
+                root = np.sqrt(weight) * (mine - centre)
+                normal = np.linalg.svd(root, full_matrices=False)[2][2]
+                weight = 1.0 / np.maximum(np.abs((mine - centre) @ normal), 0.1 * least)[:, None]
+            off[label] = np.abs((points[rows] - centre) @ normal)
+        best, own = off.argmin(axis=0), off[labels[rows], np.arange(len(rows))]
+        before = labels.copy()
+        for k in np.flatnonzero((own > least) & (off.min(axis=0) < 0.5 * own)):
+            others = points[before == best[k]]
+            if np.linalg.norm(others - points[rows[k]], axis=1).min() <= reach:
+                labels[rows[k]] = best[k]
+        if np.array_equal(labels, before):
+            break
 
 
 def _apart(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDArray[np.int64]]:

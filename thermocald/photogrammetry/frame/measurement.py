@@ -25,7 +25,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
-from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.photogrammetry.linalg import inverse_2x2, mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
@@ -59,7 +59,7 @@ def predict_circles(
     """Predict the outlines of the field's circles that face the camera and lie in the image.
 
     normals (n, 3): of the targets, by default from the planes of the field. A circle without a
-    normal is assumed to face the camera, and has no eccentricity. Returns rows and maps.
+    normal is assumed to face the camera (`add_unknown_tilts`). Returns rows and maps.
     """
     rows = np.nonzero(testfield.circles & np.isfinite(testfield.diameters))[0]
     points = testfield.points[rows]
@@ -76,6 +76,26 @@ def predict_circles(
         & (cosine > _LARGEST_TILT_COSINE)
     )
     return rows[visible], maps.select(visible)
+
+
+def add_unknown_tilts(
+    covariances: Array, testfield: TestField, camera: CameraModel, rows: NDArray[np.int64],
+    maps: LocalMap, parameters: Array,
+) -> None:  # fmt: skip
+    """Add to covariances (n, 2, 2) px² of rows (n,) of a field what unknown normals cause.
+
+    A circle without a normal was taken to face the camera. The axes a, b of its ellipse give its
+    tilt, not the sense, so that the centre is off by the eccentricity b √(a² − b²)/c along the
+    minor axis, one way or the other. parameters (n, 10): fitted with the maps.
+    """
+    loose = np.isnan(field_normals(testfield)[rows, 0])
+    shapes = parameters[loose][:, [[2, 3], [3, 4]]] + np.eye(2)
+    # a fit that failed may have no ellipse
+    linear = np.nan_to_num(maps.linear[loose] @ inverse_2x2(shapes), posinf=0.0, neginf=0.0)
+    squares, axes = np.linalg.eigh(linear @ np.swapaxes(linear, 1, 2))
+    minor, major = np.maximum(squares.T, 0.0) * (camera.sensor.pixel_pitch / camera.interior.c)
+    off = np.sqrt(minor * (major - minor))[:, None] * axes[:, :, 0]
+    covariances[loose] += off[:, :, None] * off[:, None]
 
 
 _FEWEST = 4
@@ -245,13 +265,14 @@ class _Frame:
             start = fit.parameters if same and good.all() else None
             if same:
                 new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
-            rows = new_rows
-            fit = fit_circles(image, new_maps, have_rings(field, rows), blur, None, start)
+            rows, maps = new_rows, new_maps
+            fit = fit_circles(image, maps, have_rings(field, rows), blur, None, start)
         # a circle far from the predicted place is not the target
         predicted = better.camera.project(better.exterior, field.points[rows])
         off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
         limit = max(_GROSS_PX, _GROSS_SD * min(better.scatter, 1.0))
         fit.reasons[fit.good & (off > limit)] = "not where the target must be"
+        add_unknown_tilts(fit.covariances, field, better.camera, rows, maps, fit.parameters)
         return fit.observations(rows, fit.good), fit.missed(rows), better
 
     def _finish(

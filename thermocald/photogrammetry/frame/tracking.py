@@ -28,7 +28,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
-from thermocald.photogrammetry.frame.measurement import Measurement, measure, predict_circles
+from thermocald.photogrammetry.frame.measurement import (
+    Measurement,
+    add_unknown_tilts,
+    measure,
+    predict_circles,
+)
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
@@ -135,8 +140,9 @@ _FEWEST = 4
 _MARGIN_PX = 3.0  # around the windows; if targets move farther, the whole frame is decoded
 
 
-_Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, NDArray[np.bool_]]"
-"""The tracked circles: rows of the field, their weights, and which are seen."""
+_Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, Array, NDArray[np.bool_]]"
+"""The tracked circles: rows of the field, weights, what unknown tilts add to the covariances
+(n, 2, 2) px², and which are seen."""
 
 
 class Tracker:
@@ -221,7 +227,9 @@ class Tracker:
         # a hidden target gets typical values, so that it is found when it reappears
         p = np.where(seen[:, None], fit.parameters, np.median(fit.parameters[seen], axis=0))
         p[~seen, :2] = maps.centre[~seen]
-        return rows, GradientWeights.build(image, maps, coded, p, fit.noise), seen
+        tilts = np.zeros((len(rows), 2, 2))
+        add_unknown_tilts(tilts, self._testfield, found.orientation.camera, rows, maps, p)
+        return rows, GradientWeights.build(image, maps, coded, p, fit.noise), tilts, seen
 
     def _track(self, image: Image, farthest: float = np.inf) -> Measurement | None:
         """Measure in windows; None if too many targets are lost or moved beyond `farthest` px."""
@@ -262,7 +270,7 @@ def _track_circles(
     Returns None if too many targets are lost, or if targets to be fitted again have moved by more
     than `farthest` px.
     """
-    rows, weights, seen = circles
+    rows, weights, tilts, seen = circles
     fit = weights.apply(image)
     old, p, misfit = weights.parameters, fit.parameters, fit.misfit
     top = float(np.iinfo(image.dtype).max)
@@ -302,5 +310,5 @@ def _track_circles(
         weights = GradientWeights.build(image, weights.maps, weights.coded, base, weights.noise)
     if not good.all():
         missed.update(fit.missed(rows))
-    fit = replace(fit, noise=fit.noise.scaled(factor))
-    return fit.observations(rows, good), (rows, weights, good)
+    fit = replace(fit, noise=fit.noise.scaled(factor), covariances=fit.covariances + tilts)
+    return fit.observations(rows, good), (rows, weights, tilts, good)

@@ -28,6 +28,7 @@ from thermocald.photogrammetry.targets.markers import (
     halved,
     marker_rows,
     parse_marker,
+    refuse_duplicate,
     to_8_bit,
 )
 from thermocald.photogrammetry.targets.markers import dictionary as markers_of
@@ -195,6 +196,7 @@ def numbered_rings(
 
 _CODE = re.compile(r"CHESS:(\d{1,3})x(\d{1,3}):(\d{1,5})")
 _QUIET_SHARE = 0.45  # of the distance between corners, if no marker is nearer
+_QUADRANGLES_PIXELS = 700_000  # a search without a board takes minutes in a larger image
 
 
 def chess_code(columns: int, rows: int, number: int) -> str:
@@ -224,7 +226,8 @@ def locate_chessboards(
                 f"{code!r}: a board has at least 3 × 3 inner corners, numbered from 0"
             )
         chess_code(columns, rows, number)  # refuses a board that looks the same upside down
-        boards.setdefault((columns, rows), {})[number] = row
+        known = boards.setdefault((columns, rows), {})
+        refuse_duplicate(testfield, known.setdefault(number, row), row)
     found = Corners.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():
@@ -244,11 +247,13 @@ def locate_chessboards(
 
 def _find_board(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Return a board's inner corners (rows, columns, 2) px, right-handed, from its black corner."""
-    scale = 2 if grey.size > LARGE_PIXELS else 1
-    small = halved(grey) if scale > 1 else grey
-    size = (columns, rows)
+    scale, small, size = 1, grey, (columns, rows)
+    if grey.size > LARGE_PIXELS:
+        scale, small = 2, halved(grey)
     done, corners = cv2.findChessboardCornersSB(small, size, flags=0)
     if not done:  # an oblique or blurred board: by its quadrangles
+        while small.size > _QUADRANGLES_PIXELS:
+            scale, small = 2 * scale, halved(small)
         done, corners = cv2.findChessboardCorners(small, size)
     if not done:
         return None

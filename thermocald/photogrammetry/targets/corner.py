@@ -18,7 +18,7 @@ vertex detection, IJCV 10(2), 101–124.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -178,46 +178,53 @@ def _is_saddle(grey: Array, d1: Array, d2: Array, near: NDArray[np.bool_]) -> ND
     return dark & (clear & near & (d1 < 0) & (d2 < 0)).any(axis=1)
 
 
-def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
-    """Fit corners together; return the observations, and {row: reason} of failed fits."""
-    corners, n = found.places, len(found)
+class _Pixels(NamedTuple):
+    """The pixels around n corners: x, y px, grey (n, m), which are used, and the saddles (n,)."""
+
+    x: Array
+    y: Array
+    grey: Array
+    use: Mask
+    saddle: Mask
+
+
+def _side(found: Corners) -> Array:
+    """Return the length (n,) px of the shorter side at each corner."""
+    sides = np.stack([found.before, found.after]) - found.places
+    side: Array = np.linalg.norm(sides, axis=-1).min(axis=0)
+    return side
+
+
+def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
+    """Return the pixels to fit, initial parameters (n, 7), and which corners the edge cuts off."""
+    corners, n, side = found.places, len(found), _side(found)
     height, width = image.shape
-    sides = np.stack([found.before - corners, found.after - corners])
-    side = np.linalg.norm(sides, axis=-1).min(axis=0)
     along = np.minimum(0.45 * side, REACH_PX)
     half = int(np.ceil(along.max()))
     down, right = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     x, y = (np.rint(corners).astype(int).T)[..., None] + np.stack([right, down])[:, None]
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
-
-    # inward normals of the two edges: perpendicular to one side, towards the other
-    normals = []
-    for edge, other in ((sides[0], sides[1]), (sides[1], sides[0])):
-        across = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
-        length = np.linalg.norm(across, axis=-1, keepdims=True)
-        normal = across / np.where(length > 0, length, 1.0)
-        normals.append(normal * np.sign(np.sum(normal * other, axis=-1, keepdims=True)))
     px, py = x.astype(float), y.astype(float)
     dx, dy = px - corners[:, 0, None], py - corners[:, 1, None]
+    away = np.hypot(dx, dy)
+    normals = _inward_normals(found)
     d1, d2 = (m[:, 0, None] * dx + m[:, 1, None] * dy for m in normals)
     depth = np.minimum(d1, d2)
     # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
     margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
-    saddle = _is_saddle(grey, d1, d2, inside & (np.hypot(dx, dy) <= along[:, None]))
+    saddle = _is_saddle(grey, d1, d2, inside & (away <= along[:, None]))
     # the square opposite to a marker of an AprilGrid is a third as large as the marker
     along = np.where(saddle, np.minimum(along, _SADDLE_REACH * side), along)
     near = np.where(saddle[:, None], np.minimum(np.abs(d1), np.abs(d2)), np.abs(depth))
-    use = inside & (near <= margin) & (np.hypot(dx, dy) <= along[:, None])
+    use = inside & (near <= margin) & (away <= along[:, None])
     depth = np.where(saddle[:, None], np.sign(d1 * d2) * near, depth)
-    cut_off = np.any(~inside & (np.hypot(dx, dy) < 3), axis=1)
-    m = use.sum(axis=1)
+    cut_off = np.any(~inside & (away < 3), axis=1)
     # each corner's used pixels first, so that the others can be left out
-    first = np.argsort(~use, axis=1, kind="stable")[:, : max(int(m.max()), 1)]
+    first = np.argsort(~use, axis=1, kind="stable")[:, : max(int(use.sum(axis=1).max()), 1)]
     px, py, grey, depth, use = (np.take_along_axis(v, first, 1) for v in (px, py, grey, depth, use))
-    weight = use.astype(float)
 
-    def share(mask: NDArray[np.bool_]) -> Array:
+    def share(mask: Mask) -> Array:
         part = np.where(use & mask, grey, np.nan)
         empty = ~np.isfinite(part).any(axis=1)
         part[empty] = grey[empty]
@@ -225,15 +232,31 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
 
     background = share(depth < -1)
     contrast = share(depth > 1) - background
-    p = np.column_stack(
-        [
-            corners,
-            *(np.arctan2(v[:, 1], v[:, 0]) for v in normals),
-            np.full(n, 1.2),
-            background,
-            np.where(np.abs(contrast) < 1, 1.0, contrast),
-        ]
-    )
+    angles = (np.arctan2(v[:, 1], v[:, 0]) for v in normals)
+    contrast = np.where(np.abs(contrast) < 1, 1.0, contrast)
+    p = np.column_stack([corners, *angles, np.full(n, 1.2), background, contrast])
+    return _Pixels(px, py, grey, use, saddle), p, cut_off
+
+
+def _inward_normals(found: Corners) -> list[Array]:
+    """Return the normals (n, 2) of the two edges: across one side, towards the other."""
+    sides = found.before - found.places, found.after - found.places
+    normals = []
+    for edge, other in (sides, sides[::-1]):
+        across = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
+        length = np.linalg.norm(across, axis=-1, keepdims=True)
+        normal = across / np.where(length > 0, length, 1.0)
+        normals.append(normal * np.sign(np.sum(normal * other, axis=-1, keepdims=True)))
+    return normals
+
+
+def _minimise(pixels: _Pixels, p: Array) -> tuple[Array, Array, Single, Array]:
+    """Minimise the squares by Levenberg's method from parameters (n, 7).
+
+    Returns the parameters, the sums of squares (n,), the partials (n, m, 7), the last steps (n, 7).
+    """
+    px, py, grey, use, saddle = pixels
+    weight, n = use.astype(float), len(p)
     damping = np.full(n, 1e-2)
 
     def cost(q: Array, rows: NDArray[np.int64]) -> tuple[Array, Array, Single]:
@@ -267,12 +290,20 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
         open_ = open_[np.abs(now[:, :2]).max(axis=1) >= _CONVERGED_PX]
         if len(open_) == 0:
             break
+    return p, chi, j, step
 
-    jw = j * weight[..., None]
+
+def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
+    """Fit corners together; return the observations, and {row: reason} of failed fits."""
+    pixels, p, cut_off = _pixels(image, found)
+    p, chi, j, step = _minimise(pixels, p)
+    m = pixels.use.sum(axis=1)
+    jw = j * pixels.use[..., None].astype(float)
     normal_matrix = np.swapaxes(jw, 1, 2) @ j
     cofactors = scaled_solve(normal_matrix, np.eye(7)[None, :, :2], 1e-12)[:, :2]
     variance = chi / np.maximum(m - 7, 1)
     residual_sd = np.sqrt(variance)
+    move = np.hypot(*(p[:, :2] - found.places).T)
     tests = (
         (cut_off, "cut off by the image's edge"),
         (m < 20, "too small"),
@@ -281,7 +312,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
             "the fit does not converge",
         ),
         (
-            np.hypot(*(p[:, :2] - corners).T) > _LARGEST_MOVE_PX + _LARGEST_MOVE_SHARE * side,
+            move > _LARGEST_MOVE_PX + _LARGEST_MOVE_SHARE * _side(found),
             "no corner where the marker has one",
         ),
         (np.abs(np.cos(p[:, 2] - p[:, 3])) > 0.95, "too oblique"),
@@ -289,13 +320,14 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     )
     reasons = first_reasons(tests)
     good = reasons == ""
+    saturated = pixels.use & (pixels.grey >= np.iinfo(image.dtype).max)
     quality = {
         # without the width of the pixel
         "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),
         "contrast": p[:, 6],
         "grey": p[:, 5],
         "noise": residual_sd,
-        "saturation": np.sum(use & (grey >= np.iinfo(image.dtype).max), axis=1) / np.maximum(m, 1),
+        "saturation": np.sum(saturated, axis=1) / np.maximum(m, 1),
     }
     observations = Observations.build(
         found.rows[good], p[good, :2], (cofactors * variance[:, None, None])[good],

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # of a damaged file we tell
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 _BASELINE = {0xC0, 0xC1}
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -199,6 +200,7 @@ _MOST_BYTES = 1_000_000_000
 class EncodedImage:
     """An image file, or its encoded bytes (H, W); only the parts needed are decoded.
 
+    size: width and height, px, by its header, None if that is not read (WebP).
     Raises ImageError if something is wrong with the file, at the latest when it is decoded.
     """
 
@@ -207,10 +209,10 @@ class EncodedImage:
         self.data = data = _read(source, self.name) if isinstance(source, Path) else source
         if not data:
             raise ImageError(f"{self.name}: is empty (0 bytes)")
-        self._size = image_size(data)
-        if self._size is not None and self._size[0] * self._size[1] > _MOST_PIXELS:
+        self.size = image_size(data)
+        if self.size is not None and self.size[0] * self.size[1] > _MOST_PIXELS:
             raise ImageError(
-                f"{self.name}: has {self._size[0]} × {self._size[1]} px by its header; at most "
+                f"{self.name}: has {self.size[0]} × {self.size[1]} px by its header; at most "
                 f"{_MOST_PIXELS // 10**6} million are decoded"
             )
         self._is_jpeg = data[:2] == _JPEG
@@ -260,11 +262,11 @@ class EncodedImage:
         undefined. The next call in this thread reuses the memory. None if the file does not have
         the shape (H, W), cannot be decoded in parts, or this would save no time.
         """
-        if not self._is_jpeg or self._size is None or self._size[::-1] != tuple(shape):
+        if not self._is_jpeg or self.size is None or self.size[::-1] != tuple(shape):
             return None
         try:
             layout = _layout(self.data)
-            return layout and _decode_tiles(self.data, self._size, layout, boxes)
+            return layout and _decode_tiles(self.data, self.size, layout, boxes)
         except (IndexError, ValueError):
             return None  # damaged; decoding the whole file reports how
 

@@ -245,13 +245,18 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
             if corner is None:
                 continue
             corners = rows.setdefault(dictionary, {})
-            if (marker, corner) in corners:
-                raise TestFieldError(
-                    f"code {code!r} is duplicated in the test field, at targets "
-                    f"{testfield.names[corners[marker, corner]]!r} and {testfield.names[row]!r}"
-                )
-            corners[marker, corner] = row
+            refuse_duplicate(testfield, corners.setdefault((marker, corner), row), row)
     return rows
+
+
+def refuse_duplicate(testfield: TestField, first: int, row: int) -> None:
+    """Raise TestFieldError if a row has the code of another, the first one with it."""
+    if first != row:
+        a, b = testfield.names[first], testfield.names[row]
+        raise TestFieldError(
+            f"code {testfield.codes[row]!r} is duplicated in the test field, at targets {a!r} and "
+            f"{b!r}"
+        )
 
 
 def locate_markers(

@@ -294,9 +294,10 @@ class GaugeCalibrator(EpochCalibrator):
         except DataError as error:
             return f"{text}: warning: {error}"
         rejected = ", ".join(self.testfield.names[row] for row in pose.rejected)
-        return f"{text}, sigma0 of their pose {pose.sigma0:.2f}" + (
-            f"; left out: {rejected}" if rejected else ""
-        )
+        text += f", sigma0 of their pose {pose.sigma0:.2f}"
+        text += f"; left out: {rejected}" if rejected else ""
+        twin = known.find_twin(self.predictor.settled(), pose)
+        return f"{text}; doubtful: {twin}" if twin else text
 
     def reset(self) -> None:
         """Forget the last frame and where its control points were: they are searched for anew."""

@@ -76,6 +76,7 @@ def test_a_store_gives_the_same_as_its_recording(recording, tmp_path):
         (["nowhere"], DataError, "nowhere: does not exist"),
         (["RECORDING", "RECORDING"], UsageError, "is given twice"),
         (["=RECORDING"], UsageError, "the label before = is empty"),
+        (["M1="], UsageError, "M1=: the recording or store after = is empty"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no parameter"),

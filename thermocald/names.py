@@ -71,7 +71,7 @@ def tell_apart(names: Sequence[str], sources: Sequence[str]) -> list[str]:
         levels = range(1, 1 + min(map(len, same)))
         level = next((k for k in levels if len({parts[-k] for parts in same}) == len(same)), None)
         place = source if level is None else Path(source).parts[-level]
-        told.append(name if len(same) == 1 else f"{name} in {place}")
+        told.append(name if len(same) == 1 or place == name else f"{name} in {place}")
     return told
 
 

@@ -240,6 +240,27 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
     assert found == 6
 
 
+@pytest.mark.parametrize(("shift", "at_least"), [(77.0, 13), (200.0, 17)])
+def test_two_moved_stones_of_twelve_are_left_out(shift, at_least):
+    """Once 10 and 22 of 60 such gauges had a pose afterwards, without a defect of the others."""
+    square = []
+    for seed in range(20):
+        world, rng = World(4000 + seed), np.random.default_rng(seed)
+        ways = rng.normal(size=(2, 3))
+        moved = shift * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+        gauge = GaugeCalibrator(thermal_camera(), world.field)
+        gauge.calibrate(world.epoch(1, 20.0))
+        world.points[rng.choice(12, 2, False)] += moved
+        result = gauge.calibrate(world.epoch(2, 20.0, rng.permutation(12))).adjustment
+        if result.status == "resected":
+            error = result.exterior.as_array() - POSE
+            error[:3] = np.arctan2(np.sin(error[:3]), np.cos(error[:3]))
+            square.append(error @ np.linalg.solve(result.covariance[10:, 10:], error) / 6)
+    assert len(square) >= at_least
+    assert np.sqrt(np.mean(square)) == pytest.approx(1.0, abs=0.25)
+    assert np.max(square) < 3.0**2
+
+
 def test_a_repeated_frame_is_no_second_pose():
     """Two different poses in a row are a movement: one wrong frame, delivered twice, is not."""
     world = World(208)

@@ -355,6 +355,15 @@ OUT_OF_BOUNDS = {
     ),
 }
 HOT = [25.0, 30.0, 35.0]
+SEEN = {"target": "abcd", "x": [900, 2400, 2300, 1000], "y": [700, 800, 1900, 1700],
+        "sx": [0.3] * 4, "sy": [0.3] * 4}  # fmt: skip
+
+
+def resected(camera, seen):
+    corners = [[0, 0, 0], [800, 0, 0], [800, 600, 0], [0, 600, 100]]
+    return camera.at(35.0).resect(tc.TestField.build("abcd", corners), seen)
+
+
 OF_A_CAMERA = {
     "to is 'image'; it must be an InteriorOrientation": lambda camera: camera.at(35.0).undistort(
         [[1, 2]], to="image"
@@ -365,6 +374,20 @@ OF_A_CAMERA = {
     "distance_mm is -1": lambda camera: camera.at(35.0).object_error(-1),
     "image points: must be an array \\(n, 2\\)": lambda camera: camera.at(35.0).undistort(
         [1, 2, 3]
+    ),
+    "normal is \\[0, 0, 0\\]; it must be three": lambda camera: tc.Plane([0, 0, 0], [0, 0, 0]),
+    "at least two points": lambda camera: tc.Profile([[0, 0, 0]]),
+    "plane is 'water'; it must be a Plane": lambda camera: camera.at(35.0).on_plane(
+        [[1, 2]], [0.0] * 6, "water"
+    ),
+    "points and sigmas must be numbers": lambda camera: tc.TestField.build(["a"], [[1.0, 2.0]]),
+    "points must be finite": lambda camera: tc.TestField.build(["a"], [[1.0, 2.0, np.nan]]),
+    "need the lists target, x, y, sx": lambda camera: resected(camera, [[1.0, 2.0]]),
+    "a target is given twice": lambda camera: resected(camera, SEEN | {"target": ["a"] * 4}),
+    "'z' was measured but is not in": lambda camera: resected(camera, SEEN | {"target": "abcz"}),
+    "sx, sy above 0": lambda camera: resected(camera, SEEN | {"sx": [0.0] * 4}),
+    "no pose .too_few_targets.: 2 control": lambda camera: camera.at(35.0).project(
+        [[0, 0, -1e3]], resected(camera, {name: list(column)[:2] for name, column in SEEN.items()})
     ),
     "the pose: must be": lambda camera: camera.at(35.0).project([[0, 0, -1e3]], None),
     "no thermometer 'foo'; it knows temperature": lambda camera: tc.predict(
@@ -387,7 +410,7 @@ OF_A_CAMERA = {
 
 # arrays and times, whose content is checked where they are used
 ANY = {
-    "at", "centre", "changes", "codes", "control", "diameters", "epochs", "frame", "image_points",
+    "at", "centre", "changes", "codes", "diameters", "epochs", "frame", "image_points",
     "interior", "kinds", "names", "numbers", "offsets", "plane", "points", "pose", "R", "rows",
     "seen", "settings", "sigma", "sigmas", "temperatures", "time", "times", "values",
 }  # fmt: skip
@@ -416,7 +439,7 @@ def test_an_argument_out_of_bounds_is_refused(inside, M1, message):
 
 @pytest.mark.parametrize("message", OF_A_CAMERA)
 def test_what_no_camera_can_answer_is_refused(camera, message):
-    with pytest.raises((UsageError, ConfigurationError), match=message):
+    with pytest.raises((UsageError, DataError, ConfigurationError), match=message):
         OF_A_CAMERA[message](camera)
 
 
@@ -503,10 +526,11 @@ def test_the_import_costs_nothing():
     assert sorted(map(float, seconds))[2] < 0.030
 
 
-def test_a_script_of_a_user_runs(inside, tmp_path, monkeypatch):
+def test_a_script_of_a_user_runs(tmp_path, monkeypatch):
     """From a recording to files of ROS at 10 and 40 °C; `make lint` has mypy look at its types."""
     script = Path(__file__).with_name("user_script.py")
-    monkeypatch.setattr(sys, "argv", [str(script), "M1", "M2", str(tmp_path)])
+    tc.simulate("rpi-v2.1-heating", epochs=20, out=tmp_path / "short")
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "short"), str(tmp_path)])
     with pytest.warns(match="standard deviations are widened"):
         runpy.run_path(str(script), run_name="__main__")
     files = {path.name: path.read_text() for path in tmp_path.glob("*.yaml")}

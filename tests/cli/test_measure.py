@@ -23,7 +23,7 @@ from thermocald.analysis.thermal.places import measure_places
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.measuring import Plane, Profile, place_on
-from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics import model_file
 from thermocald.store.logger.temperatures import TemperatureLog
 
@@ -282,6 +282,39 @@ def test_control_points_that_cannot_be_are_one_line_that_says_why(gauge, change,
 def test_standard_deviations_in_another_unit_are_doubted(gauge):
     done = of_points(gauge, lambda _, r: {n: 1000 * float(r[n]) for n in ("sX", "sY", "sZ")})
     assert "far better than their standard deviations say: are sX, sY, sZ in m" in done.stdout
+
+
+def test_clicks_in_an_image_that_was_turned_by_180_degrees_are_doubted(gauge):
+    """The pose fits: the camera hangs upside down, and places were 20 m off without a word."""
+    assert "doubtful" not in measured(gauge).stdout
+    done = of_points(gauge, lambda _, r: {"x": 3279 - float(r["x"]), "y": 2463 - float(r["y"])})
+    assert "doubtful: the camera hangs upside down in this pose" in done.stdout
+
+
+@pytest.mark.parametrize("beside", [0.0, 700.0])
+def test_names_that_a_symmetry_leaves_untested_are_doubted(beside):
+    """Four points in a rectangle and one in its middle, or beside it: then names are tested."""
+    world = World(1, n=5)
+    corners = [
+        [-3e3, 1e4, 0],
+        [3e3, 1e4, 300],
+        [3e3, 2e4, 0],
+        [-3e3, 2e4, 300],
+        [beside, 15e3, 900],
+    ]
+    world.points = np.array(corners)
+    world.field = TestField.build(world.field.names, world.points, SURVEY_MM)
+    image, seen = project(PLACES, POSE, **world.interior(20.0)), world.seen(20.0)
+    names = "g2, g3, g0, g1 named g0, g1, g2, g3"
+    assert [names in doubt for doubt in places(world, seen, image).doubts] == [True] * (not beside)
+    wrong = replace(seen, points=seen.points[[2, 3, 0, 1, 4]])
+    if beside:
+        with pytest.raises(DataError, match="no pose fits"):
+            places(world, wrong, image)
+    else:
+        swapped = places(world, wrong, image)
+        assert names in swapped.doubts[0]
+        assert swapped.centre == pytest.approx([-500.0, 31_000.0, 6_000.0], abs=100)
 
 
 def posed(world: World, seen: Observations, camera: Camera):

@@ -16,7 +16,7 @@ run = partial(succeed, "study")
 def recording(tmp_path_factory):
     """Some minutes of a warm phone."""
     path = tmp_path_factory.mktemp("recordings") / "nexus"
-    tc.simulate("nexus5-warm", seed=5, epochs=40, out=path)
+    tc.simulate("nexus5-warm", seed=5, epochs=31, out=path)
     return path
 
 
@@ -26,7 +26,7 @@ def test_json_on_standard_output_is_one_document_and_nothing_else(recording):
     (series,) = camera["series"]
     assert series["exterior"] in ("series", "mount")  # as the data choose
     assert series["exterior_choice"]
-    assert series["epochs"] == 40
+    assert series["epochs"] == 31
     dependence = series["temperature_dependence"]["temperature"]["parameters"]
     assert min(abs(dependence[n]["r"]) for n in ("c", "x0", "y0")) > 0.98
     # the preset has 8 px and 3 µm over 8 K
@@ -76,6 +76,7 @@ def test_a_store_gives_the_same_as_its_recording(recording, tmp_path):
         (["nowhere"], DataError, "nowhere: does not exist"),
         (["RECORDING", "RECORDING"], UsageError, "is given twice"),
         (["=RECORDING"], UsageError, "the label before = is empty"),
+        (["M1="], UsageError, "M1=: the recording or store after = is empty"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no parameter"),

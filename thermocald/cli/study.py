@@ -226,8 +226,9 @@ def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str
         # A path may contain "=": a text that exists as a path is one.
         if not equals or Path(text).exists() or is_server(text):
             label, rest = "", text
-        elif not label:
-            raise UsageError(f"{text}: the label before = is empty")
+        elif not label or not rest:
+            what = "recording or store after" if label else "label before"
+            raise UsageError(f"{text}: the {what} = is empty")
         found = tc.open_all(rest)
         labels += [label or None] * len(found)
         series += found

@@ -28,17 +28,23 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     project,
 )
+from thermocald.photogrammetry.field.testfield import (
+    Observations,
+    TestField,
+    observations_from_lists,
+)
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, jsonable, new_figure, with_sds
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,18 +82,20 @@ class Camera(Result):
         """Standard deviations by name, 0 for a parameter that was held."""
         return dict(zip(IOP_NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
-    def project(self, points: ArrayLike, pose: ExteriorOrientation | ArrayLike) -> Array:
+    def project(
+        self, points: ArrayLike, pose: Adjustment | ExteriorOrientation | ArrayLike
+    ) -> Array:
         """Project object points (n, 3) mm to image points (n, 2) px, NaN behind the camera.
 
-        pose: omega, phi, kappa (rad), X0, Y0, Z0 (mm), as an ExteriorOrientation or six numbers.
+        pose: omega, phi, kappa (rad), X0, Y0, Z0 (mm), as an ExteriorOrientation or six numbers, or
+        the result of `resect`.
 
         >>> camera = tc.load_camera("camera.yaml").at(35.0)
         >>> camera.project([[0.0, 0.0, -1000.0]], [0, 0, 0, 0, 0, 0]).shape
         (1, 2)
         """
-        six = pose.as_array() if isinstance(pose, ExteriorOrientation) else pose
-        pose_values = _numbers(six, 6, "the pose")
-        return project(self.sensor, self.values, pose_values, _numbers(points, 3, "object points"))
+        points = _numbers(points, 3, "object points")
+        return project(self.sensor, self.values, _pose_values(pose), points)
 
     def rays(self, image_points: ArrayLike) -> Array:
         """Return the unit directions (n, 3) in the camera frame of image points (n, 2) px.
@@ -145,18 +153,40 @@ class Camera(Result):
     def resect(
         self,
         control: TestField,
-        seen: Observations,
+        seen: Observations | Mapping[str, ArrayLike],
         snooping_alpha: float = 0.001,
         start: ExteriorOrientation | None = None,
     ) -> Adjustment:
         """Return the pose of this camera from control points, with its covariance as prior.
 
+        seen: the image points, as a table or mapping with target, x, y, sx, sy (px);
         snooping_alpha: error probability of a single test for gross errors, 0 for none; start: an
         earlier pose, with which three points suffice. The covariance (16, 16) of the result is
-        joint; its status and reason explain a missing pose.
+        joint; its status and reason explain a missing pose. If the points lie on each other after
+        a turn, exchanged names give another pose, and no residual shows it. Raises TestFieldError
+        for a target that the field lacks, UsageError for image points that are no numbers.
+
+        >>> camera = tc.load_camera("camera.yaml").at(35.0)
+        >>> points = [[0, 0, 0], [800, 0, 0], [800, 600, 0], [0, 600, 100]]
+        >>> field = tc.TestField.build(["a", "b", "c", "d"], points, sigmas=1.0)
+        >>> x, y = camera.project(points, [0, 0, 0, 300, 300, 900]).T
+        >>> seen = {"target": field.names, "x": x, "y": y, "sx": [0.3] * 4, "sy": [0.3] * 4}
+        >>> pose = camera.resect(field, seen)
+        >>> floor = tc.Plane([0, 0, 0], [0, 0, 1])
+        >>> places, covariance = camera.on_plane([[1500, 1000]], pose, floor)
+        >>> pose.status, places.shape, covariance.shape
+        ('ok', (1, 3), (3, 3))
         """
         from thermocald.photogrammetry.epoch.measuring import resect
 
+        if not 0.0 <= snooping_alpha < 1.0:
+            raise UsageError(f"snooping_alpha is {snooping_alpha}; it must be 0 to 1")
+        if not isinstance(seen, Observations):
+            seen = observations_from_lists(seen, control)
+            if len(set(seen.targets.tolist())) < len(seen):
+                raise UsageError("a target is given twice")
+            if not (np.isfinite(seen.points).all() and (seen.sigmas > 0).all()):
+                raise UsageError("x, y (px) must be finite numbers, and sx, sy above 0")
         return resect(
             self.sensor, self.interior, self.covariance, control, seen, start, snooping_alpha
         )
@@ -164,19 +194,28 @@ class Camera(Result):
     def on_plane(
         self,
         image_points: ArrayLike,
-        pose: Adjustment,
+        pose: Adjustment | ExteriorOrientation | ArrayLike,
         plane: Plane | Line | Profile,
         sigma: ArrayLike = 0.0,
     ) -> tuple[Array, Array]:
         """Return the places (n, 3) mm of image points (n, 2) px on a plane, a line or a profile.
 
-        pose: from `resect`; sigma: of the image points, px. Also returns their joint covariance
-        (3n, 3n), from image points, camera, pose and plane. Raises GeometryError for rays that miss
-        it.
+        pose: from `resect`, or one without error, as in `project`; sigma: of the image points, px.
+        Also returns their joint covariance (3n, 3n), from image points, camera, pose and plane.
+        Raises GeometryError for rays that miss it.
         """
-        from thermocald.photogrammetry.epoch.measuring import place_on
+        from thermocald.photogrammetry.epoch.adjustment import Adjustment
+        from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 
-        return place_on(self.sensor, pose.values, pose.covariance, image_points, sigma, plane)
+        if not isinstance(plane, Plane | Line | Profile):
+            raise UsageError(f"plane is {plane!r:.80}; it must be a Plane, a Line or a Profile")
+        values = np.concatenate([self.values, _pose_values(pose)])
+        covariance = np.pad(self.covariance, (0, 6))
+        if isinstance(pose, Adjustment):  # of camera and pose together
+            values, covariance = pose.values, pose.covariance
+        points = np.atleast_2d(_numbers(image_points, 2))
+        sigmas = _numbers(np.broadcast_to(sigma, points.shape), 2, "sigma")
+        return place_on(self.sensor, values, covariance, points, sigmas, plane)
 
     def object_distance(self, other: Camera, distance_mm: float) -> Array:
         """Return the distances (9,) mm on a plane between the image grids of this and another."""
@@ -273,6 +312,18 @@ def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Arra
     if found.ndim == 0 or found.shape[-1] != columns:
         raise UsageError(f"{name}: must be an array (n, {columns}) of numbers")
     return found
+
+
+def _pose_values(given: Adjustment | ExteriorOrientation | ArrayLike) -> Array:
+    """Return a pose as six numbers (6,), rad and mm. Raises UsageError for anything else."""
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment
+
+    if isinstance(given, Adjustment):
+        if given.exterior is None:
+            raise UsageError(f"there is no pose ({given.status}): {given.reason}")
+        given = given.exterior
+    six = given.as_array() if isinstance(given, ExteriorOrientation) else given
+    return _numbers(six, 6, "the pose")
 
 
 def _draw(sensor: Sensor, points: Array, vectors: Array, title: str) -> Figure:

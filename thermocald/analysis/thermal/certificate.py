@@ -44,37 +44,7 @@ def describe_small_misfit(document: Mapping[str, Any]) -> str:
 def model_lines(document: Mapping[str, Any]) -> list[str]:
     """Return the lines for a document of `thermocald fit`; the first is the camera's name."""
     lines = [str(document["camera"])]
-    low, high = next(iter((document["validity"] or _UNKNOWN).values()))
-    T0 = f"T0 = {document['reference_temperature']:g} °C"
-    if why := document.get("not_examined"):
-        left = document["left_over_in_noise"]
-        lines.append(f"  not examined whether an effect is missing: {why}")
-        lines.append(
-            f"  fitted from {low:g} to {high:g} °C, {T0}; what is left over is {left:.1f} times "
-            "the noise" + ("" if document["band"] else ": no 95 % band is stated")
-        )
-    elif document.get("effect_missing") and document.get("calibrations"):
-        lines.append(
-            f"  the calibrations differ by {document['sigma0']:.1f} times what their standard "
-            "deviations allow: parameters other than c, x0, y0 change with temperature, or the "
-            f"change is not linear\n  fitted from {low:g} to {high:g} °C, {T0}; standard "
-            "deviations are widened by that"
-        )
-    elif document.get("effect_missing"):
-        cause = "an effect is missing"
-        if document.get("trembles"):
-            cause += ", or the mount moves: all targets jump together from epoch to epoch"
-        lines.append(
-            f"  {cause}: the model leaves {document['misfit_px']:.3f} px in smooth "
-            f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
-            "run: thermocald discover\n"
-            f"  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by what "
-            "is left, and no 95 % band is stated"
-        )
-    else:
-        lines.append(f"  valid from {low:g} to {high:g} °C, {T0}")
-        if left := describe_small_misfit(document):
-            lines.append(f"  left over: {left}; thermocald discover looks for the cause")
+    lines += _verdict_lines(document)
     sure = document.get("distortion_sigmas")
     if sure is not None and document["distortion"] == "image":
         lines.append(
@@ -118,6 +88,43 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
     ]
     lines += [f"  {line}" for line in doubt_lines(document.get("doubts", ()))]
     return [part for line in lines for part in line.split("\n")]
+
+
+def _verdict_lines(document: Mapping[str, Any]) -> list[str]:
+    """Return the temperatures of the fit, and whether an effect is missing."""
+    lines = []
+    low, high = next(iter((document["validity"] or _UNKNOWN).values()))
+    T0 = f"T0 = {document['reference_temperature']:g} °C"
+    if why := document.get("not_examined"):
+        left = document["left_over_in_noise"]
+        lines.append(f"  not examined whether an effect is missing: {why}")
+        lines.append(
+            f"  fitted from {low:g} to {high:g} °C, {T0}; what is left over is {left:.1f} times "
+            "the noise" + ("" if document["band"] else ": no 95 % band is stated")
+        )
+    elif document.get("effect_missing") and document.get("calibrations"):
+        lines.append(
+            f"  the calibrations differ by {document['sigma0']:.1f} times what their standard "
+            "deviations allow: parameters other than c, x0, y0 change with temperature, or the "
+            f"change is not linear\n  fitted from {low:g} to {high:g} °C, {T0}; standard "
+            "deviations are widened by that"
+        )
+    elif document.get("effect_missing"):
+        cause = "an effect is missing"
+        if document.get("trembles"):
+            cause += ", or the mount moves: all targets jump together from epoch to epoch"
+        lines.append(
+            f"  {cause}: the model leaves {document['misfit_px']:.3f} px in smooth "
+            f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
+            "run: thermocald discover\n"
+            f"  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by what "
+            "is left, and no 95 % band is stated"
+        )
+    else:
+        lines.append(f"  valid from {low:g} to {high:g} °C, {T0}")
+        if left := describe_small_misfit(document):
+            lines.append(f"  left over: {left}; thermocald discover looks for the cause")
+    return lines
 
 
 def _find_doubtful(document: Mapping[str, Any]) -> list[str]:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import DataError, TestFieldError
+from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.field.testfield import KINDS, Observations, TestField
 from thermocald.store.recording.table import Table
 
@@ -38,6 +39,7 @@ _BETTER = 0.5  # largest fraction of sigma0 that a change has to leave
 _OTHER_LENSES = (1.0, 1.3, 0.77, 1.7, 0.6)  # principal distances to try, over the model's
 _OTHER_SIZES = (2.0, 4.0, 0.5)  # of the camera's images over those of the image points
 _EXCHANGED = 20  # points of which each two are exchanged, in search of a mistake
+_ON_EACH_OTHER = 0.05  # of the extent: points that an exchange of names may confuse
 _ROUND_MM = 1e6  # the origin is rounded to this
 _SURVEYED_MM = 20.0  # a GNSS receiver with corrections, if no standard deviation is given
 _CLICKED_PX = 1.0
@@ -162,6 +164,44 @@ class ControlPoints:
         # one that fits nevertheless shows no other mistake
         remedy = "; correct the click or leave it out" if pose.ok else self._remedy(camera)
         raise DataError(why + remedy)
+
+    def find_twin(self, camera: Camera, pose: Adjustment) -> str:
+        """Return the exchange of names with which another pose fits, as a sentence; "" without one.
+
+        Points that a turn about their middle puts on each other give a pose with all names
+        exchanged too: the camera is turned with them, and no residual shows it.
+        """
+        from scipy.spatial import KDTree  # 20 MB that a live daemon does not need
+        from scipy.spatial.transform import Rotation
+
+        seen = self.seen.select(~np.isin(self.seen.targets, pose.rejected))
+        names = [self.field.names[row] for row in seen.targets]
+        points = self.field.points[seen.targets]
+        beside = points - points.mean(axis=0)
+        near = _ON_EACH_OTHER * np.linalg.norm(beside, axis=1).max()
+        axes = np.array([[0.0, 0.0, 1.0], *np.linalg.svd(beside)[2]])  # the vertical first
+        for axis, quarters in product(axes, (2, 1, 3)):
+            turned = Rotation.from_rotvec(axis * quarters * np.pi / 2).apply(beside)
+            away, order = KDTree(beside).query(turned)
+            moved = np.flatnonzero(order != np.arange(len(order)))
+            if not len(moved) or len(set(order)) < len(order) or away.max() > near:
+                continue
+            twin = camera.resect(self.field, replace(seen, points=seen.points[order]), 0.0)
+            if twin.ok and twin.sigma0 < max(_FITS, pose.sigma0):
+                old, new = (", ".join(names[k] for k in rows) for rows in (order[moved], moved))
+                here, there = (f"{self.centre_text(p)} {self.unit}" for p in (pose, twin))
+                return (
+                    f"the control points fit as well with {old} named {new} (sigma0 "
+                    f"{twin.sigma0:.2f}, the camera at {there} in place of {here}): no residual "
+                    "shows which names are right; add a point that breaks the symmetry"
+                )
+        return ""
+
+    def centre_text(self, pose: Adjustment) -> str:
+        """Return X, Y, Z of a projection centre in the unit and the coordinates of the file."""
+        digits = 0 if self.unit == "mm" else 2
+        centre = (pose.values[EOP][3:] + self.origin) / UNITS[self.unit]
+        return ", ".join(f"{v:.{digits}f}" for v in centre)
 
     def _remedy(self, camera: Camera) -> str:
         """Return the change with which the points fit, as the end of a sentence; else ""."""

@@ -241,7 +241,12 @@ class Movement:
             f"the camera was moved: it turned by {math.degrees(turn):.4f} ± "
             f"{math.degrees(sd_turn):.4f}° and shifted by {shift:.1f} ± {sd_shift:.1f} mm"
             + ("; turn and shift can hardly be separated here" if sd_shift > shift else "")
-            + ("" if self.sudden else "; it was not sudden: a missing effect looks the same")
+            + (
+                ""
+                if self.sudden
+                else "; it was not sudden: a thermometer in the sun or a missing effect looks the "
+                "same"
+            )
         )
 
 
@@ -294,9 +299,10 @@ class GaugeCalibrator(EpochCalibrator):
         except DataError as error:
             return f"{text}: warning: {error}"
         rejected = ", ".join(self.testfield.names[row] for row in pose.rejected)
-        return f"{text}, sigma0 of their pose {pose.sigma0:.2f}" + (
-            f"; left out: {rejected}" if rejected else ""
-        )
+        text += f", sigma0 of their pose {pose.sigma0:.2f}"
+        text += f"; left out: {rejected}" if rejected else ""
+        twin = known.find_twin(self.predictor.settled(), pose)
+        return f"{text}; doubtful: {twin}" if twin else text
 
     def reset(self) -> None:
         """Forget the last frame and where its control points were: they are searched for anew."""
@@ -463,10 +469,10 @@ class GaugeCalibrator(EpochCalibrator):
         The same points are used, so the errors of their coordinates cancel, as do errors that the
         model has at both times. Image noise, the rates' errors and an unknown past remain.
         """
-        both = np.intersect1d(then.seen.targets, now.seen.targets)
+        both, *rows = np.intersect1d(then.seen.targets, now.seen.targets, return_indices=True)
         if len(both) < _FEWEST:
             return None
-        a, b = (p.seen.select(np.searchsorted(p.seen.targets, both)) for p in (then, now))
+        a, b = then.seen.select(rows[0]), now.seen.select(rows[1])
         points, eop = self.testfield.points[both], then.eop.as_array()
         before, after = then.predicted, now.predicted
         seen = [project(self.sensor, p.camera.values, eop, points) for p in (before, after)]

@@ -8,25 +8,25 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
+from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Steady
+from thermocald.physics.history import History
 from thermocald.store.logger.dialect import to_celsius
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
-    from thermocald.physics.history import History
     from thermocald.physics.model import ThermalModel
 
 
@@ -245,6 +245,41 @@ def require_known(log: Array, readings: Array, times: Array) -> None:
             f"({iso(log[0])} to {iso(log[-1])}) or in a gap of over ten of its intervals, the "
             f"first is {iso(times[outside][0])}"
         )
+
+
+def read_history(
+    times: ArrayLike,
+    temperatures: ArrayLike | Mapping[str, ArrayLike],
+    at: ArrayLike | None,
+    T0: float,
+) -> tuple[float, Array, History]:
+    """Return when a log begins s, the times (E,) s to predict for, and the history since then.
+
+    times (R,) s or datetime64; temperatures (R,) °C, or {channel: (R,)} with the reference first.
+    Raises UsageError for lengths that differ, for what is no number and for times that run
+    backwards, DataError for times `at` that the log does not cover.
+    """
+    t = seconds(times)
+    columns = temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
+    try:
+        readings = {str(n): floats(c) for n, c in columns.items()}
+    except (TypeError, ValueError):
+        raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
+    instants = t if at is None else np.atleast_1d(seconds(at))
+    sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
+    shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
+    if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
+        raise UsageError(
+            f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
+            "each of its times, and at least one time"
+        )
+    if (np.diff(t) < 0).any():
+        raise UsageError("the times run backwards: give a log in the order of time")
+    reference = next(iter(readings))
+    if at is not None:
+        require_known(t, readings[reference], instants)
+    begin = float(min(t[0], instants.min()))
+    return begin, instants, History(instants - begin, t - begin, readings, reference, T0)
 
 
 def require_sd(temperature_sd: float) -> None:

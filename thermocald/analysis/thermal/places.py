@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -25,9 +25,10 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
 from thermocald.files import QuantityReader, read_yaml
-from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials, project
+from thermocald.photogrammetry.camera.camera_model import EOP, IOP, partials, project, rotation
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 from thermocald.result import Result, jsonable, new_figure, with_sds
+from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.thermal.control_points import ControlPoints
     from thermocald.analysis.thermal.correction import RowBlock
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -53,6 +55,7 @@ _NONE = 1e-6  # share of a variance, or mm, that is rounding
 _TOO_GOOD = 0.1  # sigma0 below which standard deviations are not those of these points
 _CONTRADICTED = 1e-3  # heights whose differences are less probable contradict each other
 _DOUBTED = 0.05  # residuals that are less probable may hide an error that nothing checks
+_UPSIDE_DOWN = -0.3  # upward part of the image's y axis; a camera that looks down has about 0
 _BESIDE_MM = 300.0  # a staff's width: an image point further from it may be of something else
 
 
@@ -153,7 +156,8 @@ class Places(Result):
     points' time; pose: the resection; rejected: control points left out; temperatures (n,) °C, NaN
     if unknown; times (n,) s UTC; levels: of the water, if the places are on a staff or a profile;
     unchecked: control points that the others hardly check; unnoticed_mm: by how much a gross error
-    of theirs may move a place unnoticed; refused: (line, reason) of the rows left out.
+    of theirs may move a place unnoticed; refused: (line, reason) of the rows left out; centre (3,):
+    of the camera, in unit and coordinates of the control points; doubts: a sentence each.
     """
 
     names: list[str]
@@ -169,6 +173,8 @@ class Places(Result):
     unchecked: tuple[str, ...] = ()
     unnoticed_mm: float = 0.0
     refused: tuple[tuple[int, str], ...] = ()
+    centre: Array = field(default_factory=lambda: np.full(3, np.nan))
+    doubts: tuple[str, ...] = ()
 
     @cached_property
     def sd(self) -> Array:
@@ -201,10 +207,12 @@ class Places(Result):
                 "sigma0": self.pose.sigma0, "redundancy": self.pose.redundancy,
                 "control_points": self.pose.n_observations, "rejected": list(self.rejected),
                 "sd_angles_deg": np.degrees(self.pose.sd[EOP][:3]).tolist(),
+                "centre": self.centre.tolist(),
                 "sd_centre_mm": self.pose.sd[EOP][3:].tolist(),
                 "unchecked": list(self.unchecked), "unnoticed_mm": self.unnoticed_mm,
             },
             "refused": [{"line": line, "reason": why} for line, why in self.refused],
+            "doubts": list(self.doubts),
         }  # fmt: skip
 
     def lines(self) -> list[str]:
@@ -238,7 +246,12 @@ class Places(Result):
             moments = [datetime.fromtimestamp(time, UTC) for time in self.times]
             names = [f"{n} {moment:%H:%M:%S}" for n, moment in zip(names, moments, strict=True)]
         wide = max(map(len, names), default=4)
-        lines = [pose, f"{'':{wide}}  X ± sd, Y ± sd, Z ± sd in {self.unit}; thermal correction mm"]
+        at = ", ".join(
+            f"{v:.{digits}f} ± {sd / UNITS[self.unit]:.{digits}f}"
+            for v, sd in zip(self.centre, self.pose.sd[EOP][3:], strict=True)
+        )
+        lines = [pose, *doubt_lines(self.doubts), f"the camera is at {at} {self.unit}"]
+        lines.append(f"{'':{wide}}  X ± sd, Y ± sd, Z ± sd in {self.unit}; thermal correction mm")
         for name, p, sd, shift in zip(names, self.points, self.sd, self.shift_mm, strict=True):
             at = ", ".join(f"{v:.{digits}f} ± {s:.{digits}f}" for v, s in zip(p, sd, strict=True))
             lines.append(f"{name:{wide}}  {at}; {shift:.1f}")
@@ -306,17 +319,7 @@ def measure_places(
         exact = replace(exact, sd_tilt=0.0)
     unchecked, unnoticed = _reliability(sensor, control, pose, image, exact, covariance)
     if not isinstance(surface, Plane):
-        eop = pose.values[EOP]
-        on = project(sensor, states[member][:, IOP], eop, points[:, None])[:, 0]
-        scale = sensor.pixel_pitch / states[member, 0] * np.linalg.norm(points - eop[3:], axis=1)
-        beside = np.linalg.norm(on - image, axis=1) * scale
-        if beside.max() > _BESIDE_MM:
-            row = int(np.argmax(beside))
-            warnings.warn(
-                f"image point {names[row]} is {beside[row] / 1000:.1f} m beside the line that its "
-                "height is read on: is it a point of the staff or profile?",
-                stacklevel=3,
-            )
+        _warn_of_points_beside(sensor, states[member], points, image, names)
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
     levels: tuple[Level, ...] = ()
@@ -329,7 +332,43 @@ def measure_places(
         tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
         levels, unchecked, unnoticed,
         tuple(refused for block in rows for refused in block.refused),
+        (pose.values[EOP][3:] + control.origin) / scale,
+        _doubt_pose(control, then[0], pose, surface),
     )  # fmt: skip
+
+
+def _warn_of_points_beside(
+    sensor: Sensor, states: Array, points: Array, image: Array, names: Sequence[str]
+) -> None:
+    """Warn of the image point (n, 2) px that is furthest beside the line of its place (n, 3) mm.
+
+    states (n, 16): camera and pose of each point.
+    """
+    eop = states[0, EOP]
+    on = project(sensor, states[:, IOP], eop, points[:, None])[:, 0]
+    scale = sensor.pixel_pitch / states[:, 0] * np.linalg.norm(points - eop[3:], axis=1)
+    beside = np.linalg.norm(on - image, axis=1) * scale
+    if beside.max() > _BESIDE_MM:
+        row = int(np.argmax(beside))
+        warnings.warn(
+            f"image point {names[row]} is {beside[row] / 1000:.1f} m beside the line that its "
+            "height is read on: is it a point of the staff or profile?",
+            stacklevel=4,
+        )
+
+
+def _doubt_pose(
+    control: ControlPoints, camera: Camera, pose: Adjustment, surface: Plane | Line | Profile
+) -> tuple[str, ...]:
+    """Return what is doubtful in a pose although the control points fit, a sentence each."""
+    doubts = [control.find_twin(camera, pose)]
+    vertical = not isinstance(surface, Plane) or surface.normal.tolist() == [0.0, 0.0, 1.0]
+    if vertical and rotation(pose.values[EOP][:3])[2, 1] < _UPSIDE_DOWN:
+        doubts.append(
+            "the camera hangs upside down in this pose: does it, or were x, y of the control "
+            "points read in an image turned by 180°?"
+        )
+    return tuple(filter(None, doubts))
 
 
 def _reliability(

@@ -301,21 +301,13 @@ def build_camera(
     if found and any(map(detect_tremble, series)):
         verdict["trembles"] = True
     first = models[0]
-    readings: dict[str, Array] = {}
-    for s in series:
-        for channel, read in s.source.readings.items():
-            if len(finite := read[np.isfinite(read)]):
-                readings[channel] = np.append(readings.get(channel, finite[:0]), finite)
     values = np.array([first.value(n) for n in names])
     certain = with_covariance(first, tuple(names), values, covariance)
     model = replace(
         certain,
         effects=tuple(_with_event_sd(e, series[0]) for e in certain.effects),
         image_sigma=sigma,
-        validity={
-            c: (float(np.floor(10 * T.min()) / 10), float(np.ceil(10 * T.max()) / 10))
-            for c, T in readings.items()
-        },
+        validity=_find_ranges(series),
         fitted_on=tuple(
             {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
              "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
@@ -325,6 +317,37 @@ def build_camera(
     )  # fmt: skip
     sigma0 = sigma * float(np.sqrt(np.median(stated)))
     fitted = {"sigma0": sigma0, "band": not model.misses_an_effect, "series": fits}
+    rough = verdict["left_over_in_noise"] > _ROUGH
+    fitted |= _find_poorly_known(fitter, fit, model, series, fits, rough)
+    return ThermalCamera(model, {**fitted, "prediction_test": []})
+
+
+def _find_ranges(series: Sequence[ReducedSeries]) -> dict[str, tuple[float, float]]:
+    """Return the lowest and the highest reading of each thermometer, °C, to 0.1 K outwards."""
+    readings: dict[str, Array] = {}
+    for s in series:
+        for channel, read in s.source.readings.items():
+            if len(finite := read[np.isfinite(read)]):
+                readings[channel] = np.append(readings.get(channel, finite[:0]), finite)
+    return {
+        c: (float(np.floor(10 * T.min()) / 10), float(np.ceil(10 * T.max()) / 10))
+        for c, T in readings.items()
+    }
+
+
+def _find_poorly_known(
+    fitter: HypothesisFitter,
+    fit: Fit,
+    model: ThermalModel,
+    series: Sequence[ReducedSeries],
+    fits: Sequence[SeriesFit],
+    rough: bool,
+) -> dict[str, Any]:
+    """Return what the data determine poorly, as the document of a fit names it.
+
+    rough: whether the fit left much over.
+    """
+    fitted: dict[str, Any] = {}
     if tied := _tied_constants(model):
         fitted["known_together"] = tied
     delays = [
@@ -340,7 +363,7 @@ def build_camera(
         np.ptp(s.history.temperature()) > _CLEAR * f.thermometer_sd
         for s, f in zip(series, fits, strict=True)
     )
-    if not clear or verdict["left_over_in_noise"] > _ROUGH:
+    if not clear or rough:
         rated = [e.name for e in model.effects if catalogue.get(e.name).follows_rate]
         poorly += [name for name in rated if name not in poorly]
     if poorly:
@@ -349,7 +372,7 @@ def build_camera(
     rates = {p: (r, model.sd(f"rates.{p}")) for p, r in model.rates.items() if r}
     if carried := carried_by_c(share, rates):
         fitted["rates_hang_on_c"] = {"c_known_to": share, "sds": carried}
-    return ThermalCamera(model, {**fitted, "prediction_test": []})
+    return fitted
 
 
 def _tied_constants(model: ThermalModel) -> list[dict[str, Any]]:

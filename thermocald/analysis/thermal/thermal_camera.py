@@ -33,11 +33,11 @@ from thermocald.analysis.thermal.modelled_camera import (
     Validity,
     moved_model,
     predict_orientations,
-    require_known,
+    read_history,
     require_sd,
     steady_table,
 )
-from thermocald.arrays import floats, seconds
+from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
@@ -337,29 +337,8 @@ class ThermalCamera(Result):
         ((3, 10), (3, 10))
         """
         require_sd(temperature_sd)
-        t = seconds(times)
-        columns = (
-            temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
-        )
-        try:
-            readings = {str(n): floats(c) for n, c in columns.items()}
-        except (TypeError, ValueError):
-            raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
-        instants = t if at is None else np.atleast_1d(seconds(at))
-        sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
-        shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
-        if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
-            raise UsageError(
-                f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
-                "each of its times, and at least one time"
-            )
-        if (np.diff(t) < 0).any():
-            raise UsageError("the times run backwards: give a log in the order of time")
-        reference = next(iter(readings))
-        if at is not None:
-            require_known(t, readings[reference], instants)
-        begin = float(min(t[0], instants.min()))
-        history = History(instants - begin, t - begin, readings, reference, self.model.T0)
+        begin, instants, history = read_history(times, temperatures, at, self.model.T0)
+        t, readings = history.reading_times, history.readings
         others = {name: history.temperature(name) for name in self.channels if name in readings}
         outside, drift = self._beyond(
             history.temperature(), others, self.model.rate_vector, extrapolate
@@ -376,10 +355,10 @@ class ThermalCamera(Result):
         elif since is not None:
             then = np.array([since - begin])
             base = predicted(history.at(then))[2]
-            of_base = interpolation_matrix(t - begin, then).toarray()[0]
-        for first in range(0, len(instants), _CHUNK):
+            of_base = interpolation_matrix(t, then).toarray()[0]
+        for first in range(0, len(history.times), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
-            W = interpolation_matrix(t - begin, part.times)
+            W = interpolation_matrix(t, part.times)
             shares = W.power(2).sum(axis=1) - 2.0 * (W @ of_base) + of_base @ of_base
             found, slope, J = predicted(part)
             values.append(found)

@@ -203,9 +203,11 @@ def _notes(camera: CameraStudy) -> list[str]:
 
 
 def _doubts(camera: CameraStudy) -> list[str]:
-    """Return the doubts about all series, a line each."""
+    """Return the doubts about all series, a line each, with the name if there are several."""
     measured = [study.series for study in camera.series]
-    return [line for series in measured for line in doubt_lines(series.doubts, series.name)]
+    names = [series.name if len(measured) > 1 else "" for series in measured]
+    each = zip(measured, names, strict=True)
+    return [line for series, name in each for line in doubt_lines(series.doubts, name)]
 
 
 _CLOSE = 0.9

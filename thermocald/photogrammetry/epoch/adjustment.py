@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
+_SEVERAL = 10  # targets of a known camera, of which two may be rejected
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +294,8 @@ def adjust(
     problem = Problem.build(sensor, testfield, observations, unknowns, before)
     use = np.ones(n, dtype=bool) if suspects is None else ~suspects
     most = most_rejected(s.max_rejected, 2 * n - len(unknowns))
+    if known is not None and n >= _SEVERAL:  # eight points are left for six unknowns
+        most = max(most, min(s.max_rejected, 2.0 / n))
     try:
         solution = solve(problem, start, use)
         tests = point_tests(solution, use)

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import GeometryError
+from thermocald.arrays import floats
+from thermocald.errors import GeometryError, UsageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
@@ -111,11 +112,37 @@ def resect(
     return result
 
 
+class _Surface:
+    """What rays meet: made from any lists of three numbers, a direction of any length."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).copy().items():
+            words = "0 or above" if name[:2] == "sd" else "three numbers"
+            try:
+                array = floats(value)
+            except (TypeError, ValueError):
+                array = np.empty(0)
+            if name[:2] == "sd":
+                fits = array.ndim == 0 and bool(array >= 0.0)
+            else:
+                fits = array.shape[-1:] == (3,) and bool(np.isfinite(array).all())
+            if name in ("normal", "direction"):
+                size = np.linalg.norm(array, axis=-1, keepdims=True)
+                fits = fits and bool((size > 0.0).all())
+                if fits and (np.abs(size - 1.0) > 1e-12).any():
+                    array = array / size
+            if not fits:
+                raise UsageError(f"{name} is {str(value)[:80]}; it must be {words}")
+            object.__setattr__(self, name, array if array.ndim else float(array))
+
+
 @dataclass(frozen=True, eq=False)
-class Plane:
-    """A plane through `point` (3,) mm with a unit `normal` (3,); (n, 3): one for each image point.
+class Plane(_Surface):
+    """A plane through `point` (3,) mm with a `normal` (3,); (n, 3): one for each image point.
 
     sd_mm: sd of its position along the normal; sd_tilt: sd of its tilt about each axis in it, rad.
+
+    >>> water = tc.Plane([0.0, 0.0, 138_270.0], [0, 0, 1], sd_mm=5.0)
     """
 
     point: Array
@@ -125,9 +152,10 @@ class Plane:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """A line, such as a staff, through `point` (3,) mm along a unit `direction` (3,); (n, 3): one
-    for each image point.
+class Line(_Surface):
+    """A line, such as a staff, through `point` (3,) mm along a `direction` (3,).
+
+    (n, 3): one for each image point.
 
     sd_mm: sd of its position across its direction.
     """
@@ -138,7 +166,7 @@ class Line:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(_Surface):
     """A surveyed profile, such as a river bank's: straight lines between `points` (k, 3) mm.
 
     sd_mm: sd of its position across its direction.
@@ -146,6 +174,11 @@ class Profile:
 
     points: Array
     sd_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.points.ndim != 2 or len(self.points) < 2:
+            raise UsageError("a profile needs at least two points (k, 3), in order")
 
 
 def place_on(

@@ -78,13 +78,27 @@ class TestField:
         kinds: Sequence[str] | str = "circle",
         codes: Sequence[str] | str = "",
     ) -> TestField:
-        """Build a test field from columns; a scalar holds for all targets."""
+        """Build a test field from columns; a scalar holds for all targets.
+
+        Raises TestFieldError for columns of another length, and for what is no number.
+        """
         n = len(names)
+        try:
+            columns = (
+                np.array(points, dtype=float).reshape(n, 3),
+                np.array(np.broadcast_to(np.asarray(sigmas, dtype=float), (n, 3))),
+                np.array(np.broadcast_to(np.asarray(diameters, dtype=float), (n,))),
+            )
+        except (TypeError, ValueError):
+            raise TestFieldError(
+                f"{n} names: points and sigmas must be numbers ({n}, 3), diameters ({n},), or one "
+                "for all"
+            ) from None
+        if not np.isfinite(columns[0]).all() or not (columns[1] >= 0.0).all():
+            raise TestFieldError("points must be finite numbers, and sigmas 0 or above")
         return cls(
             tuple(names),
-            np.array(points, dtype=float).reshape(n, 3),
-            np.array(np.broadcast_to(np.asarray(sigmas, dtype=float), (n, 3))),
-            np.array(np.broadcast_to(np.asarray(diameters, dtype=float), (n,))),
+            *columns,
             (kinds,) * n if isinstance(kinds, str) else tuple(kinds),
             (codes,) * n if isinstance(codes, str) else tuple(codes),
         )
@@ -253,7 +267,7 @@ def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Obser
         covariances = None
         if "sxy" in lists:
             covariances = np.array(lists["sxy"], dtype=float).reshape(len(rows))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise TestFieldError(
             "observations need the lists target, x, y, sx and sy, with an entry for each target"
         ) from error

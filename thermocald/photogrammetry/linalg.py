@@ -114,7 +114,7 @@ def inverse_of_determined(N: Array) -> Array:
     scaled, scale = unit_diagonal(N)
     both = np.outer(scale, scale)
     try:
-        factor = np.linalg.cholesky(scaled)
+        factor = np.linalg.cholesky(scaled).astype(np.float64, copy=False)
         if factor.diagonal().min() > 1e-6:
             triangle = _inverse_of_triangle(factor)
             return (triangle.T @ triangle) * both
@@ -127,7 +127,7 @@ def _inverse_of_triangle(L: Array) -> Array:
     """Invert a lower triangle (p, p) by halves, in a quarter of the time of a general inverse."""
     half = len(L) // 2
     if half < 32:
-        return np.asarray(np.linalg.inv(L), dtype=np.float64)
+        return np.linalg.inv(L).astype(np.float64, copy=False)
     inverse = np.zeros_like(L)
     upper = inverse[:half, :half] = _inverse_of_triangle(L[:half, :half])
     lower = inverse[half:, half:] = _inverse_of_triangle(L[half:, half:])

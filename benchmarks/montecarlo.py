@@ -2,7 +2,7 @@
 
 Run: python -m benchmarks.montecarlo   (exit status 1 if a bound is missed)
 Bounds: 50,000 sets × 9 points, including drawing and clustering, ≤ 0.25 × the loop (runs vary from
-0.19 to 0.20, of least times taken in turn); distances equal to 1e-6 mm; ≤ 20 MB, for five million
+0.19 to 0.22, of least times taken in turn); distances equal to 1e-6 mm; ≤ 20 MB, for five million
 sets too.
 """
 

@@ -163,9 +163,8 @@ def simulate_errors(
     points, sets, limits = image_grid(sensor, settings.grid), settings.sets, settings.clusters_mm
     root = draw_root(sds, correlation)
     expected = on_plane(sensor, iop, points, settings.distance_mm)
-    first_order = np.moveaxis(
-        plane_jacobian(sensor, iop, points, settings.distance_mm) @ root.T, 1, 0
-    )
+    jacobian = plane_jacobian(sensor, iop, points, settings.distance_mm)
+    first_order = np.moveaxis(jacobian @ root.T, 1, 0)
     k = len(points)
     beyond = np.zeros((k, len(limits)), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array
 
     _Test = TypeVar("_Test", Dependence, DriftTest)
 
@@ -345,9 +345,8 @@ def _corrected(tests: dict[str, _Test], **names: str) -> dict[str, _Test]:
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     """Return the dependence of all parameters on one thermometer, or why there is none."""
     name, sd = thermometer.name, thermometer.sd
-    have: Mask | slice = np.isfinite(thermometer.values)
-    if np.all(have):
-        have = slice(None)  # no copies of a long series
+    known = np.isfinite(thermometer.values)
+    have = slice(None) if known.all() else known  # no copies of a long series
     t = thermometer.values[have]
     reason = ""
     if len(t) < _LEAST_DEPENDENCE:

@@ -322,31 +322,14 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
 def distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """Return the four elements xx, xy, yx, yy of ∂(x', y')/∂(x̄, ȳ); arguments as in `distort`."""
     _, _, _, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
-    # jxx = h + slope·x² + 6·B1·x + 2·B2·y + C1, ...: computed in place, as in `distort`
-    jxx, cross, jyy = x * x, x * y, y * y
-    r2 = jxx + jyy
-    slope = r2 * (6 * A3)
-    slope += 4 * A2
-    slope *= r2
-    slope += 2 * A1
-    h = r2 * A3
-    h += A2
-    h *= r2
-    h += A1
-    h *= r2
-    h += 1.0
-    for element in (jxx, cross, jyy):
-        element *= slope
-    jxx += h
-    jyy += h
-    for factor, along, across, own, other in (
-        (2 * B1, x, y, jxx, jyy), (2 * B2, y, x, jyy, jxx)
-    ):  # fmt: skip
-        other += np.multiply(along, factor, out=h)
-        h *= 3.0
-        own += h
-        cross += np.multiply(across, factor, out=h)
-    return jxx + C1, cross + C2, cross, jyy
+    r2 = x * x + y * y
+    radial = r2 * (A1 + r2 * (A2 + r2 * A3))
+    slope = 2 * (A1 + r2 * (2 * A2 + 3 * r2 * A3))
+    jxx = 1 + radial + slope * x * x + 6 * B1 * x + 2 * B2 * y + C1
+    jxy = slope * x * y + 2 * B1 * y + 2 * B2 * x + C2
+    jyx = slope * x * y + 2 * B2 * x + 2 * B1 * y
+    jyy = 1 + radial + slope * y * y + 6 * B2 * y + 2 * B1 * x
+    return jxx, jxy, jyx, jyy
 
 
 def partials(

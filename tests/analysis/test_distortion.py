@@ -18,7 +18,7 @@ from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import choose_distortion
 from thermocald.thermal.reduce import reduce_series
 
-SEEDS = range(1, 7)
+SEEDS = range(1, 5)
 
 
 def test_the_rates_of_an_opencv_camera_whose_f_changes():
@@ -30,7 +30,7 @@ def test_the_rates_of_an_opencv_camera_whose_f_changes():
         assert f.model.evidence["fit"]["effect_missing"] is False
         errors.append(rate_errors(f, s))
     assert np.abs(errors).max() < 3.0
-    # eighteen numbers give a standard deviation to 17 %
+    # twelve numbers give a standard deviation to 20 %
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
@@ -71,7 +71,7 @@ def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
             assert "keeps its place in the image" in lines
         else:
             assert "the data cannot distinguish" in lines
-    assert recognised >= 4  # χ² is 25 ± 10, and 9 is required
+    assert recognised >= 3  # χ² is 25 ± 10, and 9 is required
 
 
 @pytest.mark.slow

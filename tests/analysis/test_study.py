@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.conftest import INTERIOR, NEXUS, SDS
-from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.study.measured import StudySettings, Thermometer
 from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
 from thermocald.analysis.study.study import (
@@ -19,7 +19,7 @@ from thermocald.analysis.study.study import (
     study_series,
 )
 from thermocald.output.study.report import answer_sentences
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
 
 SETTINGS = StudySettings(sets=2000)
 CLUSTERS = (15.0, 50.0, 100.0)
@@ -232,7 +232,9 @@ def test_the_covariance_of_displacements_is_their_scatter(warm_up):
     sds = np.nan_to_num(series.sds[0])
     of_epoch = series.correlations[0] * np.outer(sds, sds)
     later = rng.multivariate_normal(INTERIOR, 2 * of_epoch, 2000)  # of two independent epochs
-    moved = np.array([displacement(series, INTERIOR, one)[0] for one in later])
+    grid = image_grid(NEXUS)
+    scene = directions(NEXUS, INTERIOR, grid)
+    moved = project(NEXUS, later, np.zeros((len(later), 6)), scene) - grid
 
     found = np.einsum("nki,nkj->kij", moved, moved) / len(moved)
     # 2000 draws give a variance to 3 %

@@ -85,10 +85,10 @@ def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     field = cases.bent_sheet(6, 5)
     stations = cases.convergent_stations(field, 8)
     first = cases.distance(field, 0, 29, 0.1)
-    one = _survey(field, stations, 0.05, 3, [first])[0]
+    one = _survey(field, stations, 0.05, 3, [first], interior=cases.INTERIOR)[0]
     # the second is 1 mm too long, but has ten times the sd: a hundredth of 1 mm remains at most
     both = [first, cases.distance(field, 5, 24, 1.0, 1.0)]
-    two = _survey(field, stations, 0.05, 3, both)[0]
+    two = _survey(field, stations, 0.05, 3, both, interior=cases.INTERIOR)[0]
     assert two.sd_scale < one.sd_scale
     assert two.extent == pytest.approx(one.extent, rel=0.02 / 900)
     assert two.extent > one.extent
@@ -143,10 +143,10 @@ def test_sigmas_twice_too_small_show_in_sigma0_and_twenty_times_are_refused():
     for seen in photos.values():
         seen.sigmas[:] = 0.05 / 20
     with pytest.raises(GeometryError, match="times their stated sigmas"):
-        _adjust(photos)
+        _adjust(photos, interior=cases.INTERIOR)
     for seen in photos.values():
         seen.sigmas[:] = 0.05 / 2
-    assert _adjust(photos).sigma0 == pytest.approx(2.0, rel=0.1)
+    assert _adjust(photos, interior=cases.INTERIOR).sigma0 == pytest.approx(2.0, rel=0.1)
 
 
 def test_coordinates_are_as_accurate_as_stated_if_the_focus_moves_between_photographs():
@@ -175,7 +175,7 @@ def test_coordinates_are_as_accurate_as_stated_if_the_focus_moves_between_photog
 
 def test_advice_names_the_missing_roll():
     flat = cases.convergent_stations(_BENT, 8, rolled=False)
-    network, _ = _survey(_BENT, flat, 0.05, 0)
+    network, _ = _survey(_BENT, flat, 0.05, 0, interior=cases.INTERIOR)
     assert any("turned about its axis" in note for note in advice(network))
     assert network.disagreement == 1
     rolled, _ = _survey(_BENT, cases.convergent_stations(_BENT, 8), 0.05, 0)
@@ -196,7 +196,7 @@ def test_a_foreign_photograph_and_one_of_another_focus_are_left_out_and_named(zo
         zoomed = CameraModel(cases.SENSOR, cases.INTERIOR.with_values(c=cases.INTERIOR.c * zoom))
         other, _ = cases.photographs(_BENT, stations[7:8], 0.05, rng, camera=zoomed)
         photos["photo7"] = other["photo0"]
-    network = _adjust(photos)
+    network = _adjust(photos, interior=cases.INTERIOR)
     assert "photo7" in network.unused
     assert "photo7" not in {s.photo for s in network.stations}
     assert 0.9 < network.sigma0 < 1.1

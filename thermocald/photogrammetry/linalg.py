@@ -112,12 +112,27 @@ def inverse_of_determined(N: Array) -> Array:
     if len(N) == 0:
         return N
     scaled, scale = unit_diagonal(N)
+    both = np.outer(scale, scale)
     try:
-        if np.linalg.cholesky(scaled).diagonal().min() > 1e-6:
-            return scaled_inverse(N)
+        factor = np.linalg.cholesky(scaled).astype(np.float64, copy=False)
+        if factor.diagonal().min() > 1e-6:
+            triangle = _inverse_of_triangle(factor)
+            return (triangle.T @ triangle) * both
     except np.linalg.LinAlgError:
         pass
-    return np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(scale, scale)
+    return np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * both
+
+
+def _inverse_of_triangle(L: Array) -> Array:
+    """Invert a lower triangle (p, p) by halves, in a quarter of the time of a general inverse."""
+    half = len(L) // 2
+    if half < 32:
+        return np.linalg.inv(L).astype(np.float64, copy=False)
+    inverse = np.zeros_like(L)
+    upper = inverse[:half, :half] = _inverse_of_triangle(L[:half, :half])
+    lower = inverse[half:, half:] = _inverse_of_triangle(L[half:, half:])
+    inverse[half:, :half] = -(lower @ L[half:, :half]) @ upper
+    return inverse
 
 
 def inverse_2x2(M: Array) -> Array:

@@ -432,6 +432,13 @@ def test_what_was_held_keeps_no_standard_deviation(tmp_path, to):
 # --- wrong files -------------------------------------------------------------------------------
 
 
+def _own(**changes):
+    """Return the text of a file of our own, with some keys changed."""
+    sensor = {"width": 100, "height": 100, "pixel_pitch": 0.001}
+    document = {"format": "thermocald-camera/1", "interior": {"c": 0.1}, "sensor": sensor}
+    return json.dumps(document | changes)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
@@ -453,8 +460,14 @@ def test_what_was_held_keeps_no_standard_deviation(tmp_path, to):
         ("s.ior", "1 1 -8 0 0 1e-3 0 0 0 0 0 0 0 8 6 2000 1500", "R0 is 0"),
         ("t.ior", "1 1 -8 0 0 0 0 2 0 0 0 0 0 8 6 0 1500", "columns"),
         ("o.json", '{"format": "thermocald-camera/1"}', "sensor or interior"),
-        ("u.json", """{"format": "thermocald-camera/1", "interior": {"c": 0.1}, "covariance": [],
-         "sensor": {"width": 100, "height": 100, "pixel_pitch": 0.001}}""", "covariance.matrix"),
+        ("u.json", _own(covariance=[]), "covariance.matrix"),
+        ("order.json", _own(covariance={"parameters": ["x0", "c"]}), "covariance.parameters"),
+        ("variance.json", _own(covariance={"matrix": (-np.eye(10)).tolist()}), "negative variance"),
+        ("tilted.json", _own(covariance={"matrix": np.tri(10).tolist()}), "not symmetric"),
+        ("beyond.json", _own(covariance={"matrix": (2 - np.eye(10)).tolist()}), "above 1"),
+        ("name.json", _own(interior={"c": 0.1, "a1": 2.0}), "interior.a1 is none of c"),
+        ("half.json", _own(sensor={"width": 100.5, "height": 100, "pixel_pitch": 0.001}),
+         "100.5 × 100"),
         ("v.yaml", "image_width: 10\ndistortion_model: []\n", "distortion_model"),
         ("w.cameramodel", "{'lensmodel': [], 'imagersize': 1}", "lensmodel"),
         ("x.cameramodel", "{[]: 'lensmodel imagersize'}", "Python's notation"),

@@ -84,13 +84,14 @@ def solve_distortion(iop: Array, measured: Array, ideal: Array, tolerance: float
     jxx, jxy, jyx, jyy = distortion_jacobian(iop, x, y)
     inverse = 1.0 / (jxx * jyy - jxy * jyx)
     solved: Mask = inverse > 0
-    jxx, jxy, jyx, jyy = jyy * inverse, jxy * inverse, jyx * inverse, jxx * inverse
+    jxx, jxy, jyx, jyy = (a * inverse for a in (jyy, jxy, jyx, jxx))
     for _ in range(_STEPS):
-        xd, yd = distort(iop, x, y)
-        rx, ry = xm - xd, ym - yd
+        rx, ry = distort(iop, x, y)
+        rx -= xm
+        ry -= ym
         dx, dy = jxx * rx - jxy * ry, jyy * ry - jyx * rx
-        x += dx
-        y += dy
+        x -= dx
+        y -= dy
         if max(dx.max(), -dx.min(), dy.max(), -dy.min()) <= tolerance:
             return solved
     return np.asarray(solved & (np.fmax(np.abs(dx), np.abs(dy)) <= tolerance))

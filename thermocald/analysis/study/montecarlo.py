@@ -83,7 +83,7 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
     return np.asarray(-solved, dtype=np.float64)
 
 
-_CHUNK = 1024
+_CHUNK = 512
 _SAMPLE = 400  # of the first sets, whose errors are drawn
 _CONVERGED = 1e-6  # px, a last step that leaves an error far below
 
@@ -163,6 +163,8 @@ def simulate_errors(
     points, sets, limits = image_grid(sensor, settings.grid), settings.sets, settings.clusters_mm
     root = draw_root(sds, correlation)
     expected = on_plane(sensor, iop, points, settings.distance_mm)
+    jacobian = plane_jacobian(sensor, iop, points, settings.distance_mm)
+    first_order = np.moveaxis(jacobian @ root.T, 1, 0)
     k = len(points)
     beyond = np.zeros((k, len(limits)), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))
@@ -170,8 +172,11 @@ def simulate_errors(
     rng = np.random.default_rng(settings.seed)
     used = 0
     for done in range(0, sets, _CHUNK):
-        drawn = iop + rng.standard_normal((min(_CHUNK, sets - done), len(root))) @ root
-        errors = plane_errors(sensor, drawn, points, expected, settings.distance_mm)
+        normal = rng.standard_normal((min(_CHUNK, sets - done), len(root)))
+        errors = plane_errors(
+            sensor, iop + normal @ root, points, expected, settings.distance_mm,
+            first_order @ normal.T,
+        )  # fmt: skip
         dx, dy = errors if np.isfinite(errors).all() else errors[:, :, np.isfinite(errors[0, 0])]
         distance = np.sqrt(dx * dx + dy * dy)
         used += distance.shape[1]
@@ -183,7 +188,7 @@ def simulate_errors(
         if done < _SAMPLE:
             sample.append(np.stack([dx.T, dy.T], axis=-1))
         if progress is not None:
-            progress(len(drawn))
+            progress(len(normal))
     folded = sets - used
     if used < 2:
         raise GeometryError(
@@ -202,20 +207,23 @@ def simulate_errors(
 
 
 def plane_errors(
-    sensor: Sensor, sets: Array, points: Array, expected: Array, distance_mm: float
-) -> Array:
+    sensor: Sensor, sets: Array, points: Array, expected: Array, distance_mm: float,
+    start: Array | None = None,
+) -> Array:  # fmt: skip
     """Return the errors in X and Y (2, k, n) mm of image points (k, 2) px for sets (n, 10).
 
-    expected (k, 2): points on the plane, mm, as `on_plane` gives them. A set that has no ray for
-    one of the points has NaN for all.
+    expected (k, 2): points on the plane, mm, as `on_plane` gives them; start (2, k, n): approximate
+    errors, mm. A set that has no ray for one of the points has NaN for all.
     """
     sets, middle = np.asfortranarray(sets), expected.T[..., None]
     scale = distance_mm / sets[:, 0]
     # (k, n, 1): one point per camera at a time, as the camera model broadcasts
-    ideal = (middle / scale)[..., None]
+    ideal = ((middle if start is None else middle + start) / scale)[..., None]
     measured = image_to_mm(sensor, points).T[..., None, None]
     solved = solve_distortion(sets, measured, ideal, _CONVERGED * sensor.pixel_pitch)
-    errors = ideal[..., 0] * scale - middle
+    errors = ideal[..., 0]
+    errors *= scale
+    errors -= middle
     errors[:, :, ~solved.all(axis=(0, 2))] = np.nan
     return np.asarray(errors)
 

@@ -345,7 +345,8 @@ def _corrected(tests: dict[str, _Test], **names: str) -> dict[str, _Test]:
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     """Return the dependence of all parameters on one thermometer, or why there is none."""
     name, sd = thermometer.name, thermometer.sd
-    have = np.isfinite(thermometer.values)
+    known = np.isfinite(thermometer.values)
+    have = slice(None) if known.all() else known  # no copies of a long series
     t = thermometer.values[have]
     reason = ""
     if len(t) < _LEAST_DEPENDENCE:

@@ -17,6 +17,7 @@ import yaml
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
+from thermocald.photogrammetry.linalg import unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -77,6 +78,7 @@ def among(known: Mapping[str, _T], given: Any, what: str) -> _T:
 
 
 _LARGEST = 1e9
+_ROUNDED = 1e-4  # of a correlation, in files with few digits
 _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
 
 
@@ -115,10 +117,20 @@ class CameraRecord:
         text: that of the file. Raises ConfigurationError if no camera has such values.
         """
         width, height = (int(side) for side in self.size)
-        if not (0 < width <= 100_000 and 0 < height <= 100_000):
-            raise ConfigurationError(f"image size {width} × {height} px is impossible")
+        whole = (width, height) == tuple(self.size)
+        if not (whole and 0 < width <= 100_000 and 0 < height <= 100_000):
+            given_size = " × ".join(f"{side:g}" for side in self.size)
+            raise ConfigurationError(f"image size {given_size} px is impossible")
         if not np.all(np.abs(self.values) < _LARGEST):
             raise ConfigurationError("a camera parameter is not a number, or far out of range")
+        if self.covariance is not None:
+            r = unit_diagonal(self.covariance)[0]
+            negative = self.covariance.diagonal().min() < 0 or np.linalg.eigvalsh(r)[0] < -_ROUNDED
+            if negative or not np.allclose(r, r.T, atol=_ROUNDED):
+                raise ConfigurationError(
+                    "the covariance has a negative variance, a correlation above 1, or is not "
+                    "symmetric: is a number wrong?"
+                )
         own = self.pixel_pitch
         if self.family is BROWN and own and given and not np.isclose(given, own, rtol=1e-9):
             raise ConfigurationError(
@@ -202,11 +214,16 @@ def _decode_own(text: str) -> CameraRecord:
     pitch = number(head.get("pixel_pitch"), "sensor.pixel_pitch")
     if "c" not in values:
         raise ConfigurationError("interior.c is missing")
+    for key in values:
+        if str(key).removeprefix("sd_") not in IOP_NAMES:
+            raise ConfigurationError(f"interior.{key} is none of {', '.join(IOP_NAMES)}")
     interior = np.array([number(values.get(name, 0.0), f"interior.{name}") for name in IOP_NAMES])
     covariance = document.get("covariance")
     if covariance is not None:
-        matrix = covariance.get("matrix") if isinstance(covariance, dict) else None
-        covariance = numbers(matrix, "covariance.matrix", (100,)).reshape(10, 10)
+        stated = covariance if isinstance(covariance, dict) else {}
+        if stated.get("parameters", list(IOP_NAMES)) != list(IOP_NAMES):
+            raise ConfigurationError(f"covariance.parameters are not {', '.join(IOP_NAMES)}")
+        covariance = numbers(stated.get("matrix"), "covariance.matrix", (100,)).reshape(10, 10)
     name = str(document.get("name", "camera"))
     return CameraRecord(size, BROWN, interior, name, covariance, pitch)
 

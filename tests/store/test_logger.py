@@ -198,9 +198,44 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
     assert found.times[-1] - found.times[0] <= 120
 
 
+@pytest.mark.parametrize(("row", "order", "month", "says"), [
+    ("26/06/14 12:00", None, 201406, "is taken as day/month/year, 2014-06-26; if it is 2026-06-14"),
+    ("14.06.26 12:00", None, 202606, "is taken as day/month/year, 2026-06-14; if it is 2014-06-26"),
+    ("26-06-14 12:00", "ymd", 202606, ""),
+    ("26/06/14 23:59", None, 202606, "is year/month/day: this makes the rows consecutive"),
+])  # fmt: skip
+def test_a_year_of_two_digits_may_be_first(tmp_path, row, order, month, says):
+    after = row.replace("14 23:59", "15 00:01")
+    found = logged(tmp_path, f"time,temp °C\n{row},21\n{after}:30,21\n", date_order=order)
+    assert f"{datetime.fromtimestamp(found.times[0], UTC):%Y%m}" == str(month)
+    assert any(says in note for note in found.notes)
+    assert any("--date-order" in note for note in found.notes) == ("if it is" in says)
+
+
+@pytest.mark.parametrize(("encoding", "head", "channel"), [
+    ("cp1251", "Дата;Температура (°C)", "Температура"), ("koi8-r", "Время;Темп. 1", "Темп. 1"),
+    ("cp866", "Дата;Влажность;Температура", "Температура"),
+    ("shift_jis", "日時;湿度;筐体温度[℃]", "筐体温度"), ("euc-jp", "時刻;気温", "気温"),
+    ("gb18030", "时间;外壳温度(℃)", "外壳温度"), ("big5", "時間;溫度", "溫度"),
+    ("euc-kr", "측정시간;온도(℃)", "온도"), ("cp1250", "Čas;Teplota", "Teplota"),
+    ("cp1253", "Ώρα;Θερμοκρασία", "Θερμοκρασία"), ("cp1252", "Tid;Kåpa °C", "Kåpa"),
+    ("cp850", "Zeit;Gehäuse °C", "Gehäuse"), ("mac-roman", "Heure;Température °C", "Température"),
+])  # fmt: skip
+def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head, channel):
+    rows = "".join(f"2026-06-14 12:0{i}{';45' * (head.count(';') - 1)};21.5\n" for i in range(3))
+    found = logged(tmp_path, f"{head}\n{rows}".encode(encoding))
+    assert list(found.channels) == [channel]
+    assert "(assumed; set --encoding to change), columns" in found.notes[0]
+    given = logged(tmp_path, f"{head}\n{rows}".encode(encoding), encoding=encoding)
+    assert list(given.channels) == [channel]
+    assert "assumed" not in given.notes[0]
+
+
 @pytest.mark.parametrize(
     ("data", "options", "reason"),
     [
+        ("time,T\n13/05/2026 12:00,20\n05/13/2026 12:01,20\n", {},
+         "line 3, column 'time': '05/13/2026 12:01' is not in the order of day and month"),
         (GERMAN, {"clock": DeviceClock()}, "no time zone: give it with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
         (b"Date;Time;T\n" + 9 * b"05/06/2026;10:00;21\n" + b"05/06/2026;10:;21\n", {}, "10:' is"),
@@ -308,7 +343,7 @@ def test_clock_errors(text, seconds):
     ("text", "expected"),
     [
         ("2026:06:14 12:00:01", datetime(2026, 6, 14, 12, 0, 1)),
-        ("14.06.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
+        ("06.14.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
         ("20260614_120001", datetime(2026, 6, 14, 12, 0, 1)),
         ("6/14/2026 12:02 AM", datetime(2026, 6, 14, 0, 2)),
         ("2026-06-14 12:00 MESZ", datetime(2026, 6, 14, 10, tzinfo=UTC)),

@@ -7,6 +7,7 @@ daylight saving skips is refused, and one that it repeats too, unless it is give
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta, timezone, tzinfo
 from typing import TYPE_CHECKING
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
+ORDERS = {"dmy": "day/month/year", "mdy": "month/day/year", "ymd": "year/month/day"}
+"""Orders of a date that does not begin with a year of four digits."""
 AMBIGUOUS = ("refuse", "order", "earlier", "later")
 """How to treat the repeated hour: refuse it, use the order of the rows, or take one."""
 
@@ -224,7 +227,7 @@ def iso(seconds: float, digits: str = "milliseconds") -> str:
 def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     """Parse a date with a time, with or without a zone; or a date or a time alone.
 
-    order: of day and month, `dmy` or `mdy`; None: year-month-day or dmy, by the date's form.
+    order: one of ORDERS; None: year-month-day or dmy, by the date's form.
     Numbers are seconds (or ms, µs, ns) since 1970 UTC. Raises ValueError for other text.
     """
     text = _month_to_number(text.strip())
@@ -274,13 +277,20 @@ def is_date_like(text: str) -> bool:
     return re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}(?!\d)", text) is not None
 
 
-def day_and_month(text: str) -> tuple[int, int] | None:
-    """Return the first two numbers of a date with / or - that does not begin with the year."""
+def date_orders(text: str) -> set[str] | None:
+    """Return the orders, of ORDERS, in which text is a date; None if it has only one form."""
     text = _month_to_number(text.strip())
     found = _FULL.fullmatch(text) or _ONLY_DATE.fullmatch(text)
-    if found is None or found["compact"] or len(found["a"]) == 4 or found["mark"] == ".":
+    if found is None or found["compact"] or len(found["a"]) == 4:
         return None
-    return int(found["a"]), int(found["b"])
+    possible = set()
+    for order in ORDERS:
+        with suppress(ValueError):
+            _date(found, order)
+            possible.add(order)
+    if found["mark"] == ".":
+        possible.discard("mdy")  # unless the user gives it
+    return possible
 
 
 def _month_to_number(text: str) -> str:
@@ -305,9 +315,9 @@ def _date(found: re.Match[str], order: str | None) -> date:
     a, b, c = (int(found[part]) for part in "abc")
     if len(found["a"]) == 4:
         return date(a, b, c)
-    year = c if len(found["c"]) == 4 else 2000 + c
-    month_first = order == "mdy" and found["mark"] != "."
-    return date(year, a, b) if month_first else date(year, b, a)
+    if len(found["c"]) != 4:
+        a, c = (2000 + a, c) if order == "ymd" else (a, 2000 + c)
+    return date(a, b, c) if order == "ymd" else date(c, *((a, b) if order == "mdy" else (b, a)))
 
 
 def _time(found: re.Match[str]) -> time:

@@ -412,9 +412,9 @@ _LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months
 class LogOptions:
     """What the user has given about a log.
 
-    times, temperatures: names of columns, empty to guess; encoding, separator, decimal, date_order,
-    unit: None to detect; clock: the logger's; wanted: names of temperature columns to use if they occur,
-    such as a model's thermometers; names: new names of columns by those in the file.
+    times, temperatures: names of columns, empty to guess; encoding to unit: None to detect; clock:
+    the logger's; wanted: names of temperature columns to use if they occur, such as a model's
+    thermometers; names: new names of columns by those in the file.
     """
 
     times: tuple[str, ...] = ()

@@ -559,7 +559,7 @@ def find_date_order(
     if len(spans) == 1 or set(spans) == {"dmy", "ymd"}:
         one, *others = spans
         return one, [
-            f"log: {first!r} is taken as {ORDERS[one]}, {spans[one][0]:%Y-%m-%d}; if it is "
+            f"doubtful: {first!r} is taken as {ORDERS[one]}, {spans[one][0]:%Y-%m-%d}; if it is "
             f"{spans[other][0]:%Y-%m-%d}, give --date-order {other}"
             for other in others
         ]

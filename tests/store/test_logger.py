@@ -346,6 +346,10 @@ def test_clock_errors(text, seconds):
         ("06.14.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
         ("20260614_120001", datetime(2026, 6, 14, 12, 0, 1)),
         ("6/14/2026 12:02 AM", datetime(2026, 6, 14, 0, 2)),
+        ("6/14/2026 12:02 p. m.", datetime(2026, 6, 14, 12, 2)),
+        ("2026-06-30 24:00", datetime(2026, 7, 1)),
+        ("Sun Jun 14 12:00:00 2026", datetime(2026, 6, 14, 12)),
+        ("Sun Jun 14 12:00:00 CEST 2026", datetime(2026, 6, 14, 10, tzinfo=UTC)),
         ("2026-06-14 12:00 MESZ", datetime(2026, 6, 14, 10, tzinfo=UTC)),
     ],
 )
@@ -363,7 +367,8 @@ def test_moments(text, expected):
         *((time_zone, text, UsageError, "time zone")
           for text in ("Europe/Nowhere", "CEST!", "+99:00", "../../etc/passwd", "")),
         *((parse_moment, text, ValueError, r".")
-          for text in ("2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12")),
+          for text in ("2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12",
+                       "2026-06-14 24:00:01")),
         (find_photographs, [], DataError, "no photographs are given"),
     ],
 )  # fmt: skip
@@ -489,6 +494,16 @@ PROGRAMS = {
     "days of a spreadsheet": (
         ["Datum;T °C"],
         lambda m, t, i: f"{(m.timestamp() / 86400 + 25569):.5f};{t:.2f}".replace(".", ",")),
+    "a Raspberry Pi's vcgencmd": (
+        [], lambda m, t, i: f"{m:%Y-%m-%dT%H:%M:%S}Z,temp={t:.2f}'C"),
+    "InfluxDB, annotated": (
+        ["#group,false,false,false", "#datatype,long,dateTime:RFC3339,double", "#default,,,",
+         ",table,_time,_value"],
+        lambda m, t, i: f",0,{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f}"),
+    "ThingSpeak": (
+        ["created_at,entry_id,field1"], lambda m, t, i: f"{m:%Y-%m-%d %H:%M:%S} UTC,{i},{t:.2f}"),
+    "Chinese dates": (
+        ["时间,温度"], lambda m, t, i: f"{m.year}年{m.month}月{m.day}日 {m:%H:%M:%S},{t:.2f}"),
     "a remark between the rows": (
         ["time,T °C"],
         lambda m, t, i: "# battery changed\r\n" * (i == 6) + f"{int(m.timestamp())},{t:.2f}"),

@@ -180,7 +180,7 @@ _DATE = r"(?P<a>\d{1,4})(?P<mark>[-./:])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})\.?
 _COMPACT_DATE = r"(?P<compact>\d{8})"
 _TIME = (
     r"(?P<h>\d{1,2})[:.](?P<m>\d{2})(?:[:.](?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?"
-    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?"
 )
 _COMPACT_TIME = r"(?P<ct>\d{6})(?:[.,]?(?P<cf>\d{1,9}))?"
 _ZONES_H = {
@@ -202,6 +202,9 @@ _NAMED_DATE = re.compile(
     r"(?:[^\W\d_]{2,9}\.?,?\s+)?"  # the day of the week
     r"(?:(?P<m1>[^\W\d_]{3,9})\.?\s+(?P<d1>\d{1,2})(?:st|nd|rd|th)?,?\s+(?P<y1>\d{4})"
     r"|(?P<d2>\d{1,2})[\s.-]+(?P<m2>[^\W\d_]{3,9})[\s.,-]+(?P<y2>\d{4}|\d{2}))(?P<rest>\D.*|)"
+)
+_OF_DATE = re.compile(  # as `date` and ctime write it: Sun Jun 14 12:00:00 CEST 2026
+    r"^[^\W\d_]{2,4}\.? ([^\W\d_]{3,4})\.? +(\d{1,2}) (\d\d:\d\d:\d\d)( [A-Z]{3,4})? (\d{4})$"
 )
 _MONTHS = {
     name: number
@@ -237,6 +240,10 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
         except (OverflowError, OSError) as cause:
             raise ValueError(f"{text} is not a time") from cause
     if found := _FULL.fullmatch(text):
+        if found["h"] == "24" and int(found["m"] + (found["s"] or "0")) == 0:  # a day's end
+            begin = parse_moment(f"{text[: found.start('h')]}00{text[found.end('h') :]}", order)
+            assert isinstance(begin, datetime)
+            return begin + timedelta(days=1)
         return datetime.combine(_date(found, order), _time(found))
     if found := _ONLY_TIME.fullmatch(text):
         return _time(found)
@@ -297,7 +304,7 @@ def _month_to_number(text: str) -> str:
     """Rewrite a date with the month as a word, or in Chinese, as 2026-06-14."""
     if text.isascii() and not _WORD.search(text):
         return text
-    text = text.translate(_CHINESE)
+    text = _OF_DATE.sub(r"\1 \2 \5 \3\4", text.translate(_CHINESE))
     found = _NAMED_DATE.fullmatch(text)
     if found is None:
         return text

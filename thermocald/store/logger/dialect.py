@@ -62,7 +62,7 @@ _STATED = re.compile(
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
-UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
+UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|'C|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
 """The unit behind a reading."""
 
 
@@ -115,12 +115,13 @@ _ENCODINGS = (
     "cp1254", "cp850", "mac_roman",
 )  # fmt: skip
 """Encodings that are tried after those of Western Europe and China."""
+_LETTERS_ALONE = "\u03a9\u2126\u0394"  # ohm and delta, which are part of Greek words too
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
 _POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
-    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º]?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
+    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º']?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
     r"|unavailable|unknown|none|null|n/?an?|-+|err(?:or)?",
     re.IGNORECASE,
 )
@@ -247,7 +248,7 @@ def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[i
     reader = csv.reader((line.replace("−", "-") for line in lines), delimiter=mark)
     try:
         for row in reader:
-            fields = [field.strip() for field in row]
+            fields = [field.strip().removeprefix("temp=") for field in row]  # vcgencmd's
             if any(fields):
                 yield reader.line_num, fields
     except csv.Error as cause:
@@ -308,7 +309,8 @@ def _detect_encoding(path: Path) -> str:
 def _count_words(text: str) -> int:
     """Return how many words for times, temperatures and others a text has in letters beyond A-Z."""
     patterns = (TIME_NAME, _TEMPERATURE_NAME, OTHER_NAME)
-    return sum(not found[0].isascii() for p in patterns for found in p.finditer(text))
+    words = [found[0] for pattern in patterns for found in pattern.finditer(text)]
+    return sum(not word.isascii() and word not in _LETTERS_ALONE for word in words)
 
 
 def _detect_separator(path: Path, lines: list[str]) -> str:
@@ -352,7 +354,7 @@ def _column_names(above: list[list[str]], width: int) -> tuple[str, ...]:
     """
     wide = [_join_units(row, width) for row in above if len(row) > width][-1:]
     narrow = [row for row in above if len(row) == width - 1 and width > 2][-1:]
-    rows = [row for row in above if len(row) == width]
+    rows = [row for row in above if len(row) == width and row[0] not in _ANNOTATIONS]
     # a line with a logger's serial number may have as many fields as the data
     named = next((i for i, row in enumerate(rows) if any(map(TIME_NAME.search, row))), None)
     if named is None and any(TIME_NAME.search(name) for row in wide for name in row):
@@ -394,7 +396,7 @@ _TEMPERATURE_NAME = re.compile(
 OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
     r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt|ros[ée]e|roc[ií]o|rugiada"
-    r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|濕度|露点|序号|влажн|давлен|습도|気圧"
+    r"|^table$|entry_id|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|濕度|露点|序号|влажн|давлен|습도|気圧"
     # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
     r"|temp\w*[ _]?set|soll|consigne|desired|target|wanted|nominal|reference value|forecast"
@@ -405,6 +407,7 @@ OTHER_NAME = re.compile(
 _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _GOOD_SHARE = 0.8
+_ANNOTATIONS = ("#group", "#datatype", "#default")  # of InfluxDB
 _LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
 
 

@@ -243,7 +243,8 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
         if found["h"] == "24" and int(found["m"] + (found["s"] or "0")) == 0:  # a day's end
             begin = parse_moment(f"{text[: found.start('h')]}00{text[found.end('h') :]}", order)
             assert isinstance(begin, datetime)
-            return begin + timedelta(days=1)
+            with suppress(OverflowError):
+                return begin + timedelta(days=1)
         return datetime.combine(_date(found, order), _time(found))
     if found := _ONLY_TIME.fullmatch(text):
         return _time(found)

@@ -184,9 +184,12 @@ def open_log(path: Path, options: LogOptions) -> LoggerFile:
     detected = _detect_encoding(path)
     encoding = options.encoding or detected
     is_assumed = not options.encoding and not detected.startswith("utf")
-    with path.open(encoding=encoding, errors="replace", newline="") as file:
-        begin = list(islice(file, _SAMPLE))
-        end = list(deque(filter(str.strip, file), _SAMPLE))
+    try:
+        with path.open(encoding=encoding, errors="replace", newline="") as file:
+            begin = list(islice(file, _SAMPLE))
+            end = list(deque(filter(str.strip, file), _SAMPLE))
+    except UnicodeError as cause:
+        raise UsageError(f"--encoding {encoding}: {path} cannot be read so: {cause}") from cause
     if not any(map(str.strip, begin + end)):
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
@@ -198,7 +201,7 @@ def open_log(path: Path, options: LogOptions) -> LoggerFile:
         if not ours:
             raise
         mark = ","
-    start, last = _split_lines(begin, mark), _split_lines(end, mark)
+    start, last = list(_parse_rows(path, begin, mark)), _split_lines(end, mark)
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; at most {_MOST_COLUMNS} are read")

@@ -291,6 +291,8 @@ def date_orders(text: str) -> set[str] | None:
     found = _FULL.fullmatch(text) or _ONLY_DATE.fullmatch(text)
     if found is None or found["compact"] or len(found["a"]) == 4:
         return None
+    if found["mark"] == "." and len(found["c"]) == 4:
+        return None
     possible = set()
     for order in ORDERS:
         with suppress(ValueError):

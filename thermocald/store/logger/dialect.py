@@ -248,10 +248,11 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    reader = csv.reader((line.replace("−", "-") for line in lines), delimiter=mark)
+    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)  # as vcgencmd writes it
+    reader = csv.reader(plain, delimiter=mark)
     try:
         for row in reader:
-            fields = [field.strip().removeprefix("temp=") for field in row]  # vcgencmd's
+            fields = [field.strip() for field in row]
             if any(fields):
                 yield reader.line_num, fields
     except csv.Error as cause:

@@ -530,6 +530,39 @@ def find_date_order(
         return options.date_order, []
     if not any(map(date_orders, file.column(names[0]))):
         return None, []
+    first, spans = _read_in_orders(file, names)
+    one, *others = spans
+    costs: dict[str, dict[str, float]] = {}  # of each order, s, by what speaks for the least
+    if others and near is not None:
+        times = {o: clock.utc(span, lambda _: f"{file.path}") for o, span in spans.items()}
+        costs["puts the log near the photographs"] = {
+            o: float(max(t.min() - near[1], near[0] - t.max(), 0.0)) for o, t in times.items()
+        }
+    if others:
+        costs["makes the rows consecutive"] = {
+            o: abs((b.replace(tzinfo=None) - a.replace(tzinfo=None)).total_seconds())
+            for o, (a, b) in spans.items()
+        }
+    for why, cost in costs.items():
+        order, second, *_ = sorted(cost, key=cost.__getitem__)
+        if cost[second] > _LONGER * cost[order] + 86400.0:
+            return order, [f"log: {first!r} is {ORDERS[order]}: this {why}"]
+    if "mdy" in others:
+        raise DataError(
+            f"{file.path}, column {names[0]!r}: {first!r} may be "
+            f"{' or '.join(ORDERS[o] for o in spans)}: give --date-order {' or '.join(spans)}"
+        )
+    return one, [
+        f"doubtful: {first!r} is taken as {ORDERS[one]}, {spans[one][0]:%Y-%m-%d}; if it is "
+        f"{spans[other][0]:%Y-%m-%d}, give --date-order {other}"
+        for other in others
+    ]
+
+
+def _read_in_orders(
+    file: LoggerFile, names: tuple[str, ...]
+) -> tuple[str, dict[str, list[datetime]]]:
+    """Return the first date, and the first and last moment in every order that fits all dates."""
     places = [file.names.index(name) for name in names]
     first = last = ""
     orders, dates = list(ORDERS), dict[str, set[str]]()
@@ -547,33 +580,8 @@ def find_date_order(
             last = " ".join(row[place] for place in places)
             first = first or last
     spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in orders}
-    spans = {o: s for o, s in spans.items() if s not in list(spans.values())[: orders.index(o)]}
-    if len(spans) > 1 and near is not None:
-        far = {}
-        for order, span in spans.items():
-            utc = clock.utc(span, lambda _: f"{file.path}")
-            far[order] = float(max(utc.min() - near[1], near[0] - utc.max(), 0.0))
-        order, *others = sorted(far, key=lambda o: far[o])
-        if far[others[0]] - far[order] > 86400.0:
-            why = "this puts the log near the photographs"
-            return order, [f"log: {first!r} is {ORDERS[order]}: {why}"]
-    if len(spans) > 1:
-        ends = {o: [moment.replace(tzinfo=None) for moment in span] for o, span in spans.items()}
-        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in ends.items()}
-        order, *others = sorted(lengths, key=lambda o: lengths[o])
-        if lengths[others[0]] > _LONGER * lengths[order]:
-            return order, [f"log: {first!r} is {ORDERS[order]}: this makes the rows consecutive"]
-    if len(spans) == 1 or set(spans) == {"dmy", "ymd"}:
-        one, *others = spans
-        return one, [
-            f"doubtful: {first!r} is taken as {ORDERS[one]}, {spans[one][0]:%Y-%m-%d}; if it is "
-            f"{spans[other][0]:%Y-%m-%d}, give --date-order {other}"
-            for other in others
-        ]
-    raise DataError(
-        f"{file.path}, column {names[0]!r}: {first!r} may be "
-        f"{' or '.join(ORDERS[o] for o in spans)}: give --date-order {' or '.join(spans)}"
-    )
+    every = list(spans.values())
+    return first, {o: s for i, (o, s) in enumerate(spans.items()) if s not in every[:i]}
 
 
 def _moment(file: LoggerFile, names: tuple[str, ...], text: str, order: str) -> datetime:

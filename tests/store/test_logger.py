@@ -81,11 +81,6 @@ VENDORS = {
         b"sensor.box_temperature,unknown,2026-06-14T10:00:30.000Z\n"
         b"sensor.box_temperature,21.75,2026-06-14T10:01:00.000Z\n"
     ),
-    # Elitech's and others' Chinese programs
-    "GB 18030": (
-        "设备名称,RC-5\n序号,时间,温度(℃),湿度(%RH)\n1,2026-06-14 12:00:00,21.5,45\n"
-        "2,2026-06-14 12:01:00,21.75,45\n"
-    ).encode("gb18030"),
     "months as words": (
         b'Timestamp,Temperature (C)\n"Jun 14, 2026 12:00 PM",21.5\n"Jun 14, 2026 12:01 PM",21.75\n'
     ),
@@ -379,13 +374,6 @@ def test_what_is_none_is_refused(read, text, error, words):
         read(text)
 
 
-def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
-    moment = datetime(2026, 6, 14, 12, tzinfo=time_zone("+02:00"))
-    assert DeviceClock(time_zone("UTC")).utc([moment], str) == JUNE
-    assert DeviceClock(time_zone("UTC"), forced=True).utc([moment], str) == JUNE + 7200
-    assert DeviceClock().utc([moment + timedelta(seconds=1)], str) == JUNE + 1
-
-
 def test_a_zone_that_is_given_for_the_logger_overrules_that_of_its_head(tmp_path):
     standard = HOBO.replace("GMT+02:00", "GMT+01:00")
     forced = logged(tmp_path, standard, clock=DeviceClock(time_zone("+02:00"), forced=True))
@@ -504,8 +492,9 @@ PROGRAMS = {
         lambda m, t, i: f",0,{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f}"),
     "ThingSpeak": (
         ["created_at,entry_id,field1"], lambda m, t, i: f"{m:%Y-%m-%d %H:%M:%S} UTC,{i},{t:.2f}"),
-    "Chinese dates": (
-        ["时间,温度"], lambda m, t, i: f"{m.year}年{m.month}月{m.day}日 {m:%H:%M:%S},{t:.2f}"),
+    "Chinese dates below a logger's name": (
+        ["设备名称,RC-5", "序号,时间,温度(℃),湿度(%RH)"],
+        lambda m, t, i: f"{i},{m.year}年{m.month}月{m.day}日 {m:%H:%M:%S},{t:.2f},45"),
     "a remark between the rows": (
         ["time,T °C"],
         lambda m, t, i: "# battery changed\r\n" * (i == 6) + f"{int(m.timestamp())},{t:.2f}"),

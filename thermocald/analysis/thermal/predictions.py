@@ -75,8 +75,8 @@ def read_model_log(
         for note in log.notes:
             if (doubt := note.removeprefix("doubtful: ")) != note:
                 warnings.warn(f"{path}: {doubt}", stacklevel=3)
-        given = log.with_reference(wanted or reference).channels
-        T = thermal.validity.worst(np.array([v for v in next(iter(given.values())) if v == v]))
+        given = next(iter(log.with_reference(wanted or reference).channels.values()))
+        T = thermal.validity.worst(given[np.isfinite(given)]) if np.isfinite(given).any() else 0.0
         unit = thermal.validity.other_unit(T)
         if unit and camera is None and options.unit is None and thermal.validity.is_far(T):
             raise UsageError(

@@ -564,24 +564,31 @@ def _read_in_orders(
 ) -> tuple[str, dict[str, list[datetime]]]:
     """Return the first date, and the first and last moment in every order that fits all dates."""
     places = [file.names.index(name) for name in names]
-    first = last = ""
-    orders, dates = list(ORDERS), dict[str, set[str]]()
+    first, dates = "", set[str]()
+    found: dict[str, list[datetime]] = {order: [] for order in ORDERS}
     for line, row in file.rows():
         date = row[places[0]][:10]
-        if date not in dates:
-            dates[date] = date_orders(row[places[0]]) or set()
-            orders = [o for o in orders if not dates[date] or o in dates[date]]
-            if not orders:
-                raise DataError(
-                    f"{file.path}, line {line}, column {names[0]!r}: {row[places[0]]!r} is not in "
-                    f"the order of day and month of the rows above ({first!r})"
-                )
-        if dates[date]:
-            last = " ".join(row[place] for place in places)
-            first = first or last
-    spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in orders}
-    every = list(spans.values())
-    return first, {o: s for i, (o, s) in enumerate(spans.items()) if s not in every[:i]}
+        if date in dates:
+            continue
+        dates.add(date)
+        if (possible := date_orders(row[places[0]])) is None:
+            continue
+        found = {order: moments for order, moments in found.items() if order in possible}
+        if not found:
+            raise DataError(
+                f"{file.path}, line {line}, column {names[0]!r}: {row[places[0]]!r} is not in the "
+                f"order of day and month of the rows above ({first!r})"
+            )
+        text = " ".join(row[place] for place in places)
+        first = first or text
+        for order, moments in found.items():
+            moments.append(_moment(file, names, text, order))
+    every = list(found.values())
+    return first, {
+        order: [moments[0], moments[-1]]
+        for i, (order, moments) in enumerate(found.items())
+        if moments not in every[:i]
+    }
 
 
 def _moment(file: LoggerFile, names: tuple[str, ...], text: str, order: str) -> datetime:

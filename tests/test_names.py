@@ -21,7 +21,13 @@ from thermocald.acquisition.thermometers import Thermometers, require_columns
 from thermocald.config import parse_config
 from thermocald.daemon.series_run import result_row
 from thermocald.epoch import Epoch
-from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice
+from thermocald.errors import (
+    ConfigurationError,
+    RecordingError,
+    StoreError,
+    UsageError,
+    WrongDevice,
+)
 from thermocald.hal import Frame, Reading, VirtualClock, open_device
 from thermocald.names import channel_fault, tell_apart
 from thermocald.output.dashboard.view import View
@@ -218,9 +224,20 @@ def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
             ["a/x/M1", "a/y/M1", "b/x/M1"],
             ["M1 in a/x/M1", "M1 in a/y/M1", "M1 in b/x/M1"],
         ),
-        (["M1", "M1"], ["M1", "old/M1"], ["M1", "M1 in old/M1"]),
         (["M1", "M1"], ["day/M1", "day/N1"], ["M1", "M1 in N1"]),
+        (["M1", "M1"], ["M1", "old/M1"], ["M1", "M1 in old"]),
+        (["M1"] * 3, ["M1", "a/M1", "x/b/M1"], ["M1", "M1 in a", "M1 in b"]),
     ],
 )
 def test_series_of_one_name_are_told_apart(names, sources, told):
     assert tell_apart(names, sources) == told
+
+
+@pytest.mark.parametrize(("path", "says"), [
+    ("", "a path is empty"), ("nowhere/M1", "nowhere/M1: does not exist"),
+    ("x" * 5000, "x: cannot be read: File name too long"),
+])  # fmt: skip
+def test_a_path_that_leads_nowhere_is_one_error(path, says):
+    for read in (tc.open, tc.open_all):
+        with pytest.raises((StoreError, UsageError), match=says):
+            read(path)

@@ -16,7 +16,7 @@ import os
 import stat
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain, repeat
+from itertools import chain, repeat, zip_longest
 from numbers import Integral, Real
 from pathlib import Path, PurePosixPath
 from types import FunctionType, NoneType, UnionType
@@ -66,12 +66,12 @@ def tell_apart(names: Sequence[str], sources: Sequence[str]) -> list[str]:
     """Return the names of series, those that several have with where they are: `M1 in day2`."""
     told = []
     for name, source in zip(names, sources, strict=True):
-        same = [Path(s).parts for n, s in zip(names, sources, strict=True) if n == name]
-        # the last part of their paths in which all differ
-        levels = range(1, 1 + min(map(len, same)))
-        level = next((k for k in levels if len({parts[-k] for parts in same}) == len(same)), None)
-        place = source if level is None else Path(source).parts[-level]
-        told.append(name if len(same) == 1 or place == name else f"{name} in {place}")
+        same = [Path(s).parts[::-1] for n, s in zip(names, sources, strict=True) if n == name]
+        # the last part of their paths in which all differ; a short path has none there
+        levels = zip_longest(*same, fillvalue="")
+        level = next((k for k, parts in enumerate(levels) if len({*parts}) == len(same)), None)
+        place = source if level is None else "".join(Path(source).parts[::-1][level : level + 1])
+        told.append(name if len(same) == 1 or place in ("", name) else f"{name} in {place}")
     return told
 
 

@@ -361,5 +361,7 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
 
 def source_of(text: Path | str) -> Path:
     """Return a path with `~` expanded, or a server's address, as the readers take it."""
+    if text == "":
+        raise UsageError("a path is empty: give a recording (folder) or a store")
     path = Path(text)
     return path if is_server(path) else path.expanduser()

@@ -110,7 +110,10 @@ def test_a_dry_run_shows_all_and_writes_nothing(place):
     document = json.loads(result.stdout)
     assert document["with_temperature"] == 6
     assert "2026-06-14T10:00:00.250Z" in result.stderr
-    assert "cp1252, columns separated by semicolon, decimals with a comma" in result.stderr
+    assert (
+        "cp1252 (assumed; set --encoding to change), columns separated by semicolon"
+        in result.stderr
+    )
 
 
 def test_clock_errors_and_zones_of_each_device(place):
@@ -132,6 +135,8 @@ def test_clock_errors_and_zones_of_each_device(place):
         (("--timezone", "Mars"), "time zone 'Mars'"),
         (("--timezone", "UTC", "--pixel-pitch", 0.002, "--unit", "R"), "--unit R"),
         (("--timezone", "UTC", "--temperature-column", "T"), "there is no column 'T'"),
+        (("--timezone", "UTC", "--encoding", "greek8bit"), "--encoding greek8bit: is unknown"),
+        (("--timezone", "UTC", "--encoding", "hex"), "--encoding hex: is unknown"),
     ],
 )
 def test_what_is_not_certain_is_refused_and_nothing_is_written(place, more, reason):

@@ -190,7 +190,7 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         (("correct", "{images}", "--log", "{M1}/epochs.csv"), "--out is missing"),
         (("correct", "{images}", "--log", "{M1}/epochs.csv", "--out", "{new}"), "has 640×480 px"),
         (("correct", "{late}", "--log", "{M1}/epochs.csv", "--out", "{new}"), "outside the temp"),
-        (("correct", "{points}", "--log", "{fahrenheit}"), "looks like fahrenheit"),
+        (("correct", "{points}", "--log", "{fahrenheit}"), "fahrenheit.csv: 89 looks like"),
         (("correct", "{points}", "--log", "{hot}"), "set `extrapolate`"),
         (("correct", "{images}", "--log", "{hot}", "--out", "{new}"), "set `extrapolate`"),
         (("correct", "{elsewhere}", "--log", "{M1}/epochs.csv"), "of another camera, or binned"),
@@ -204,7 +204,7 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         (("predict", "--temperature", "88"), "looks like fahrenheit"),
         (("predict", "--temperature", "305"), "looks like kelvin"),
         (("predict", "--temperature", "-40"), "set `extrapolate`"),
-        (("predict", "--log", "{fahrenheit}"), "looks like fahrenheit"),
+        (("predict", "--log", "{fahrenheit}"), "fahrenheit.csv: 89 looks like fahrenheit"),
         (("predict", "--test", "{nothing}"), "does not exist"),
     ],
 )

@@ -81,11 +81,6 @@ VENDORS = {
         b"sensor.box_temperature,unknown,2026-06-14T10:00:30.000Z\n"
         b"sensor.box_temperature,21.75,2026-06-14T10:01:00.000Z\n"
     ),
-    # Elitech's and others' Chinese programs
-    "GB 18030": (
-        "设备名称,RC-5\n序号,时间,温度(℃),湿度(%RH)\n1,2026-06-14 12:00:00,21.5,45\n"
-        "2,2026-06-14 12:01:00,21.75,45\n"
-    ).encode("gb18030"),
     "months as words": (
         b'Timestamp,Temperature (C)\n"Jun 14, 2026 12:00 PM",21.5\n"Jun 14, 2026 12:01 PM",21.75\n'
     ),
@@ -198,12 +193,49 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
     assert found.times[-1] - found.times[0] <= 120
 
 
+@pytest.mark.parametrize(("row", "order", "month", "says"), [
+    ("26/06/14 12:00", None, 201406, "is taken as day/month/year, 2014-06-26; if it is 2026-06-14"),
+    ("14.06.26 12:00", None, 202606, "is taken as day/month/year, 2026-06-14; if it is 2014-06-26"),
+    ("26-06-14 12:00", "ymd", 202606, ""),
+    ("26/06/14 23:59", None, 202606, "is year/month/day: this makes the rows consecutive"),
+])  # fmt: skip
+def test_a_year_of_two_digits_may_be_first(tmp_path, row, order, month, says):
+    after = row.replace("14 23:59", "15 00:01")
+    found = logged(tmp_path, f"time,temp °C\n{row},21\n{after}:30,21\n", date_order=order)
+    assert f"{datetime.fromtimestamp(found.times[0], UTC):%Y%m}" == str(month)
+    assert any(says in note for note in found.notes)
+    assert any("--date-order" in note for note in found.notes) == ("if it is" in says)
+
+
+@pytest.mark.parametrize(("encoding", "head", "channel"), [
+    ("cp1251", "Дата;Температура (°C)", "Температура"), ("koi8-r", "Время;Темп. 1", "Темп. 1"),
+    ("cp866", "Дата;Влажность;Температура", "Температура"),
+    ("shift_jis", "日時;湿度;筐体温度[℃]", "筐体温度"), ("euc-jp", "時刻;気温", "気温"),
+    ("gb18030", "时间;外壳温度(℃)", "外壳温度"), ("big5", "時間;溫度", "溫度"),
+    ("euc-kr", "측정시간;온도(℃)", "온도"), ("cp1250", "Čas;Teplota", "Teplota"),
+    ("cp1253", "Ώρα;Θερμοκρασία", "Θερμοκρασία"), ("cp1252", "Tid;Kåpa °C", "Kåpa"),
+    ("cp850", "Zeit;Gehäuse °C", "Gehäuse"), ("mac-roman", "Heure;Température °C", "Température"),
+])  # fmt: skip
+def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head, channel):
+    rows = "".join(f"2026-06-14 12:0{i}{';45' * (head.count(';') - 1)};21.5\n" for i in range(3))
+    found = logged(tmp_path, f"{head}\n{rows}".encode(encoding))
+    assert list(found.channels) == [channel]
+    assert "(assumed; set --encoding to change), columns" in found.notes[0]
+    given = logged(tmp_path, f"{head}\n{rows}".encode(encoding), encoding=encoding)
+    assert list(given.channels) == [channel]
+    assert "assumed" not in given.notes[0]
+
+
 @pytest.mark.parametrize(
     ("data", "options", "reason"),
     [
+        ("time,T\n13/05/2026 12:00,20\n05/13/2026 12:01,20\n", {},
+         "line 3, column 'time': '05/13/2026 12:01' is not in the order of day and month"),
         (GERMAN, {"clock": DeviceClock()}, "no time zone: give it with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
-        (b"Date;Time;T\n" + 9 * b"05/06/2026;10:00;21\n" + b"05/06/2026;10:;21\n", {}, "10:' is"),
+        (b"Date;Time;T\n" + 9 * b"05/06/2026;10:00;21\n" + b"05/06/2026;10:;21\n",
+         {"date_order": "dmy"}, "10:' is"),
+        (b"time,T\n07/07/2026 9:00,21\n08/07/2026 9:00,21\n08/08/2026 9:00,21\n", {}, "--date-"),
         (b"Time (EST/EDT),T\n2026-06-14 12:00,20\n", {}, "EST/EDT.*Berlin: give --log-timezone"),
         (b"time;T\n05/06/2026 10:00;21\n05/06/2026 10:01+01:00;21\n", {}, "--date-order dmy or"),
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
@@ -224,6 +256,8 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         (b"time,temp\n46187.5,20\n46187.54,20\n", {}, "line 2.* spreadsheet's date"),
         (b"Zeit;T\n46187.5,20\n46188.5,20\n", {}, "show 45992.5 as a date with a time"),
         (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
+        (GERMAN, {"encoding": "utf-16"}, "--encoding utf-16: .* cannot be read so: .*BOM"),
+        (f"time,T\n{'x' * 200_000}\n", {"separator": ","}, "line 2: is not readable: field larger"),
         # 21,5 split at its comma would be 21
         (PLAIN.replace("21.", "21,"), {}, "line 2: the rows hold more fields than the head"),
         ("time,T °C\n2000-07-06 13:55,21\n2000-07-06 13:56,21\n2026-07-06 13:57,21\n", {},
@@ -308,9 +342,13 @@ def test_clock_errors(text, seconds):
     ("text", "expected"),
     [
         ("2026:06:14 12:00:01", datetime(2026, 6, 14, 12, 0, 1)),
-        ("14.06.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
+        ("06.14.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
         ("20260614_120001", datetime(2026, 6, 14, 12, 0, 1)),
         ("6/14/2026 12:02 AM", datetime(2026, 6, 14, 0, 2)),
+        ("6/14/2026 12:02 p. m.", datetime(2026, 6, 14, 12, 2)),
+        ("2026-06-30 24:00", datetime(2026, 7, 1)),
+        ("Sun Jun 14 12:00:00 2026", datetime(2026, 6, 14, 12)),
+        ("Sun Jun 14 12:00:00 CEST 2026", datetime(2026, 6, 14, 10, tzinfo=UTC)),
         ("2026-06-14 12:00 MESZ", datetime(2026, 6, 14, 10, tzinfo=UTC)),
     ],
 )
@@ -328,20 +366,14 @@ def test_moments(text, expected):
         *((time_zone, text, UsageError, "time zone")
           for text in ("Europe/Nowhere", "CEST!", "+99:00", "../../etc/passwd", "")),
         *((parse_moment, text, ValueError, r".")
-          for text in ("2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12")),
+          for text in ("2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12",
+                       "2026-06-14 24:00:01", "9999-12-31 24:00")),
         (find_photographs, [], DataError, "no photographs are given"),
     ],
 )  # fmt: skip
 def test_what_is_none_is_refused(read, text, error, words):
     with pytest.raises(error, match=words):
         read(text)
-
-
-def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
-    moment = datetime(2026, 6, 14, 12, tzinfo=time_zone("+02:00"))
-    assert DeviceClock(time_zone("UTC")).utc([moment], str) == JUNE
-    assert DeviceClock(time_zone("UTC"), forced=True).utc([moment], str) == JUNE + 7200
-    assert DeviceClock().utc([moment + timedelta(seconds=1)], str) == JUNE + 1
 
 
 def test_a_zone_that_is_given_for_the_logger_overrules_that_of_its_head(tmp_path):
@@ -454,6 +486,17 @@ PROGRAMS = {
     "days of a spreadsheet": (
         ["Datum;T °C"],
         lambda m, t, i: f"{(m.timestamp() / 86400 + 25569):.5f};{t:.2f}".replace(".", ",")),
+    "a Raspberry Pi's vcgencmd": (
+        [], lambda m, t, i: f"{m:%Y-%m-%dT%H:%M:%S}Z,temp={t:.2f}'C"),
+    "InfluxDB, annotated": (
+        ["#group,false,false,false", "#datatype,long,dateTime:RFC3339,double", "#default,,,",
+         ",table,_time,_value"],
+        lambda m, t, i: f",0,{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f}"),
+    "ThingSpeak": (
+        ["created_at,entry_id,field1"], lambda m, t, i: f"{m:%Y-%m-%d %H:%M:%S} UTC,{i},{t:.2f}"),
+    "Chinese dates below a logger's name": (
+        ["设备名称,RC-5", "序号,时间,温度(℃),湿度(%RH)"],
+        lambda m, t, i: f"{i},{m.year}年{m.month}月{m.day}日 {m:%H:%M:%S},{t:.2f},45"),
     "a remark between the rows": (
         ["time,T °C"],
         lambda m, t, i: "# battery changed\r\n" * (i == 6) + f"{int(m.timestamp())},{t:.2f}"),

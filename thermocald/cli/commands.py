@@ -33,7 +33,8 @@ _OUTPUTS: dict[str, Output] = {
     "testfield print out": "folder",
 }  # fmt: skip
 _READING = (
-    "temperature_column name unit date_order time_column log_timezone log_clock separator decimal"
+    "temperature_column name unit date_order time_column log_timezone log_clock encoding separator "
+    "decimal"
 )
 # by command and option: the options that do nothing without it
 _NEEDED = {

@@ -89,7 +89,9 @@ def _log_options(
         None, metavar="COLUMN=LABEL", help="Label for a column of the log; repeatable."
     ),
     unit: str | None = typer.Option(None, help="Unit, if the log states none: degC, K, degF."),
-    date_order: str | None = expert(None, help="Order of dates such as 06/07/2026: dmy or mdy."),
+    date_order: str | None = expert(
+        None, help="Order of dates such as 06/07/26: dmy, mdy or ymd (year first)."
+    ),
     time_column: list[str] | None = expert(
         None, help="Name of the log's time column; twice for a date and a time column."
     ),
@@ -101,6 +103,7 @@ def _log_options(
         "order",
         help="The hour that occurs twice in autumn: order (of rows), earlier, later, refuse.",
     ),
+    encoding: str | None = expert(None, help="Encoding of the log, such as cp1251 or shift_jis."),
     separator: str | None = expert(None, help="Column separator of the log: ';' ',' tab."),
     decimal: str | None = expert(None, help="Decimal mark of the log: , or ."),
 ) -> Any:

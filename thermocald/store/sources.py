@@ -66,11 +66,16 @@ def require_source(source: Path) -> Path:
 
     A server is not contacted until it is opened.
     """
-    if not is_server(source) and not source.exists():
+    try:
+        if not is_server(source):
+            source.stat()
+    except (FileNotFoundError, NotADirectoryError):
         raise StoreError(
             f"{source}: does not exist; give a recording (folder), a store (file), or "
             "postgresql://…"
-        )
+        ) from None
+    except OSError as cause:
+        raise StoreError(f"{source}: cannot be read: {cause.strerror}") from cause
     return source
 
 

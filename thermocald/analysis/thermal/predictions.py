@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.errors import DataError
+from thermocald.errors import DataError, UsageError
 from thermocald.numbers import percent, plain
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
 from thermocald.physics.device import CameraDevice, read_camera_device, read_programme
@@ -74,6 +75,15 @@ def read_model_log(
         for note in log.notes:
             if (doubt := note.removeprefix("doubtful: ")) != note:
                 warnings.warn(f"{path}: {doubt}", stacklevel=3)
+        given = next(iter(log.with_reference(wanted or reference).channels.values()))
+        T = thermal.validity.worst(given[np.isfinite(given)]) if np.isfinite(given).any() else 0.0
+        unit = thermal.validity.other_unit(T)
+        if unit and camera is None and options.unit is None and thermal.validity.is_far(T):
+            raise UsageError(
+                f"{path}: {T:g} looks like {unit}: the model was fitted between "
+                f"{thermal.validity.low:g} and {thermal.validity.high:g} °C; give --unit "
+                f"{OTHER_UNITS[unit]}, or --unit degC if it is °C"
+            )
     if camera is not None:
         thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
     return log.with_reference(wanted or reference)

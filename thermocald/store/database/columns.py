@@ -48,6 +48,10 @@ KEPT = {
 }
 """The tables that grow while a daemon runs: numbers and texts, in the order of the checksum."""
 ROW = {table: (*numbers, *texts, "checksum") for table, (numbers, texts) in KEPT.items()}
+_INSERT = {
+    table: f"INSERT INTO {table} ({', '.join(names)}) VALUES ({', '.join('?' * len(names))})"
+    for table, names in ROW.items()
+}
 _MAPPINGS = ("temperatures", "extra")
 CHUNKED = (*(n for n in EPOCH_NUMBERS if n not in ("revision", "measured")), "status", *_MAPPINGS)
 
@@ -101,9 +105,7 @@ def insert_row(connection: sqlite3.Connection, table: str, **given: Any) -> int:
     row = {"id": last_id(connection, table) + 1, **given}
     numbers, texts = ([row[name] for name in names] for names in KEPT[table])
     values = (*numbers, *texts, row_checksum(numbers, texts))
-    places = ", ".join("?" * len(values))
-    statement = f"INSERT INTO {table} ({', '.join(ROW[table])}) VALUES ({places})"
-    if connection.execute(statement, values).rowcount != 1:
+    if connection.execute(_INSERT[table], values).rowcount != 1:
         raise sqlite3.IntegrityError(f"a foreign trigger keeps rows out of {table}; drop it")
     return int(row["id"])
 

@@ -69,7 +69,7 @@ _ADVICE = {
 }
 """Advice by the beginning of SQLite's name of an error; {}: SQLite's message."""
 # The -wal file must not fill a small card; a replay need not sync so often.
-_WAL_LIMIT_BYTES = {True: 1_000_000, False: 4_000_000}  # durable or not
+_WAL_LIMIT_BYTES = {True: 1_000_000, False: 16_000_000}  # durable or not
 _MMAP_BYTES = 2**31 - 1
 _ATTEMPTS = 3
 # SQLite's own locks of a file end when this process closes any descriptor of it, so a claimed file

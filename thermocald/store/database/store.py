@@ -70,8 +70,8 @@ class Store(SeriesReader):
         self._db = connection
         self._file = file  # None if the caller holds the lock, or there is none
         self._lock = threading.RLock()
-        # {series: epochs in no chunk}, -inf if its chunks cannot be built
-        self._loose: dict[int, float] = {}
+        # {series: last epoch, epochs in no chunk}, the latter -inf if chunks cannot be built
+        self._ends: dict[int, tuple[int, float]] = {}
 
     @classmethod
     def open(
@@ -356,7 +356,7 @@ class Store(SeriesReader):
         blur. Raises StoreError if the number is not above the last one, StoreFullError if the disk
         is full; nothing of the epoch is then stored. An epoch without observations is smaller.
         """
-        if taken := {*COLUMN_NAMES, *series.head.channels} & set(extra or ()):
+        if extra and (taken := extra.keys() & {*COLUMN_NAMES, *series.head.channels}):
             raise StoreError(f"an extra column cannot be called {min(taken)!r}")
         stored = StoredEpoch(
             epoch, result or EpochResult(NOT_CALIBRATED), extra or {}, clock_trusted, 0
@@ -371,17 +371,17 @@ class Store(SeriesReader):
     def _append(self, series: StoredSeries, stored: StoredEpoch) -> None:
         epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not stored"):
-            last = self.last_epoch(series)
+            last, loose = self._ends.get(series.id) or (self.last_epoch(series), columns.CHUNK)
             if last is not None and epoch.number <= last:
                 raise StoreError(
                     f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
                     f"epoch {last}; numbers must increase"
                 )
             epochs.insert_epoch(self._db, series.id, stored)
-            loose = self._loose.get(series.id, columns.CHUNK) + 1
+            loose += 1
             if loose >= columns.CHUNK:
                 loose = self._build_chunks(series)
-        self._loose[series.id] = loose
+        self._ends[series.id] = (epoch.number, loose)
 
     def _build_chunks(self, series: StoredSeries) -> float:
         """Build chunks; return the number of epochs that are in none.

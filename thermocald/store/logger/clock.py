@@ -7,6 +7,7 @@ daylight saving skips is refused, and one that it repeats too, unless it is give
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta, timezone, tzinfo
 from typing import TYPE_CHECKING
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
+ORDERS = {"dmy": "day/month/year", "mdy": "month/day/year", "ymd": "year/month/day"}
+"""Orders of a date that does not begin with a year of four digits."""
 AMBIGUOUS = ("refuse", "order", "earlier", "later")
 """How to treat the repeated hour: refuse it, use the order of the rows, or take one."""
 
@@ -177,7 +180,7 @@ _DATE = r"(?P<a>\d{1,4})(?P<mark>[-./:])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})\.?
 _COMPACT_DATE = r"(?P<compact>\d{8})"
 _TIME = (
     r"(?P<h>\d{1,2})[:.](?P<m>\d{2})(?:[:.](?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?"
-    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?"
 )
 _COMPACT_TIME = r"(?P<ct>\d{6})(?:[.,]?(?P<cf>\d{1,9}))?"
 _ZONES_H = {
@@ -199,6 +202,9 @@ _NAMED_DATE = re.compile(
     r"(?:[^\W\d_]{2,9}\.?,?\s+)?"  # the day of the week
     r"(?:(?P<m1>[^\W\d_]{3,9})\.?\s+(?P<d1>\d{1,2})(?:st|nd|rd|th)?,?\s+(?P<y1>\d{4})"
     r"|(?P<d2>\d{1,2})[\s.-]+(?P<m2>[^\W\d_]{3,9})[\s.,-]+(?P<y2>\d{4}|\d{2}))(?P<rest>\D.*|)"
+)
+_OF_DATE = re.compile(  # as `date` and ctime write it: Sun Jun 14 12:00:00 CEST 2026
+    r"^[^\W\d_]{2,4}\.? ([^\W\d_]{3,4})\.? +(\d{1,2}) (\d\d:\d\d:\d\d)( [A-Z]{3,4})? (\d{4})$"
 )
 _MONTHS = {
     name: number
@@ -224,7 +230,7 @@ def iso(seconds: float, digits: str = "milliseconds") -> str:
 def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     """Parse a date with a time, with or without a zone; or a date or a time alone.
 
-    order: of day and month, `dmy` or `mdy`; None: year-month-day or dmy, by the date's form.
+    order: one of ORDERS; None: year-month-day or dmy, by the date's form.
     Numbers are seconds (or ms, µs, ns) since 1970 UTC. Raises ValueError for other text.
     """
     text = _month_to_number(text.strip())
@@ -234,6 +240,11 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
         except (OverflowError, OSError) as cause:
             raise ValueError(f"{text} is not a time") from cause
     if found := _FULL.fullmatch(text):
+        if found["h"] == "24" and int(found["m"] + (found["s"] or "0")) == 0:  # a day's end
+            begin = parse_moment(f"{text[: found.start('h')]}00{text[found.end('h') :]}", order)
+            assert isinstance(begin, datetime)
+            with suppress(OverflowError):
+                return begin + timedelta(days=1)
         return datetime.combine(_date(found, order), _time(found))
     if found := _ONLY_TIME.fullmatch(text):
         return _time(found)
@@ -274,20 +285,29 @@ def is_date_like(text: str) -> bool:
     return re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}(?!\d)", text) is not None
 
 
-def day_and_month(text: str) -> tuple[int, int] | None:
-    """Return the first two numbers of a date with / or - that does not begin with the year."""
+def date_orders(text: str) -> set[str] | None:
+    """Return the orders, of ORDERS, in which text is a date; None if it has only one form."""
     text = _month_to_number(text.strip())
     found = _FULL.fullmatch(text) or _ONLY_DATE.fullmatch(text)
-    if found is None or found["compact"] or len(found["a"]) == 4 or found["mark"] == ".":
+    if found is None or found["compact"] or len(found["a"]) == 4:
         return None
-    return int(found["a"]), int(found["b"])
+    if found["mark"] == "." and len(found["c"]) == 4:
+        return None
+    possible = set()
+    for order in ORDERS:
+        with suppress(ValueError):
+            _date(found, order)
+            possible.add(order)
+    if found["mark"] == ".":
+        possible.discard("mdy")  # unless the user gives it
+    return possible
 
 
 def _month_to_number(text: str) -> str:
     """Rewrite a date with the month as a word, or in Chinese, as 2026-06-14."""
     if text.isascii() and not _WORD.search(text):
         return text
-    text = text.translate(_CHINESE)
+    text = _OF_DATE.sub(r"\1 \2 \5 \3\4", text.translate(_CHINESE))
     found = _NAMED_DATE.fullmatch(text)
     if found is None:
         return text
@@ -305,9 +325,9 @@ def _date(found: re.Match[str], order: str | None) -> date:
     a, b, c = (int(found[part]) for part in "abc")
     if len(found["a"]) == 4:
         return date(a, b, c)
-    year = c if len(found["c"]) == 4 else 2000 + c
-    month_first = order == "mdy" and found["mark"] != "."
-    return date(year, a, b) if month_first else date(year, b, a)
+    if len(found["c"]) != 4:
+        a, c = (2000 + a, c) if order == "ymd" else (a, 2000 + c)
+    return date(a, b, c) if order == "ymd" else date(c, *((a, b) if order == "mdy" else (b, a)))
 
 
 def _time(found: re.Match[str]) -> time:

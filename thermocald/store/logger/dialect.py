@@ -26,9 +26,10 @@ from typing import TYPE_CHECKING
 from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
 from thermocald.store.logger.clock import (
+    ORDERS,
     DeviceClock,
     are_serials,
-    day_and_month,
+    date_orders,
     device_clock,
     is_date_like,
     parse_moment,
@@ -61,7 +62,7 @@ _STATED = re.compile(
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
-UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
+UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|'C|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
 """The unit behind a reading."""
 
 
@@ -95,7 +96,9 @@ def to_celsius(values: Array, unit: str) -> Array:
 OUR_TIMES = ("time", "temperature_time", "frame_time", "timestamp")
 """Names of columns of seconds in this program's files, which may count from any day."""
 TIME_NAME = re.compile(
-    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|时间|日期|changed", re.IGNORECASE
+    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|changed|\btid|时间|日期|時間|日時|時刻|日付"
+    r"|시간|날짜|일시|дата|врем|čas|ώρα",
+    re.IGNORECASE,
 )
 """Words in the head of a column of times."""
 SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma"}
@@ -106,12 +109,19 @@ _SAMPLE = 400
 _CONSISTENT = 0.8
 _PREAMBLE = 12
 _ENDS = ("\n", "\r")
+_FOREIGN = 50  # lines by which an encoding is detected
+_ENCODINGS = (
+    "utf-8", "cp932", "euc_jp", "big5", "cp949", "cp1251", "koi8_r", "cp866", "cp1250", "cp1253",
+    "cp1254", "cp850", "mac_roman",
+)  # fmt: skip
+"""Encodings that are tried after those of Western Europe and China."""
+_LETTERS_ALONE = "\u03a9\u2126\u0394"  # ohm and delta, which are part of Greek words too
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
 _POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
-    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º]?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
+    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º']?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
     r"|unavailable|unknown|none|null|n/?an?|-+|err(?:or)?",
     re.IGNORECASE,
 )
@@ -122,7 +132,8 @@ class LoggerFile:
     """A table in a file: the names of its columns, and its detected form.
 
     first_line: line of the first row; sample: some rows from the beginning and the end; above: the
-    lines above the first row; is_cut: whether the last row is incomplete.
+    lines above the first row; is_cut: whether the last row is incomplete; is_assumed: whether other
+    encodings would do as well.
     """
 
     path: Path
@@ -134,13 +145,15 @@ class LoggerFile:
     sample: tuple[tuple[str, ...], ...]
     above: tuple[str, ...] = ()
     is_cut: bool = False
+    is_assumed: bool = False
 
     @property
     def description(self) -> str:
         """The detected form, for the user."""
         mark = "a comma" if self.decimal == "," else "a point"
+        assumed = " (assumed; set --encoding to change)" if self.is_assumed else ""
         return (
-            f"{self.encoding}, columns separated by "
+            f"{self.encoding}{assumed}, columns separated by "
             f"{SEPARATORS.get(self.separator, self.separator)}, decimals with {mark}"
         )
 
@@ -163,25 +176,32 @@ class LoggerFile:
                     yield line, _fit_width(row, width)
 
 
-def open_log(path: Path, separator: str | None = None, decimal: str | None = None) -> LoggerFile:
-    """Detect the form of a logger's table; separator and decimal mark only if not given.
+def open_log(path: Path, options: LogOptions) -> LoggerFile:
+    """Detect the form of a logger's table; encoding, separator, decimal mark only if not given.
 
     Raises DataError if the file cannot be read or holds no table with times.
     """
-    encoding = _detect_encoding(path)
-    with path.open(encoding=encoding, errors="replace", newline="") as file:
-        begin = list(islice(file, _SAMPLE))
-        end = list(deque(filter(str.strip, file), _SAMPLE))
+    detected = _detect_encoding(path)
+    encoding = options.encoding or detected
+    is_assumed = not options.encoding and not detected.startswith("utf")
+    try:
+        with path.open(encoding=encoding, errors="replace", newline="") as file:
+            begin = list(islice(file, _SAMPLE))
+            end = list(deque(filter(str.strip, file), _SAMPLE))
+    except UnicodeError as cause:
+        raise UsageError(f"--encoding {encoding}: {path} cannot be read so: {cause}") from cause
     if not any(map(str.strip, begin + end)):
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
     try:
-        mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)
+        mark = options.separator or _detect_separator(
+            path, end if len(end) == _SAMPLE else begin + end
+        )
     except DataError:
         if not ours:
             raise
         mark = ","
-    start, last = _split_lines(begin, mark), _split_lines(end, mark)
+    start, last = list(_parse_rows(path, begin, mark)), _split_lines(end, mark)
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; at most {_MOST_COLUMNS} are read")
@@ -203,7 +223,7 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             head, first = [row], i + 1
     names = _column_names(head, width)
     rows = tuple(tuple(_fit_width(row, len(names))) for _, row in start[first:] + last)
-    found = decimal or _detect_decimal(rows, mark)
+    found = options.decimal or _detect_decimal(rows, mark)
     ends = [";".join(row[-2:]) for row in rows if row[-1]]
     if mark == "," and head and len(head[-1]) < width and ends and all(map(_CUT.fullmatch, ends)):
         raise DataError(
@@ -212,7 +232,9 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
         )
     above = tuple(" ".join(row) for _, row in start[:first])
     is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
-    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above, is_cut)
+    return LoggerFile(
+        path, names, start[first][0], encoding, mark, found, rows, above, is_cut, is_assumed
+    )
 
 
 def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
@@ -226,7 +248,8 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    reader = csv.reader((line.replace("−", "-") for line in lines), delimiter=mark)
+    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)  # as vcgencmd writes it
+    reader = csv.reader(plain, delimiter=mark)
     try:
         for row in reader:
             fields = [field.strip() for field in row]
@@ -248,7 +271,11 @@ def _fit_width(row: list[str], width: int) -> list[str]:
 
 
 def _detect_encoding(path: Path) -> str:
-    """Return the first encoding in which the whole file is text."""
+    """Return the encoding of a text file.
+
+    Of a file without a byte order mark that is not UTF-8, it is the one in which its lines hold
+    most words of a log that this program knows.
+    """
     if not path.is_file():
         raise DataError(f"{path}: is not a file")
     if path.stat().st_size > _LARGEST_BYTES:
@@ -269,16 +296,25 @@ def _detect_encoding(path: Path) -> str:
                     return "utf-16-be" if odd[0] else "utf-16-le"
                 raise DataError(f"{path}: is not text; save it as CSV in UTF-8")
             file.seek(0)
-            # GB 18030 writes 温度 in pairs of high bytes; ° and ä of Latin-1 are single bytes
-            pairs = re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", file.read(_CHUNK))
-        chinese: tuple[str, ...] = () if any(len(run) % 2 for run in pairs) else ("gb18030",)
-        for name in ("utf-8", *chinese, "cp1252"):
-            with suppress(UnicodeDecodeError), path.open(encoding=name) as text:
-                deque(text, 0)
-                return name
+            lines = [line for line in file.read(_CHUNK).splitlines() if not line.isascii()]
+        with suppress(UnicodeDecodeError), path.open(encoding="utf-8", newline="") as text:
+            while text.read(_CHUNK):
+                pass
+            return "utf-8"
     except OSError as cause:
         raise DataError(f"{path}: cannot be read: {cause.strerror}") from cause
-    return "latin-1"
+    some = b"\n".join(lines[:_FOREIGN])
+    # GB 18030 writes Chinese in pairs of high bytes; ° and ä of Western Europe are single
+    pairs = all(len(run) % 2 == 0 for run in re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", some))
+    first = ("gb18030", "cp1252") if pairs else ("cp1252", "gb18030")
+    return max((*first, *_ENCODINGS), key=lambda name: _count_words(some.decode(name, "replace")))
+
+
+def _count_words(text: str) -> int:
+    """Return how many words for times, temperatures and others a text has in letters beyond A-Z."""
+    patterns = (TIME_NAME, _TEMPERATURE_NAME, OTHER_NAME)
+    words = [found[0] for pattern in patterns for found in pattern.finditer(text)]
+    return sum(not word.isascii() and word not in _LETTERS_ALONE for word in words)
 
 
 def _detect_separator(path: Path, lines: list[str]) -> str:
@@ -322,7 +358,7 @@ def _column_names(above: list[list[str]], width: int) -> tuple[str, ...]:
     """
     wide = [_join_units(row, width) for row in above if len(row) > width][-1:]
     narrow = [row for row in above if len(row) == width - 1 and width > 2][-1:]
-    rows = [row for row in above if len(row) == width]
+    rows = [row for row in above if len(row) == width and row[0] not in _ANNOTATIONS]
     # a line with a logger's serial number may have as many fields as the data
     named = next((i for i, row in enumerate(rows) if any(map(TIME_NAME.search, row))), None)
     if named is None and any(TIME_NAME.search(name) for row in wide for name in row):
@@ -358,13 +394,13 @@ def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
 
 _TEMPERATURE_NAME = re.compile(
     r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
-    r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|[℃℉]",
+    r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
     re.IGNORECASE,
 )
 OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
     r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt|ros[ée]e|roc[ií]o|rugiada"
-    r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
+    r"|^table$|entry_id|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|濕度|露点|序号|влажн|давлен|습도|気圧"
     # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
     r"|temp\w*[ _]?set|soll|consigne|desired|target|wanted|nominal|reference value|forecast"
@@ -375,21 +411,22 @@ OTHER_NAME = re.compile(
 _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _GOOD_SHARE = 0.8
-_WORDS = {"dmy": "day/month", "mdy": "month/day"}
-_LONGER = 10.0  # ratio of spans: with day and month exchanged, a log spans months
+_ANNOTATIONS = ("#group", "#datatype", "#default")  # of InfluxDB
+_LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
 
 
 @dataclass(frozen=True, slots=True)
 class LogOptions:
     """What the user has given about a log.
 
-    times, temperatures: names of columns, empty to guess; separator, decimal, date_order, unit:
-    None to detect; clock: the logger's; wanted: names of temperature columns to use if they occur,
-    such as a model's thermometers; names: new names of columns by those in the file.
+    times, temperatures: names of columns, empty to guess; encoding to unit: None to detect; clock:
+    the logger's; wanted: names of temperature columns to use if they occur, such as a model's
+    thermometers; names: new names of columns by those in the file.
     """
 
     times: tuple[str, ...] = ()
     temperatures: tuple[str, ...] = ()
+    encoding: str | None = None
     separator: str | None = None
     decimal: str | None = None
     date_order: str | None = None
@@ -407,6 +444,7 @@ def log_options(
     ambiguous: str = "order",
     time_column: Sequence[str] | None = None,
     temperature_column: Sequence[str] | None = None,
+    encoding: str | None = None,
     separator: str | None = None,
     decimal: str | None = None,
     date_order: str | None = None,
@@ -416,11 +454,17 @@ def log_options(
     """Return the options of a log from the text of a command. Raises UsageError."""
     for option, value, allowed in (
         ("--unit", unit, UNITS),
-        ("--date-order", date_order, ("dmy", "mdy")),
+        ("--date-order", date_order, ORDERS),
         ("--decimal", decimal, (",", ".")),
     ):
         if value is not None and value not in allowed:
             raise UsageError(f"{option} {value}: must be one of {', '.join(allowed)}")
+    try:
+        "".encode(encoding or "utf-8")
+    except (LookupError, ValueError):
+        raise UsageError(
+            f"--encoding {encoding}: is unknown; give utf-8, cp1251, shift_jis, …"
+        ) from None
     names = {}
     for text in name or ():
         column, _, label = text.rpartition("=")
@@ -433,8 +477,8 @@ def log_options(
         raise UsageError(f"--separator {separator}: must be one character, or the word tab")
     clock = device_clock(timezone, log_timezone, log_clock, ambiguous, "--log-timezone")
     return LogOptions(
-        tuple(time_column or ()), tuple(temperature_column or ()), mark, decimal, date_order, unit,
-        clock, names=names,
+        tuple(time_column or ()), tuple(temperature_column or ()), encoding, mark, decimal,
+        date_order, unit, clock, names=names,
     )  # fmt: skip
 
 
@@ -476,49 +520,75 @@ def find_date_order(
     clock: DeviceClock,
     near: tuple[float, float] | None,
 ) -> tuple[str | None, list[str]]:
-    """Return the order of day and month, None if dates need none, and notes.
+    """Return the order of day, month and year, None if dates need none, and notes.
 
-    It follows from a number above 12; else from the photographs, if only one order puts the log
-    near them; else from the rows, as a log of some days would span months in the other order.
+    It follows from the numbers, such as a month above 12; else from the photographs, if only one
+    order puts the log near them; else from the rows, as a log of some days would span months or
+    years in another order. Where nothing decides, a year of two digits is taken to be last.
     """
     if options.date_order is not None:
         return options.date_order, []
-    if not any(day_and_month(text) for text in file.column(names[0])):
+    if not any(map(date_orders, file.column(names[0]))):
         return None, []
+    first, spans = _read_in_orders(file, names)
+    one, *others = spans
+    costs: dict[str, dict[str, float]] = {}  # of each order, s, by what speaks for the least
+    if others and near is not None:
+        times = {o: clock.utc(span, lambda _: f"{file.path}") for o, span in spans.items()}
+        costs["puts the log near the photographs"] = {
+            o: float(max(t.min() - near[1], near[0] - t.max(), 0.0)) for o, t in times.items()
+        }
+    if others:
+        costs["makes the rows consecutive"] = {
+            o: abs((b.replace(tzinfo=None) - a.replace(tzinfo=None)).total_seconds())
+            for o, (a, b) in spans.items()
+        }
+    for why, cost in costs.items():
+        order, second, *_ = sorted(cost, key=cost.__getitem__)
+        if cost[second] > _LONGER * cost[order] + 86400.0:
+            return order, [f"log: {first!r} is {ORDERS[order]}: this {why}"]
+    if "mdy" in others:
+        raise DataError(
+            f"{file.path}, column {names[0]!r}: {first!r} may be "
+            f"{' or '.join(ORDERS[o] for o in spans)}: give --date-order {' or '.join(spans)}"
+        )
+    return one, [
+        f"doubtful: {first!r} is taken as {ORDERS[one]}, {spans[one][0]:%Y-%m-%d}; if it is "
+        f"{spans[other][0]:%Y-%m-%d}, give --date-order {other}"
+        for other in others
+    ]
+
+
+def _read_in_orders(
+    file: LoggerFile, names: tuple[str, ...]
+) -> tuple[str, dict[str, list[datetime]]]:
+    """Return the first date, and the first and last moment in every order that fits all dates."""
     places = [file.names.index(name) for name in names]
-    first = last = ""
-    pairs: set[tuple[int, int]] = set()
-    for _, row in file.rows():
-        if found := day_and_month(row[places[0]]):
-            pairs.add(found)
-            last = " ".join(row[place] for place in places)
-            first = first or last
-    orders = {"dmy" if a > 12 else "mdy" for a, b in pairs if max(a, b) > 12}
-    if len(orders) == 1:
-        return orders.pop(), []
-    if all(a == b for a, b in pairs):
-        return "dmy", []
-    if not orders:
-        spans = {o: [_moment(file, names, text, o) for text in (first, last)] for o in _WORDS}
-        if near is not None:
-            far = {}
-            for order, span in spans.items():
-                utc = clock.utc(span, lambda _: f"{file.path}")
-                far[order] = float(max(utc.min() - near[1], near[0] - utc.max(), 0.0))
-            if abs(far["dmy"] - far["mdy"]) > 86400.0:
-                order = min(far, key=lambda o: far[o])
-                return order, [
-                    f"log: {first!r} is {_WORDS[order]}: this puts the log near the photographs"
-                ]
-        ends = {o: [moment.replace(tzinfo=None) for moment in span] for o, span in spans.items()}
-        lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in ends.items()}
-        order = min(lengths, key=lambda o: lengths[o])
-        if max(lengths.values()) > _LONGER * lengths[order]:
-            return order, [f"log: {first!r} is {_WORDS[order]}: this makes the rows consecutive"]
-    raise DataError(
-        f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: give "
-        "--date-order dmy or mdy"
-    )
+    first, dates = "", set[str]()
+    found: dict[str, list[datetime]] = {order: [] for order in ORDERS}
+    for line, row in file.rows():
+        date = row[places[0]][:10]
+        if date in dates:
+            continue
+        dates.add(date)
+        if (possible := date_orders(row[places[0]])) is None:
+            continue
+        found = {order: moments for order, moments in found.items() if order in possible}
+        if not found:
+            raise DataError(
+                f"{file.path}, line {line}, column {names[0]!r}: {row[places[0]]!r} is not in the "
+                f"order of day and month of the rows above ({first!r})"
+            )
+        text = " ".join(row[place] for place in places)
+        first = first or text
+        for order, moments in found.items():
+            moments.append(_moment(file, names, text, order))
+    every = list(found.values())
+    return first, {
+        order: [moments[0], moments[-1]]
+        for i, (order, moments) in enumerate(found.items())
+        if moments not in every[:i]
+    }
 
 
 def _moment(file: LoggerFile, names: tuple[str, ...], text: str, order: str) -> datetime:

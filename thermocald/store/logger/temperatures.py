@@ -84,7 +84,7 @@ def read_log(
     Raises DataError or UsageError if something cannot be determined, naming the option to set.
     """
     options = options or LogOptions()
-    file = open_log(path, options.separator, options.decimal)
+    file = open_log(path, options)
     time_names = find_time_columns(file, options)
     lines = [found[1] for line in file.above if (found := _ZONE_LINE.search(line))]
     clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))

@@ -328,11 +328,13 @@ class ColumnChunk(Chunk):
         column = self._batch.column(name)
         if not self.is_number(name):
             self.fail(0, name, f"holds {column.type}; numbers are required")
-        empty = np.asarray(column.is_null())
-        values: Array = column.cast(_pyarrow().float64(), safe=False).to_numpy(zero_copy_only=False)
-        wrong = ~np.isfinite(values) & ~(empty & empty_is_nan)
-        self.check(name, wrong, lambda row: "is empty; a number is required" if empty[row]
-                   else f"{values[row]} is not a finite number")  # fmt: skip
+        values: Array = _to_numpy(column.cast(_pyarrow().float64(), safe=False), np.nan)
+        wrong = ~np.isfinite(values)
+        if wrong.any():
+            empty = np.asarray(column.is_null())
+            wrong &= ~(empty & empty_is_nan)
+            self.check(name, wrong, lambda row: "is empty; a number is required" if empty[row]
+                       else f"{values[row]} is not a finite number")  # fmt: skip
         return values
 
     def is_number(self, name: str) -> bool:
@@ -351,7 +353,12 @@ class ColumnChunk(Chunk):
         encoded = self._batch.column(name).dictionary_encode()
         words = ["" if word is None else str(word) for word in encoded.dictionary.to_pylist()]
         # the indices of other programs may be unsigned
-        return words, encoded.indices.cast(_pyarrow().int64()).fill_null(-1).to_numpy()
+        return words, _to_numpy(encoded.indices.cast(_pyarrow().int64()), -1)
+
+
+def _to_numpy(column: Any, missing: float) -> NDArray[Any]:
+    """Return an Arrow column of numbers without importing pandas, as its `to_numpy` does."""
+    return np.from_dlpack(column.fill_null(missing) if column.null_count else column)
 
 
 def _parse_once(table: Table) -> Table:
@@ -397,6 +404,13 @@ def _cache() -> Path:
     return folder
 
 
+class _ParsedChunk(ColumnChunk):
+    """Some rows of a text table, whose text stays in Arrow's form, to be written again."""
+
+    def text(self, name: str) -> Any:
+        return self._batch.column(name)
+
+
 def _parsed(table: Table) -> Iterator[ColumnChunk]:
     """Yield the rows of a CSV table by pyarrow's parser, six times as fast as ours.
 
@@ -420,7 +434,7 @@ def _parsed(table: Table) -> Iterator[ColumnChunk]:
     first = 0
     with reader:
         for batch in reader:
-            yield ColumnChunk(table, first, batch)
+            yield _ParsedChunk(table, first, batch)
             first += len(batch)
 
 
@@ -435,7 +449,9 @@ def _write(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
     tables: Iterator[Any] = (
         pyarrow.table(
             {
-                name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
+                name: values
+                if isinstance(values, pyarrow.Array)
+                else pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
                 for name, values in columns.items()
             }
         )

@@ -170,9 +170,8 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
     basis = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
     fast = fast - basis @ (basis.T @ fast)
     rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
-    needed = 0.0  # a short series shows only whether a mount moves beyond what bends explain
-    if m >= _ENOUGH_FAST:
-        needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
+    needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
+    least = needed if m >= _ENOUGH_FAST else 0.0  # a short series only shows what no bend explains
     likelihood = float(_likelihood(fast, low))
     for _ in range(min(_MOST_BENDS, max((m // 4 - basis.shape[1]) // 3, 1))):
         parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
@@ -180,8 +179,9 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
         best = max(tried, key=itemgetter(0))
         for near in (np.linspace(0.0, 1.0, 11), np.linspace(-0.1, 0.1, 21)):
             best = _best_bend(fast, basis, best[1] + near, low)
-        if best[0] - likelihood < needed:
+        if best[0] - likelihood < least:
             break
+        least = needed
         likelihood, at, fast, bend = best
         basis = np.column_stack([basis, bend])
         rows = rows[np.abs(rows - at) > _LEAST_BEND]  # two together would be a step

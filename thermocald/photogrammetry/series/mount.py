@@ -177,6 +177,8 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
         parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
         tried = (_best_bend(fast, basis, part, low, anywhere=True) for part in parts)
         best = max(tried, key=itemgetter(0))
+        if best[0] - likelihood < least:
+            break
         for near in (np.linspace(0.0, 1.0, 11), np.linspace(-0.1, 0.1, 21)):
             best = _best_bend(fast, basis, best[1] + near, low)
         if best[0] - likelihood < least:

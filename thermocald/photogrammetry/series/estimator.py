@@ -13,13 +13,14 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
 from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, settle
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2, median_known
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2, inverse_of_determined, median_known
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     Partials,
     chunks,
     linearise,
+    normal_matrices,
     planes,
     sums_of_squares,
 )
@@ -64,6 +65,7 @@ _SAME_FIELD = 0.1  # relative change of that component at convergence
 _LEAST_SHARE = 0.1  # of an offset that image points must determine, for the offset to count
 _FEWEST_OFFSETS = 8
 _BEYOND_CHANCE = 3.1  # standard deviations
+_LEAST_NUMBER = 0.05  # redundancy number of a coordinate that hardly anything else checks
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 
 
@@ -279,9 +281,8 @@ class SeriesEstimator:
         # in few epochs the share of the residuals that offsets absorb is not negligible
         use = estimate.system.use
         lost = int(self.has_offsets and len(use) < FEW_EPOCHS)
-        ratios, freedom = noise_ratios(
-            estimate.residuals, self.grid.weights, use, self.redundancy_share(use), lost
-        )
+        numbers = self._redundancy_numbers(estimate.system)
+        ratios, freedom = noise_ratios(estimate.residuals, self.grid.weights, use, numbers, lost)
         ratios = np.column_stack([ratios, np.sqrt(ratios.prod(axis=1))])
         grid = ObservationGrid(self.grid.points, self.grid.weights / ratios)
         return replace(self, grid=grid, ratios=ratios, freedom=freedom)
@@ -299,6 +300,20 @@ class SeriesEstimator:
         if self.freedom is None and self.s.target_noise:
             return np.full(len(self.testfield), _GUESSED)
         return self.freedom
+
+    def _redundancy_numbers(self, system: SeriesSystem) -> Array:
+        """Return the redundancy numbers (T, 2) of the coordinates in a typical epoch.
+
+        Of few targets the outer ones determine an epoch, and their residuals are small.
+        """
+        use = system.use & system.good[:, None]
+        A = system.design.at.A[..., system.design.own]
+        sums = np.stack([(self.grid.weights[..., k] * use).sum(axis=0) for k in range(3)], axis=1)
+        N = normal_matrices(sums[None] / max(int(system.good.sum()), 1), A)[0]
+        Q = inverse_of_determined(N + system.design.own_prior)
+        weights = sums[:, :2] / np.maximum(use.sum(axis=0), 1)[:, None]
+        numbers: Array = 1.0 - weights * np.einsum("tkp,pq,tkq->tk", A, Q, A)
+        return numbers.clip(_LEAST_NUMBER)
 
     def redundancy_share(self, use: Mask) -> float:
         """Return the redundancy over the number of observations."""

@@ -8,6 +8,7 @@ perspective shows whether the mount moved, and by how much.
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,8 +26,10 @@ if TYPE_CHECKING:
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
 _CERTAIN = 6.0  # standard deviations of the step by the epochs around
-_BENT = 3.0  # standard deviations of a change of the rate
+_CERTAIN_CHI2 = 36.0  # χ² with 6 degrees of freedom of a step beside a bend
+_BENT = 3.0  # standard deviations of the squares that straight lines leave
 _LASTING = 0.5  # share of the change that must remain
+_BESIDE = 3  # epochs between a step and a bend, within which either looks like the other
 SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
 _ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from both
@@ -77,10 +80,15 @@ def find_jumps(
         certain = abs(step[column]) > _CERTAIN * noise[worst, column] * np.sqrt(factor / 2)
         if not certain or abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
-        if _is_bent(left[:, column], row, noise[worst, column] / np.sqrt(2.0)):
-            continue
+        sds = noise[worst] / np.sqrt(2.0)
+        variance = factor * sds**2
+        if not _is_straight(left, row, sds):
+            beside = _step_beside_bend(left, row, sds)
+            if beside is None or beside[0] in jumps:
+                continue
+            row, step, variance = beside
         left[row:] -= step
-        if jump := _find_mover(row, step, factor * noise[worst] ** 2 / 2, M, g):
+        if jump := _find_mover(row, step, variance, M, g):
             jumps[row] = jump
     return left, dict(sorted(jumps.items())), hidden
 
@@ -155,21 +163,57 @@ def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
     return estimator @ trajectory[row + t], float(estimator @ estimator)
 
 
-def _is_bent(trajectory: Array, row: int, sd: float) -> bool:
-    """Return whether the rate of a trajectory (E,) changes at an epoch, which may explain a step.
+def _is_straight(trajectory: Array, row: int, sds: Array) -> bool:
+    """Return whether a trajectory (E, k) is straight before and after an epoch, and the step there
+    larger than a bend between two epochs leaves.
 
-    sd: of an epoch. A heater that is switched between two epochs bends the course anywhere between
-    them: the curves before and after then differ by up to half an epoch's change of the rate.
+    sds (k,): of an epoch.
     """
     rows = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory)))
     u, after = rows - row + 0.5, rows >= row
-    bend = np.linalg.pinv(np.column_stack([u**0, u, after, u * after]))[3]
-    if abs(bend @ trajectory[rows]) < _BENT * sd * np.linalg.norm(bend):
-        return False
-    curves = np.column_stack([u**0, u, u**2, after, u * after, u**2 * after])
-    step, rate = np.linalg.pinv(curves)[3:5]
-    left = abs(step @ trajectory[rows]) - 0.5 * abs(rate @ trajectory[rows])
-    return bool(left < _CERTAIN * sd * np.linalg.norm(step))
+    lines, y = np.column_stack([u**0, u, after, u * after]), trajectory[rows] / sds
+    fit = np.linalg.pinv(lines) @ y
+    left, (step, rate) = y - lines @ fit, np.linalg.norm(fit[2:], axis=1)
+    freedom = left.size * (1.0 - 4.0 / len(rows))
+    straight = float((left**2).sum()) < freedom + _BENT * np.sqrt(2.0 * freedom)
+    return bool(straight and step > rate)
+
+
+def _step_beside_bend(trajectory: Array, row: int, sds: Array) -> tuple[int, Array, Array] | None:
+    """Return the epoch near `row` at which a trajectory (E, k) steps, the step (k,) and its
+    variances (k,); None if a bend alone explains it.
+
+    sds (k,): of an epoch. The course is a cubic on either side of the bend. A heater is switched
+    anywhere between two epochs: if the step is between them too, one hides a part of the other.
+    """
+    rows = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory)))
+    t = (rows - row) / SIDE
+    at = np.arange(-_BESIDE, _BESIDE, 0.1)
+    after = np.clip(t - at[:, None] / SIDE, 0.0, None)
+    cubic = np.broadcast_to(np.vander(t, 4), (len(at), len(t), 4))
+    bends = np.concatenate([np.stack([after, after**2, after**3], axis=-1), cubic], axis=-1)
+    y = trajectory[rows] / sds
+
+    def squares(models: Array) -> Array:
+        """Return the sums of squares (bends,) that models (bends, epochs, ·) leave."""
+        return np.asarray(((y - models @ (np.linalg.pinv(models) @ y)) ** 2).sum(axis=(1, 2)))
+
+    found = []
+    for k in range(-_BESIDE, _BESIDE + 1):
+        step = np.broadcast_to((rows >= row + k)[:, None], (*after.shape, 1))
+        both = np.concatenate([step, bends], axis=-1)
+        left = squares(both)
+        best = int(left.argmin())
+        apart = at - (k - 0.5)
+        together = abs(apart[best]) < 0.7
+        model = both[np.abs(apart).argmin() if together else best]
+        found.append((float(left[best]), row + k, together, np.linalg.pinv(model)))
+    least, where, together, estimator = min(found, key=itemgetter(0))
+    if squares(bends).min() - least < _CERTAIN_CHI2:
+        return None
+    step, rate = (estimator @ trajectory[rows])[:2]
+    variance = estimator[0] @ estimator[0] * sds**2 + together * (rate / SIDE) ** 2 / 12.0
+    return where, step, variance
 
 
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:

@@ -55,7 +55,7 @@ _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six
 _SLOW_COST = 2.0  # further log-likelihood that a memory must gain
 _NEGLIGIBLE = 0.02  # of the noise's variance
 _DEGREE = 6
-_LEAST_FAST = 30  # frequencies of a drift's removal
+_LEAST_FAST = 12  # frequencies of a drift's removal
 _ENOUGH_FAST = 120  # frequencies; with fewer too much of a movement goes with the drift
 _MOST_BENDS = 4
 _MOST_BENDS_TRIED = 400
@@ -166,35 +166,51 @@ def _remove_drift(coefficients: Array, low: int) -> Array:
     fast, n = coefficients[low:], len(coefficients) + 1
     u = np.linspace(-1.0, 1.0, n)[:, None]
     m = len(fast)
-    basis = _cosines(u ** np.arange(1, min(_DEGREE, m // 10) + 1))[low:]
+    basis = _cosines(u ** np.arange(1, min(_DEGREE, max(m // 10, 1)) + 1))[low:]
     basis = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
     fast = fast - basis @ (basis.T @ fast)
     rows = np.unique(np.linspace(_LEAST_BEND, n - _LEAST_BEND, _MOST_BENDS_TRIED).astype(int))
-    parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
     needed = 0.5 * chi2_quantile(1.0 - _BY_CHANCE / len(rows), 3 * fast.shape[1])
+    least = needed if m >= _ENOUGH_FAST else 0.0  # a short series only shows what no bend explains
     likelihood = float(_likelihood(fast, low))
-    for _ in range(min(_MOST_BENDS, (m // 4 - basis.shape[1]) // 3)):
-        tried = (_best_bend(fast, basis, u - u[part, 0], low) for part in parts)
-        better, left, bend = max(tried, key=itemgetter(0))
-        if better - likelihood < needed:
+    for _ in range(min(_MOST_BENDS, max((m // 4 - basis.shape[1]) // 3, 1))):
+        parts = np.array_split(rows, -(-len(rows) * n // _TOGETHER))
+        tried = (_best_bend(fast, basis, part, low, anywhere=True) for part in parts)
+        best = max(tried, key=itemgetter(0))
+        if best[0] - likelihood < least:
             break
-        likelihood, fast, basis = better, left, np.column_stack([basis, bend])
+        for near in (np.linspace(0.0, 1.0, 11), np.linspace(-0.1, 0.1, 21)):
+            best = _best_bend(fast, basis, best[1] + near, low)
+        if best[0] - likelihood < least:
+            break
+        least = needed
+        likelihood, at, fast, bend = best
+        basis = np.column_stack([basis, bend])
+        rows = rows[np.abs(rows - at) > _LEAST_BEND]  # two together would be a step
+        if not len(rows):
+            break
     return np.concatenate([coefficients[:low], fast])
 
 
-def _best_bend(fast: Array, basis: Array, after: Array, low: int) -> tuple[float, Array, Array]:
-    """Return the likelihood with the best of some bends, the coefficients left, and its basis.
+def _best_bend(
+    fast: Array, basis: Array, at: Array, low: int, *, anywhere: bool = False
+) -> tuple[float, float, Array, Array]:
+    """Return the likelihood with the best of some bends, its epoch, the coefficients left, and its
+    basis.
 
-    fast (m, k): coefficients without `basis` (m, ·); after (E, bends): time after each bend.
+    fast (m, k): coefficients without `basis` (m, ·); at (bends,): epochs of the bends, anywhere: up
+    to the next one, as a heater is switched between two epochs.
     """
-    after = np.clip(after, 0.0, None)
-    bends = np.stack([_cosines(after**k)[low:].T for k in (1, 2, 3)], axis=-1)  # (bends, m, 3)
+    n = low + len(fast) + 1
+    after = np.clip((np.arange(n)[:, None] - at) / n, 0.0, None)
+    shapes = [after, after**2, after**3, *[np.sign(after)] * anywhere]
+    bends = np.stack([_cosines(each)[low:].T for each in shapes], axis=-1)  # (bends, m, ·)
     inside = bends - basis @ (basis.T @ bends)
     inside = np.linalg.qr(inside / np.linalg.norm(inside, axis=1, keepdims=True))[0]
     left = fast - inside @ (np.swapaxes(inside, 1, 2) @ fast)
     likelihood = _likelihood(left, low)
     best = int(np.argmax(likelihood))
-    return float(likelihood[best]), left[best], inside[best]
+    return float(likelihood[best]), float(at[best]), left[best], inside[best]
 
 
 def _likelihood(coefficients: Array, low: int) -> Array:
@@ -355,10 +371,11 @@ _MEDIAN_CHI2_6 = 5.348
 _WINDOW = 15  # epochs of the local cubic that smooths the interior orientation
 _CUBIC = 0.6  # window of the local cubic that follows the drift, over the drift's shortest period
 _SPIKE = 6.0  # robust standard deviations beyond which a deviation is a passer-by, not the mount
-_WEAK = 3.0  # times the usual variance of the pose, beyond which an epoch is interpolated
+_WEAK = 3.0  # times the usual variance of a parameter, beyond which an epoch is interpolated
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
 _LEAST_NOISE = 0.2  # variance with correlated errors, whose estimate may even be negative
+_NEIGHBOURS = 5  # epochs on one side that predict an epoch
 _FOLLOWED = 1e-9  # share of a movement that the free parameters follow, beyond rounding
 _PERIODS = 2.5  # periods that a series must have to show a drift
 
@@ -496,8 +513,9 @@ def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, 
     if len(own):
         Q, found = stacked_inverses(N[:, own[:, None], own])
         interior = np.einsum("epq,eq->ep", Q, b[:, own])
-        interior[~found] = np.nan
-        interior = _smooth(_fill(interior, ~found))
+        spread = np.where(found[:, None], np.diagonal(Q, axis1=1, axis2=2), np.inf)
+        shown = found & (spread <= _WEAK * np.median(spread, axis=0)).all(axis=1)
+        interior = _smooth(_fill(interior, ~shown))
     Q, found = stacked_inverses(N[:, EOP, EOP])
     coupling = N[:, EOP_COLUMNS[:, None], own]
     pose = np.einsum("eij,ej->ei", Q, b[:, EOP] - np.einsum("eip,ep->ei", coupling, interior))
@@ -541,7 +559,10 @@ def _separate(
         smooth = np.concatenate([_smooth(part, int(_CUBIC * period)) for part in parts])
     rough = trajectory - smooth
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
-    rough = np.clip(rough, -limit, limit)
+    beyond = np.maximum(np.abs(rough) - limit, 0.0)
+    if period:
+        beyond[_least_deviation(trajectory) < limit] = 0.0
+    rough -= np.copysign(beyond, rough)
     groups = []
     for part in (axes[:, alike > 0.5], axes[:, alike <= 0.5]):
         inside = rough @ part
@@ -552,6 +573,19 @@ def _separate(
     size = [len(p) for p in parts]
     white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
     return directions, white, slow, max(f[2] for f in found)
+
+
+def _least_deviation(trajectory: Array) -> Array:
+    """Return how far each epoch of a trajectory (E, k) is from the parabola through those before it
+    or after it, whichever is nearer: a spike is far from both, a kink from one.
+    """
+    n = _NEIGHBOURS
+    predict = np.linalg.pinv(np.vander(np.arange(1.0, n + 1), 3))[-1]  # at 0
+    windows = np.lib.stride_tricks.sliding_window_view(trajectory, n, axis=0)
+    out = np.full((2, *trajectory.shape), np.inf)
+    out[0, :-n] = np.abs(trajectory[:-n] - windows[1:] @ predict)
+    out[1, n:] = np.abs(trajectory[n:] - windows[:-1] @ predict[::-1])
+    return np.asarray(out.min(axis=0))
 
 
 def _fill(trajectory: Array, missing: Mask) -> Array:

@@ -46,17 +46,17 @@ _CLIP = 60.0  # times the median square, beyond which a square is a jump
 
 
 def noise_ratios(
-    residuals: Array, weights: Array, used: Mask, redundancy_share: float, lost: int = 0
+    residuals: Array, weights: Array, used: Mask, redundancy: Array | float, lost: int = 0
 ) -> tuple[Array, Array]:
     """Estimate variances (T, 2) of the targets' coordinates in units of their a-priori variances;
     return them with their degrees of freedom (T,).
 
-    residuals (E, T, 2) px; weights (E, T, 3) px⁻²; used (E, T); redundancy_share: redundancy over
-    observations; lost: epochs of each target that its offset uses up. Robust: from medians of
-    squares, or for a few epochs means of squares with jumps cut. They are drawn to the targets'
-    common variance, strongly if they differ no more than by chance (Smyth, 2004).
+    residuals (E, T, 2) px; weights (E, T, 3) px⁻²; used (E, T); redundancy (T, 2): redundancy
+    numbers of the coordinates; lost: epochs of each target that its offset uses up. Robust: from
+    medians of squares, or for a few epochs means of squares with jumps cut. They are drawn to the
+    targets' common variance, strongly if they differ no more than by chance (Smyth, 2004).
     """
-    squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan) / redundancy_share
+    squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan) / redundancy
     n = used.sum(axis=0)[:, None].astype(np.float64)
     if lost:
         left = np.maximum(n - lost, 0.0)

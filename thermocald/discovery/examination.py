@@ -17,12 +17,13 @@ from thermocald.discovery.evidence import (
 from thermocald.discovery.mounted import (
     KNOCKS,
     contradict,
+    fit_beside_walk,
     is_convincing,
     make_own_rates,
     search_beside_mount,
     split_knocks,
 )
-from thermocald.discovery.search import Search, Solution, by_score
+from thermocald.discovery.search import Search, Solution, by_score, say_searched
 from thermocald.discovery.validation import (
     SurrogateTest,
     compare_with_surrogates,
@@ -126,7 +127,7 @@ def examine_series(
     say = progress or (lambda _: None)
     known, loose = {catalogue.get(m.name).seen_in for m in given}, set(targets_of(given))
     given = [m for m in given if catalogue.get(m.name).seen_in == "trajectory"]
-    say("targets that moved")
+    say("looking for targets that moved")
     displaced, cleaned, field = [], [], []
     for e in series:
         boards, still = replace_moved_boards(e)
@@ -176,7 +177,7 @@ def _examine_standing(
         search = Search(HypothesisFitter(series), say)
         return _search_standing(search, search.base(given), jobs)
 
-    say("base model")
+    say("fitting the model without a further effect")
     search = Search(HypothesisFitter(ready), say)
     base = search.base(given)
     # a single effect accounts for most of the image's movement
@@ -186,7 +187,7 @@ def _examine_standing(
     if not found.adequate:
         again = remove_curvature(found.fitter, found.best.fit)
         if again is not None and _is_explained(again, found):
-            say("curvature of the projection: searching again")
+            say("searching again with the projection's curvature, which the effects found show")
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
@@ -194,7 +195,7 @@ def _examine_standing(
         if alongside is not None:
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
-        say("noise that targets share: searching again")
+        say("searching again with the noise that targets share")
         found = search_in(noisy)
     if not found.adequate or any(t.kind.is_event for t in found.best.terms):
         knocked = _search_beside_knocks(found, say, jobs)
@@ -227,7 +228,7 @@ def _search_beside_knocks(
         if not any(fresh):
             break
         knocks = (*knocks, Term(event.name, EOP_NAMES, (), fresh))
-        say("alongside a knock of the mount")
+        say("the mount was knocked: searching again")
         base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
         again = _search_standing(search, base, jobs)
         # beside steps with six free coefficients each, several effects could imitate anything
@@ -253,8 +254,8 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     frontier, larger = [base], base
     complete = False
     for level in range(1, _EFFECTS + 1):
-        beside = " or ".join(", ".join(s.names) for s in frontier) if level > 1 else "the base"
-        search.progress(f"effect {level}: alongside {beside}")
+        beside = " or ".join(" with ".join(s.names) for s in frontier) if level > 1 else ""
+        search.progress(say_searched(beside))
         if level == 1:
             grown = ranking = search.expand(base)
         else:
@@ -472,9 +473,10 @@ def _examine_beside_mount(
 def _keep_named(
     search: Search, base: Solution, best: Solution, jobs: int
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
-    """Drop the effects that do not predict blocks left out or do not pass the surrogate test.
+    """Drop the effects that do not predict blocks left out, are noise, or a random walk.
 
-    Returns also the gains of the others in each block, and their tests.
+    Several flexible effects imitate a camera that walks at random; as they leave only noise,
+    surrogates do not show it. Returns also the gains of the others in each block, and their tests.
     """
     kept = len(base.terms)
     while len(best.terms) > kept:
@@ -482,19 +484,25 @@ def _keep_named(
         bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
         if bad:
             worst = min(bad, key=lambda i: float(blocks[i].sum()))
-            search.progress(f"{best.names[kept + worst]} does not predict blocks left out")
+            search.progress(f"{best.names[kept + worst]} predicts no period left out: dropped")
             best = _drop_effect(search, base, best, kept + worst)
             continue
-        tests = []
-        for i in range(kept, len(best.terms)):
-            without = _drop_effect(search, base, best, i)
-            gain = without.score - best.score
-            tests.append(compare_with_surrogates(search, best.fit, without, gain, jobs=jobs))
+        fewer = [_drop_effect(search, base, best, i) for i in range(kept, len(best.terms))]
+        tests = [
+            compare_with_surrogates(search, best.fit, s, s.score - best.score, jobs=jobs)
+            for s in fewer
+        ]
         worst = max(range(len(tests)), key=lambda i: tests[i].p)
         if tests[worst].passed:
-            return best, blocks, tuple(tests)
-        search.progress(f"{best.names[kept + worst]} may be noise: surrogates reach it")
-        best = _drop_effect(search, base, best, kept + worst)
+            if best.mount is not None:  # they were found beside its walk
+                return best, blocks, tuple(tests)
+            walking = fit_beside_walk(best).score
+            gains = [fit_beside_walk(s).score - walking for s in fewer]
+            worst = int(np.argmin(gains))
+            if gains[worst] > 0.0:
+                return best, blocks, tuple(tests)
+        search.progress(f"{best.names[kept + worst]} may be noise or a random walk: dropped")
+        best = fewer[worst]
     return best, [], ()
 
 

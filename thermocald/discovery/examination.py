@@ -79,7 +79,8 @@ class Examination:
     mount, as terms of the base; as_slips: whether a slip inside the camera explains each equally
     well. unblocked: the series as examined, not averaged in blocks. field_movements: of boards and
     targets, per series. distortion_sigmas: significance of what the distortion follows.
-    knows_noise: whether the model has the growth of the noise already.
+    knows_noise: whether the model has the growth of the noise already. walks: whether an effect of
+    `best` may be a random walk of the camera.
     """
 
     base: Solution
@@ -100,6 +101,7 @@ class Examination:
     unblocked: tuple[ReducedSeries, ...] = ()
     field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
     distortion_sigmas: float = 0.0
+    walks: bool = False
 
     @property
     def fitter(self) -> HypothesisFitter:
@@ -153,6 +155,9 @@ def examine_series(
     if result is None:
         shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
         result = _examine_standing(ready, shaking, say, given, jobs)
+        if result.walks:
+            say("the camera may have moved at random: searching again")
+            result = _examine_beside_mount(calibrated, say, given, jobs) or result
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
@@ -253,7 +258,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     best, ranking, seen = base, list[Solution](), list[Solution]()
     frontier, larger = [base], base
     complete = False
-    for level in range(1, _EFFECTS + 1):
+    for level in range(1, min(_EFFECTS, max(search.epochs // criteria.EPOCHS_EACH, 1)) + 1):
         beside = " or ".join(" with ".join(s.names) for s in frontier) if level > 1 else ""
         search.progress(say_searched(beside))
         if level == 1:
@@ -303,7 +308,8 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     if _is_adequate(examine_all(fitter, best.fit), base_adequacy):
         best, blocks, tests = _keep_named(search, base, best, jobs)
     adequacy = examine_all(fitter, best.fit)
-    complete = _is_adequate(adequacy, base_adequacy)
+    walks = _imitates_walk(search, base, best)
+    complete = _is_adequate(adequacy, base_adequacy) and not walks
     if len(best.terms) > kept and len(fitter.series) < 2:
         # if single targets wander much, one series alone names no effect
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
@@ -311,8 +317,19 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         complete = complete and not _own_rates_do_better(search, base, best)
     return Examination(
         base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
-        complete, tuple(blocks), surrogates=tests,
+        complete, tuple(blocks), surrogates=tests, walks=walks,
     )  # fmt: skip
+
+
+def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
+    """Test whether an effect found is not worth its penalty beside a random walk of the camera.
+
+    In few epochs, several flexible effects imitate a walk; as they leave only noise, surrogates do
+    not show it.
+    """
+    walking = fit_beside_walk(best).score
+    fewer = (_drop_effect(search, base, best, i) for i in range(len(base.terms), len(best.terms)))
+    return any(fit_beside_walk(s).score < walking for s in fewer)
 
 
 def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool:
@@ -473,10 +490,9 @@ def _examine_beside_mount(
 def _keep_named(
     search: Search, base: Solution, best: Solution, jobs: int
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
-    """Drop the effects that do not predict blocks left out, are noise, or a random walk.
+    """Drop the effects that do not predict blocks left out or do not pass the surrogate test.
 
-    Several flexible effects imitate a camera that walks at random; as they leave only noise,
-    surrogates do not show it. Returns also the gains of the others in each block, and their tests.
+    Returns also the gains of the others in each block, and their tests.
     """
     kept = len(base.terms)
     while len(best.terms) > kept:
@@ -487,22 +503,16 @@ def _keep_named(
             search.progress(f"{best.names[kept + worst]} predicts no period left out: dropped")
             best = _drop_effect(search, base, best, kept + worst)
             continue
-        fewer = [_drop_effect(search, base, best, i) for i in range(kept, len(best.terms))]
-        tests = [
-            compare_with_surrogates(search, best.fit, s, s.score - best.score, jobs=jobs)
-            for s in fewer
-        ]
+        tests = []
+        for i in range(kept, len(best.terms)):
+            without = _drop_effect(search, base, best, i)
+            gain = without.score - best.score
+            tests.append(compare_with_surrogates(search, best.fit, without, gain, jobs=jobs))
         worst = max(range(len(tests)), key=lambda i: tests[i].p)
         if tests[worst].passed:
-            if best.mount is not None:  # they were found beside its walk
-                return best, blocks, tuple(tests)
-            walking = fit_beside_walk(best).score
-            gains = [fit_beside_walk(s).score - walking for s in fewer]
-            worst = int(np.argmin(gains))
-            if gains[worst] > 0.0:
-                return best, blocks, tuple(tests)
-        search.progress(f"{best.names[kept + worst]} may be noise or a random walk: dropped")
-        best = fewer[worst]
+            return best, blocks, tuple(tests)
+        search.progress(f"{best.names[kept + worst]} may be noise: dropped")
+        best = _drop_effect(search, base, best, kept + worst)
     return best, [], ()
 
 

@@ -62,7 +62,7 @@ def test_no_effect_no_name(evidence_of):
     assert "field" not in found.as_dict()  # which stands still
 
 
-@pytest.mark.parametrize("epochs", [30, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("epochs", [20, pytest.param(50, marks=pytest.mark.slow)])
 def test_recordings_of_two_cameras_contradict_each_other(epochs):
     """M2 is of another camera of the same type; M1 alone lacks no effect.
 

@@ -290,26 +290,15 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     # a larger combination that was rejected is a rival if two effects in it do better than one here
     seen = [s for s in seen if len(s.terms) <= len(best.terms) or _does_better(s, best)]
     if len(best.terms) > kept:
-        decides = _does_better(larger, best, by=criteria.BAND)
-        best, seen = _compare_ties(search, best, seen)
-        if decides:  # its last effect is too small for a name, but shows which tie is right
-            ties = [s for s in seen if s.score < best.score + criteria.BAND]
-            inside = [s for s in ties if set(s.names) < set(larger.names)]
-            best = min(inside, key=by_score, default=best)
-        # The likelihood takes all trajectories of the temperature as equally probable. A lag
-        # smooths the thermometer's noise, a delay does not, so a smooth image would always favour
-        # a lag: only the fit decides.
-        other = search.with_other_delay(best)
-        if other is not None:
-            seen = [*seen, other]
-            best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
+        best, seen = _settle_ties(search, best, larger, seen)
     blocks: list[Array] = []
     tests: tuple[SurrogateTest, ...] = ()
     if _is_adequate(examine_all(fitter, best.fit), base_adequacy):
         best, blocks, tests = _keep_named(search, base, best, jobs)
     adequacy = examine_all(fitter, best.fit)
-    walks = _imitates_walk(search, base, best)
-    complete = _is_adequate(adequacy, base_adequacy) and not walks
+    complete = _is_adequate(adequacy, base_adequacy)
+    walks = complete and _imitates_walk(search, base, best)
+    complete = complete and not walks
     if len(best.terms) > kept and len(fitter.series) < 2:
         # if single targets wander much, one series alone names no effect
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
@@ -327,6 +316,8 @@ def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
     In few epochs, several flexible effects imitate a walk; as they leave only noise, surrogates do
     not show it.
     """
+    if best is base:
+        return False
     walking = fit_beside_walk(best).score
     fewer = (_drop_effect(search, base, best, i) for i in range(len(base.terms), len(best.terms)))
     return any(fit_beside_walk(s).score < walking for s in fewer)
@@ -375,6 +366,26 @@ def _shows_once(term: Term, series: Sequence[ReducedSeries]) -> bool:
     pairs = zip(series, term.fresh, strict=True)
     later = [e.times[e.n > 0] >= own[0][1] for e, own in pairs if own]
     return all(min(np.sum(after), np.sum(~after)) <= 1 for after in later)
+
+
+def _settle_ties(
+    search: Search, best: Solution, larger: Solution, seen: list[Solution]
+) -> tuple[Solution, list[Solution]]:
+    """Choose among near ties; larger: the best combination with one more effect."""
+    decides = _does_better(larger, best, by=criteria.BAND)
+    best, seen = _compare_ties(search, best, seen)
+    if decides:  # its last effect is too small for a name, but shows which tie is right
+        ties = [s for s in seen if s.score < best.score + criteria.BAND]
+        inside = [s for s in ties if set(s.names) < set(larger.names)]
+        best = min(inside, key=by_score, default=best)
+    # The likelihood takes all trajectories of the temperature as equally probable. A lag smooths
+    # the thermometer's noise, a delay does not, so a smooth image would always favour a lag: only
+    # the fit decides.
+    other = search.with_other_delay(best)
+    if other is not None:
+        seen = [*seen, other]
+        best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
+    return best, seen
 
 
 def _compare_ties(

@@ -68,7 +68,7 @@ def test_everything_is_written(recordings, found):
     assert told["effects"][0]["statement"][1:] in page
     stages = (
         "reading", "looking for targets", "measuring noise", "without a further effect",
-        "looking for an effect\n", "beside thermal_lag\n",
+        "looking for an effect", "beside thermal_lag",
     )  # fmt: skip
     assert [found.stderr.count(stage) for stage in stages[1:3]] == [1, 1]
     assert [*stages] == sorted(stages, key=found.stderr.index)

@@ -10,6 +10,7 @@ import numpy as np
 
 from tests.blind.case import OUTSIDE
 from tests.blind.outcome import Outcome
+from thermocald.numbers import percent
 
 HEAD = (
     "| part | cases | exact | exact or listed | lists | parameters within 3 sd | "
@@ -36,7 +37,7 @@ def row(part: str, outcomes: list[Outcome]) -> str:
     s = summary(outcomes)
 
     def share(name: str) -> str:
-        return f"{s[name]:.1%}" if np.isfinite(s[name]) else ""
+        return percent(s[name]) if np.isfinite(s[name]) else ""
 
     return (f"| {part} | {s['cases']:.0f} | {share('exact')} | {share('exact_or_listed')} | "
             f"{share('lists')} | {share('within_3_sd')} | {share('gap_closed_90')} |")  # fmt: skip

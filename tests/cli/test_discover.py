@@ -66,7 +66,10 @@ def test_everything_is_written(recordings, found):
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
     assert told["effects"][0]["statement"][1:] in page
-    stages = ("reading", "targets that moved", "measuring noise", "base model", "effect 1")
+    stages = (
+        "reading", "looking for targets", "measuring noise", "without a further effect",
+        "looking for an effect", "beside thermal_lag",
+    )  # fmt: skip
     assert [found.stderr.count(stage) for stage in stages[1:3]] == [1, 1]
     assert [*stages] == sorted(stages, key=found.stderr.index)
 

@@ -30,6 +30,7 @@ from tests.real_corners.generator import (
     generate,
 )
 from thermocald.discovery.result import Discovery, discover_series
+from thermocald.numbers import percent
 from thermocald.store.recording.reader import read_recording
 from thermocald.thermal.reduce import reduce_together
 from thermocald.thermal.series import SeriesInput
@@ -92,11 +93,15 @@ def missed(part: str, done: list[Outcome]) -> list[str]:
     named = float(np.mean([o.right_or_listed for o in done]))
     out = []
     if named < GOALS[part]:
-        out.append(f"{part}: {named:.0%} named exactly or listed; the goal is {GOALS[part]:.0%}")
+        out.append(
+            f"{part}: {percent(named)} named exactly or listed; the goal is {percent(GOALS[part])}"
+        )
     gaps = [o.gap_closed for o in done if o.right and o.case.effects and o.gap_closed is not None]
     open_ = sum(g < GAP_CLOSED for g in gaps)
     if open_ > 0.1 * len(gaps):
-        out.append(f"{part}: {open_} of {len(gaps)} close less than {GAP_CLOSED:.0%} of the gap")
+        out.append(
+            f"{part}: {open_} of {len(gaps)} close less than {percent(GAP_CLOSED)} of the gap"
+        )
     return out
 
 

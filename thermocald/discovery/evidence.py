@@ -129,6 +129,9 @@ class Displaced:
     gain: float
 
 
+_LASTING = 3  # points on either side of a step: two may be gross errors
+
+
 def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Array]:
     """Find the best step of each target: gain (T,), first epoch after it, share of movement."""
     w = np.sqrt(evidence.weights[..., :2])
@@ -146,7 +149,7 @@ def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Arra
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = s1 / after[..., None] - s0 / before[..., None]
         gain = np.sum(difference**2, axis=2) * before * after / total
-    gain = np.where((before >= 4) & (after >= 4), np.nan_to_num(gain), 0.0)
+    gain = np.where(np.minimum(before, after) >= _LASTING, np.nan_to_num(gain), 0.0)
     best = np.argmax(gain, axis=0)
     columns = np.arange(gain.shape[1])
     top = gain[best, columns]

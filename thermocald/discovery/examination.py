@@ -17,12 +17,13 @@ from thermocald.discovery.evidence import (
 from thermocald.discovery.mounted import (
     KNOCKS,
     contradict,
+    fit_beside_walk,
     is_convincing,
     make_own_rates,
     search_beside_mount,
     split_knocks,
 )
-from thermocald.discovery.search import Search, Solution, by_score
+from thermocald.discovery.search import Search, Solution, by_score, say_searched
 from thermocald.discovery.validation import (
     SurrogateTest,
     compare_with_surrogates,
@@ -78,7 +79,8 @@ class Examination:
     mount, as terms of the base; as_slips: whether a slip inside the camera explains each equally
     well. unblocked: the series as examined, not averaged in blocks. field_movements: of boards and
     targets, per series. distortion_sigmas: significance of what the distortion follows.
-    knows_noise: whether the model has the growth of the noise already.
+    knows_noise: whether the model has the growth of the noise already. walks: whether an effect of
+    `best` may be a random walk of the camera.
     """
 
     base: Solution
@@ -99,6 +101,7 @@ class Examination:
     unblocked: tuple[ReducedSeries, ...] = ()
     field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
     distortion_sigmas: float = 0.0
+    walks: bool = False
 
     @property
     def fitter(self) -> HypothesisFitter:
@@ -126,7 +129,7 @@ def examine_series(
     say = progress or (lambda _: None)
     known, loose = {catalogue.get(m.name).seen_in for m in given}, set(targets_of(given))
     given = [m for m in given if catalogue.get(m.name).seen_in == "trajectory"]
-    say("targets that moved")
+    say("looking for targets that moved")
     displaced, cleaned, field = [], [], []
     for e in series:
         boards, still = replace_moved_boards(e)
@@ -152,6 +155,9 @@ def examine_series(
     if result is None:
         shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
         result = _examine_standing(ready, shaking, say, given, jobs)
+        if result.walks:
+            say("the camera may have moved at random: searching again")
+            result = _examine_beside_mount(calibrated, say, given, jobs) or result
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
@@ -176,7 +182,7 @@ def _examine_standing(
         search = Search(HypothesisFitter(series), say)
         return _search_standing(search, search.base(given), jobs)
 
-    say("base model")
+    say("fitting the model without a further effect")
     search = Search(HypothesisFitter(ready), say)
     base = search.base(given)
     # a single effect accounts for most of the image's movement
@@ -186,7 +192,7 @@ def _examine_standing(
     if not found.adequate:
         again = remove_curvature(found.fitter, found.best.fit)
         if again is not None and _is_explained(again, found):
-            say("curvature of the projection: searching again")
+            say("searching again with the projection's curvature, which the effects found show")
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
@@ -194,7 +200,7 @@ def _examine_standing(
         if alongside is not None:
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
-        say("noise that targets share: searching again")
+        say("searching again with the noise that targets share")
         found = search_in(noisy)
     if not found.adequate or any(t.kind.is_event for t in found.best.terms):
         knocked = _search_beside_knocks(found, say, jobs)
@@ -227,7 +233,7 @@ def _search_beside_knocks(
         if not any(fresh):
             break
         knocks = (*knocks, Term(event.name, EOP_NAMES, (), fresh))
-        say("alongside a knock of the mount")
+        say("the mount was knocked: searching again")
         base = search.refine((*base.terms, knocks[-1]), (*base.penalties, 0.0))
         again = _search_standing(search, base, jobs)
         # beside steps with six free coefficients each, several effects could imitate anything
@@ -252,9 +258,9 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     best, ranking, seen = base, list[Solution](), list[Solution]()
     frontier, larger = [base], base
     complete = False
-    for level in range(1, _EFFECTS + 1):
-        beside = " or ".join(", ".join(s.names) for s in frontier) if level > 1 else "the base"
-        search.progress(f"effect {level}: alongside {beside}")
+    for level in range(1, min(_EFFECTS, max(search.epochs // criteria.EPOCHS_EACH, 1)) + 1):
+        beside = " or ".join(" with ".join(s.names) for s in frontier) if level > 1 else ""
+        search.progress(say_searched(beside))
         if level == 1:
             grown = ranking = search.expand(base)
         else:
@@ -284,25 +290,15 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     # a larger combination that was rejected is a rival if two effects in it do better than one here
     seen = [s for s in seen if len(s.terms) <= len(best.terms) or _does_better(s, best)]
     if len(best.terms) > kept:
-        decides = _does_better(larger, best, by=criteria.BAND)
-        best, seen = _compare_ties(search, best, seen)
-        if decides:  # its last effect is too small for a name, but shows which tie is right
-            ties = [s for s in seen if s.score < best.score + criteria.BAND]
-            inside = [s for s in ties if set(s.names) < set(larger.names)]
-            best = min(inside, key=by_score, default=best)
-        # The likelihood takes all trajectories of the temperature as equally probable. A lag
-        # smooths the thermometer's noise, a delay does not, so a smooth image would always favour
-        # a lag: only the fit decides.
-        other = search.with_other_delay(best)
-        if other is not None:
-            seen = [*seen, other]
-            best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
+        best, seen = _settle_ties(search, best, larger, seen)
     blocks: list[Array] = []
     tests: tuple[SurrogateTest, ...] = ()
     if _is_adequate(examine_all(fitter, best.fit), base_adequacy):
         best, blocks, tests = _keep_named(search, base, best, jobs)
     adequacy = examine_all(fitter, best.fit)
     complete = _is_adequate(adequacy, base_adequacy)
+    walks = complete and _imitates_walk(search, base, best)
+    complete = complete and not walks
     if len(best.terms) > kept and len(fitter.series) < 2:
         # if single targets wander much, one series alone names no effect
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
@@ -310,8 +306,21 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         complete = complete and not _own_rates_do_better(search, base, best)
     return Examination(
         base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
-        complete, tuple(blocks), surrogates=tests,
+        complete, tuple(blocks), surrogates=tests, walks=walks,
     )  # fmt: skip
+
+
+def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
+    """Test whether an effect found is not worth its penalty beside a random walk of the camera.
+
+    In few epochs, several flexible effects imitate a walk; as they leave only noise, surrogates do
+    not show it.
+    """
+    if best is base:
+        return False
+    walking = fit_beside_walk(best).score
+    fewer = (_drop_effect(search, base, best, i) for i in range(len(base.terms), len(best.terms)))
+    return any(fit_beside_walk(s).score < walking for s in fewer)
 
 
 def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool:
@@ -357,6 +366,26 @@ def _shows_once(term: Term, series: Sequence[ReducedSeries]) -> bool:
     pairs = zip(series, term.fresh, strict=True)
     later = [e.times[e.n > 0] >= own[0][1] for e, own in pairs if own]
     return all(min(np.sum(after), np.sum(~after)) <= 1 for after in later)
+
+
+def _settle_ties(
+    search: Search, best: Solution, larger: Solution, seen: list[Solution]
+) -> tuple[Solution, list[Solution]]:
+    """Choose among near ties; larger: the best combination with one more effect."""
+    decides = _does_better(larger, best, by=criteria.BAND)
+    best, seen = _compare_ties(search, best, seen)
+    if decides:  # its last effect is too small for a name, but shows which tie is right
+        ties = [s for s in seen if s.score < best.score + criteria.BAND]
+        inside = [s for s in ties if set(s.names) < set(larger.names)]
+        best = min(inside, key=by_score, default=best)
+    # The likelihood takes all trajectories of the temperature as equally probable. A lag smooths
+    # the thermometer's noise, a delay does not, so a smooth image would always favour a lag: only
+    # the fit decides.
+    other = search.with_other_delay(best)
+    if other is not None:
+        seen = [*seen, other]
+        best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
+    return best, seen
 
 
 def _compare_ties(
@@ -482,7 +511,7 @@ def _keep_named(
         bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
         if bad:
             worst = min(bad, key=lambda i: float(blocks[i].sum()))
-            search.progress(f"{best.names[kept + worst]} does not predict blocks left out")
+            search.progress(f"{best.names[kept + worst]} predicts no period left out: dropped")
             best = _drop_effect(search, base, best, kept + worst)
             continue
         tests = []
@@ -493,7 +522,7 @@ def _keep_named(
         worst = max(range(len(tests)), key=lambda i: tests[i].p)
         if tests[worst].passed:
             return best, blocks, tuple(tests)
-        search.progress(f"{best.names[kept + worst]} may be noise: surrogates reach it")
+        search.progress(f"{best.names[kept + worst]} may be noise: dropped")
         best = _drop_effect(search, base, best, kept + worst)
     return best, [], ()
 

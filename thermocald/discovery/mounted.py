@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from thermocald.discovery import criteria
-from thermocald.discovery.search import Search, Solution, by_score
+from thermocald.discovery.search import Search, Solution, by_score, say_searched
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Proportional
@@ -58,12 +58,12 @@ def search_beside_mount(
     start = first.base(given)
     W = find_combinations(fitter.series)
     guess = guess_mount_motion(fitter, start.fit, W)
-    say("movement of the mount")
+    say("estimating how the camera moves on its mount")
     trials = [_fit_beside(start, Mount(W, guess, corner), 4) for corner in _CORNERS]
     plain = best = min(trials, key=by_score)
     ranking, seen = list[Solution](), list[Solution]()
     for level in range(_LEVELS):
-        say(f"alongside the mount: {', '.join(best.names) or 'the base'}")
+        say(say_searched(" with ".join(best.names)))
         search = Search(best.fitter, like=first)
         grown: list[Solution] = []
         # a scan is accurate to a few percent, and a further effect must gain much
@@ -96,6 +96,13 @@ def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
         solution.fitter, solution.terms, mount, solution.fit.coefficients, turns
     )
     return Solution(fit, solution.penalties, own, mount)
+
+
+def fit_beside_walk(solution: Solution) -> Solution:
+    """Fit a solution beside a random walk of the camera, as large as the solution leaves it."""
+    W = find_combinations(solution.fitter.series)
+    guess = guess_mount_motion(solution.fitter, solution.fit, W)
+    return _fit_beside(solution, Mount(W, guess, 0.0), 5)
 
 
 def _settle(solution: Solution, best: float) -> Solution:

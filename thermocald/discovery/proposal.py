@@ -68,7 +68,7 @@ def propose(
     moving = [p for p in PARAMETER_NAMES if p in {*parameters, *BASE}]
     if len(x.fitter.series) < 2:
         return None
-    (progress or (lambda _: None))("beyond the catalogue")
+    (progress or (lambda _: None))("looking for a formula beyond the catalogue")
     # without the projection's curvature along all movements
     series: list[ReducedSeries] = []
     for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):

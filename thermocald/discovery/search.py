@@ -107,6 +107,11 @@ class Solution:
         return tuple(t.effect for t in self.fit.terms)
 
 
+def say_searched(beside: str) -> str:
+    """Say what is searched; beside: the effects found so far, if any."""
+    return f"looking for an effect beside {beside}" if beside else "looking for an effect"
+
+
 by_score = attrgetter("score")
 """The order of solutions, the best one first."""
 

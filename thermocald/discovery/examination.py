@@ -148,10 +148,8 @@ def examine_series(
         cleaned = [reweight(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
     calibrated = calibrate_thermometers(cleaned)
     ready = [in_blocks(weight_slow_noise(e)) for e in calibrated]
-    result = None
     wanders = max(e.correlation for e in calibrated) > criteria.MEMORY
-    if wanders:
-        result = _examine_beside_mount(calibrated, say, given, jobs)
+    result = _examine_beside_mount(calibrated, say, given, jobs) if wanders else None
     if result is None:
         shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
         result = _examine_standing(ready, shaking, say, given, jobs)

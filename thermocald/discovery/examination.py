@@ -309,16 +309,16 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
 
 
 def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
-    """Test whether an effect found is not worth its penalty beside a random walk of the camera.
+    """Test whether a random walk of the camera in place of an effect found is not excluded.
 
     In few epochs, several flexible effects imitate a walk; as they leave only noise, surrogates do
     not show it.
     """
-    if best is base:
+    found = range(len(base.terms), len(best.terms))
+    if search.epochs >= criteria.NO_WALK_EACH * len(found):
         return False
-    walking = fit_beside_walk(best).score
-    fewer = (_drop_effect(search, base, best, i) for i in range(len(base.terms), len(best.terms)))
-    return any(fit_beside_walk(s).score < walking for s in fewer)
+    limit = fit_beside_walk(best).score + criteria.BAND
+    return any(fit_beside_walk(_drop_effect(search, base, best, i)).score < limit for i in found)
 
 
 def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool:

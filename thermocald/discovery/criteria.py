@@ -17,7 +17,7 @@ STEP_SHARE = 0.9  # share of a target's slow movement that a step explains; else
 
 MARGIN = 16.0  # added to the penalty of a search, for errors of the noise model itself. Scored
 EPOCHS_EACH = 15  # least number per effect: in fewer, effects imitate a camera that walks. Scored
-NO_WALK_EACH = 45  # number of epochs per effect from which on no walk was named. Scored
+NO_WALK_EACH = 50  # number of epochs per effect from which on no walk was named. Scored
 SET_SHARE = 0.95  # share of its best set's promise at which another set of parameters is fitted
 BAND = 14.0  # a solution with a score worse by less is not excluded: odds of 1 to 1,100
 DRIVES_BAND = 120.0  # the same in χ², for one drive in place of another. Scored

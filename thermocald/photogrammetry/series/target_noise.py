@@ -82,8 +82,9 @@ def noise_ratios(
     between = float(np.var(np.log(ratio[shown]))) - of_chance
     prior = (1.0 + np.sqrt(1.0 + 2.0 * between)) / between if between > 0 else _ALIKE
     prior = min(prior, _ALIKE)
+    worth = worth * redundancy  # the share of a residual that is of its own error
     drawn: Array = (worth * np.where(shown, ratio, common) + prior * common) / (worth + prior)
-    return np.maximum(drawn, 1e-12), worth[:, 0] + prior
+    return np.maximum(drawn, 1e-12), worth.mean(axis=1) + prior
 
 
 @dataclass(frozen=True, eq=False)

@@ -189,7 +189,11 @@ class ControlPoints:
             twin = camera.resect(self.field, replace(seen, points=seen.points[order]), 0.0)
             if twin.ok and twin.sigma0 < max(_FITS, pose.sigma0):
                 old, new = (", ".join(names[k] for k in rows) for rows in (order[moved], moved))
-                here, there = (f"{self.centre_text(p)} {self.unit}" for p in (pose, twin))
+                digits = 0 if self.unit == "mm" else 2
+                here, there = (
+                    f"{', '.join(f'{v:.{digits}f}' for v in self.centre(p))} {self.unit}"
+                    for p in (pose, twin)
+                )
                 return (
                     f"the control points fit as well with {old} named {new} (sigma0 "
                     f"{twin.sigma0:.2f}, the camera at {there} in place of {here}): no residual "
@@ -197,11 +201,10 @@ class ControlPoints:
                 )
         return ""
 
-    def centre_text(self, pose: Adjustment) -> str:
-        """Return X, Y, Z of a projection centre in the unit and the coordinates of the file."""
-        digits = 0 if self.unit == "mm" else 2
-        centre = (pose.values[EOP][3:] + self.origin) / UNITS[self.unit]
-        return ", ".join(f"{v:.{digits}f}" for v in centre)
+    def centre(self, pose: Adjustment) -> Array:
+        """Return the projection centre (3,) in the unit and the coordinates of the file."""
+        centre: Array = (pose.values[EOP][3:] + self.origin) / UNITS[self.unit]
+        return centre
 
     def _remedy(self, camera: Camera) -> str:
         """Return the change with which the points fit, as the end of a sentence; else ""."""

@@ -332,7 +332,7 @@ def measure_places(
         tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
         levels, unchecked, unnoticed,
         tuple(refused for block in rows for refused in block.refused),
-        (pose.values[EOP][3:] + control.origin) / scale,
+        control.centre(pose),
         _doubt_pose(control, then[0], pose, surface),
     )  # fmt: skip
 

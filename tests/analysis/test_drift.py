@@ -136,25 +136,6 @@ def test_many_epochs_are_averaged():
     assert [c.drifts for c in courses(table_of(values, sd, "series"))] == [False, True, False]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("coloured", "phi", "epochs"), [(1.0, 0.97, 150), (0.5, 0.97, 150), (1.0, 0.9, 30)]
-)
-def test_replay_reports_no_drift_in_noise_with_a_memory(coloured, phi, epochs):
-    """At the level of 1 %; a test with its own line once reported drift in 7 to 17 %."""
-    from scipy.signal import lfilter  # half a second, of one worker
-
-    rng, claims = np.random.default_rng(16), []
-    for _ in range(80):
-        values = np.zeros((epochs, 16))
-        slow = lfilter([1], [1, -phi], rng.standard_normal((600 + epochs, 3)), axis=0)[600:]
-        values[:, :3] = np.sqrt(coloured * (1 - phi**2)) * slow
-        values[:, :3] += np.sqrt(1 - coloured) * rng.standard_normal((epochs, 3))
-        table = table_of(values, np.ones((epochs, 16)), "series")
-        claims += [c.drifts for c in courses(table)]
-    assert np.mean(claims) <= 0.025
-
-
 def test_a_noisy_thermometer_flattens_no_slope_and_hides_no_accuracy(tmp_path):
     """The slope of `replay` is off by a few of its sds, and these are small, as in a study."""
     s = preset_simulation("rpi-v2.1-heating", seed=1)

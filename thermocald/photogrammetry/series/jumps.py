@@ -81,7 +81,7 @@ def find_jumps(
             continue
         sds = noise[worst] / np.sqrt(2.0)
         bend = _straight_bend(left, row, sds)
-        if bend is not None:
+        if bend is not None:  # which may be anywhere between the two epochs
             variance = np.diag(factor * sds**2) + np.outer(bend, bend) / 12.0
         else:
             beside = _step_beside_bend(left, row, sds)
@@ -221,7 +221,7 @@ def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> S
     """
     ((moved, V),) = estimate_steps(M, g, {row: (step, np.zeros_like(variance))})
     if _chi2(moved, V) > _EXCLUDED:
-        return step, np.linalg.inv(variance)
+        return step, np.asarray(np.linalg.inv(variance), dtype=np.float64)
     if _chi2(step - moved, V + variance) > _EXCLUDED:
         return None
     return np.zeros_like(step), _loose(step)

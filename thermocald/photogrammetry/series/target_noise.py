@@ -12,6 +12,7 @@ the covariance of least squares under correlated noise, Q (Aᵀ P C P A) Q, as K
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -244,6 +245,7 @@ def neighbours_variance(unit: Array, known: Mask, least: float = 1.0) -> Array:
     return np.clip(middle, least, _NOISIEST)[at]
 
 
+@cache
 def _local_fit(kink: int) -> Array:
     """Return the projector (15, 15) on a cubic over 15 epochs, with a kink before one of them.
 
@@ -292,9 +294,7 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) ->
     hats = np.stack([_local_fit(at) for at in range(_SMOOTH)])
     inner = slice(half, len(values) - half)
     windows = np.lib.stride_tricks.sliding_window_view(values, _SMOOTH, axis=0)
-    model = np.zeros(windows.shape[:2], dtype=np.int64)
-    if kinks:
-        model = _kinks_inside(windows, hats)
+    model = _kinks_inside(windows, hats) if kinks else np.zeros(windows.shape[:2], np.int64)
     smooth = hats[model, half]
     residual = values[inner] - (windows * smooth).sum(axis=-1)
     normed = residual**2 / (1.0 - smooth[..., half]) / variances[inner]

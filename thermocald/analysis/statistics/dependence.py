@@ -156,16 +156,15 @@ _CONVERGED = 1e-7  # fraction of the slope's standard deviation
 
 
 def fit_straight_line(
-    x: Array, y: Array, sd_x: ArrayLike, sd_y: ArrayLike, extra_variance_y: float = 0.0
+    x: Array, y: Array, sd_x: ArrayLike, sd_y: ArrayLike
 ) -> tuple[float, float, float]:
     """Fit a straight line to x, y (n,) with standard deviations of both, scalars or (n,).
 
-    extra_variance_y: scatter of y about the line that neither sd explains. Returns the slope, its
-    sd (from the stated sds, not scaled), and the chi-square of the residuals with n - 2 degrees of
-    freedom.
+    Returns the slope, its sd (from the stated sds, not scaled), and the chi-square of the residuals
+    with n - 2 degrees of freedom.
     """
     var_x = np.square(np.asarray(sd_x, dtype=float))
-    var_y = np.square(np.asarray(sd_y, dtype=float)) + extra_variance_y
+    var_y = np.square(np.asarray(sd_y, dtype=float))
     # about the means: an intercept far outside the data would cost digits of the slope
     u0, v0 = x - float(np.mean(x)), y - float(np.mean(y))
     slope = float(np.dot(u0, v0) / np.dot(u0, u0))
@@ -266,9 +265,8 @@ def dependence(
         unexplained = (misfit**2 - 1) * float(
             np.mean(np.square(sds)) + (slope * temperature_sd) ** 2
         )
-        slope, sd_slope, _ = fit_straight_line(
-            temperature, values, temperature_sd, sds, unexplained
-        )
+        scatter = np.sqrt(np.square(sds) + unexplained)
+        slope, sd_slope, _ = fit_straight_line(temperature, values, temperature_sd, scatter)
     # an epoch with few targets does not show the noise of the others
     usual: Mask = sds <= _UNUSUAL * float(np.median(sds))
     those = usual if np.ptp(temperature[usual]) > 0 else np.ones(n, dtype=bool)

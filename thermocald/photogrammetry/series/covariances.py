@@ -13,6 +13,7 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
 from thermocald.photogrammetry.series.normals import (
+    as_matrices,
     cofactors,
     linearise,
     normal_matrices,
@@ -205,9 +206,9 @@ def estimate_held_affinity(
     use = system.use & system.good[:, None]
     weights = np.stack([(system.weights[..., k] * use).sum(axis=0) for k in range(3)], axis=1)
     seen = (weights[:, :2] > 0).all(axis=1)
-    noise, of_field = inverse_2x2(_full(weights[seen])), np.zeros((2, 2))
+    noise, of_field = inverse_2x2(as_matrices(weights[seen])), np.zeros((2, 2))
     if len(design.offset_prior):
-        of_field = inverse_2x2(_full(design.offset_prior[seen]))
+        of_field = inverse_2x2(as_matrices(design.offset_prior[seen]))
     N = _normals(A[seen], inverse_2x2(noise + of_field))
     moves = np.zeros((len(held), 16))
     moves[:, free] = -N[np.ix_(held, free)] @ inverse_of_determined(N[np.ix_(free, free)])
@@ -236,11 +237,6 @@ def estimate_held_affinity(
 
 def _normals(A: Array, W: Array) -> Array:
     return np.asarray(np.einsum("tki,tkl,tlj->ij", A, W, A, optimize=True))
-
-
-def _full(weights: Array) -> Array:
-    """Return weights (T, 3) xx, yy, xy as matrices (T, 2, 2)."""
-    return np.stack([weights[:, [0, 2]], weights[:, [2, 1]]], axis=1)
 
 
 def pose_equations(N: Array, b: Array, own: Index, Q: Array) -> tuple[Array, Array]:

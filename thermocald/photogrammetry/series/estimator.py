@@ -290,9 +290,9 @@ class SeriesEstimator:
     def pairs(self, estimate: Estimate) -> CorrelatedPairs:
         """Find the pairs of image coordinates with correlated errors."""
         use = estimate.system.use
-        return correlated_pairs(
-            estimate.residuals, use, self.testfield.groups, self.redundancy_share(use)
-        )
+        n, epochs = 2 * int(use.sum()), int(use.any(axis=1).sum())
+        redundant = max((n - len(self.s.per_epoch) * epochs) / max(n, 1), 0.05)
+        return correlated_pairs(estimate.residuals, use, self.testfield.groups, redundant)
 
     @property
     def _noise_freedom(self) -> Array | None:
@@ -314,12 +314,6 @@ class SeriesEstimator:
         weights = sums[:, :2] / np.maximum(use.sum(axis=0), 1)[:, None]
         numbers: Array = 1.0 - weights * np.einsum("tkp,pq,tkq->tk", A, Q, A)
         return numbers.clip(_LEAST_NUMBER)
-
-    def redundancy_share(self, use: Mask) -> float:
-        """Return the redundancy over the number of observations."""
-        n = 2 * int(use.sum())
-        own = len(self.s.per_epoch) * int(use.any(axis=1).sum())
-        return max((n - own) / max(n, 1), 0.05)
 
     def _snoop_together(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Snoop epochs that share unknowns, solving the whole series again after every round.

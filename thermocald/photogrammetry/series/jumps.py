@@ -8,7 +8,6 @@ perspective shows whether the mount moved, and by how much.
 
 from __future__ import annotations
 
-from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
 
     Step = tuple[Array, Array]
-    """A step (k,) of the pose and the weights (k,) of what is known of it."""
+    """A step (k,) of the pose and the weights (k, k) of what is known of it."""
 
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
@@ -29,7 +28,7 @@ _CERTAIN = 6.0  # standard deviations of the step by the epochs around
 _CERTAIN_CHI2 = 36.0  # χ² with 6 degrees of freedom of a step beside a bend
 _BENT = 3.0  # standard deviations of the squares that straight lines leave
 _LASTING = 0.5  # share of the change that must remain
-_BESIDE = 3  # epochs between a step and a bend, within which either looks like the other
+_BESIDE = 5  # epochs between a step and a bend, within which either looks like the other
 SIDE = 8  # epochs before and after a jump that give its step
 _MOST = 8  # jumps examined
 _ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from both
@@ -81,8 +80,10 @@ def find_jumps(
         if not certain or abs(lasting) < _LASTING * abs(change[worst, column]):
             continue
         sds = noise[worst] / np.sqrt(2.0)
-        variance = factor * sds**2
-        if not _is_straight(left, row, sds):
+        bend = _straight_bend(left, row, sds)
+        if bend is not None:  # which may be anywhere between the two epochs
+            variance = np.diag(factor * sds**2) + np.outer(bend, bend) / 12.0
+        else:
             beside = _step_beside_bend(left, row, sds)
             if beside is None or beside[0] in jumps:
                 continue
@@ -106,8 +107,8 @@ def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[
     right = np.concatenate([g[row:].sum(axis=0) for row in starts])
     for j, (step, weights) in enumerate(jumps.values(), start=1):
         own = np.arange(j * k, (j + 1) * k)
-        N[own, own] += weights
-        right[own] += weights * step
+        N[own[:, None], own] += weights
+        right[own] += weights @ step
     Q = inverse_of_determined(N)
     found = (Q @ right).reshape(-1, k)
     Q = Q.reshape(len(starts), k, len(starts), k)
@@ -163,9 +164,9 @@ def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
     return estimator @ trajectory[row + t], float(estimator @ estimator)
 
 
-def _is_straight(trajectory: Array, row: int, sds: Array) -> bool:
-    """Return whether a trajectory (E, k) is straight before and after an epoch, and the step there
-    larger than a bend between two epochs leaves.
+def _straight_bend(trajectory: Array, row: int, sds: Array) -> Array | None:
+    """Return the change of the rates (k,) at an epoch before and after which a trajectory (E, k) is
+    straight; None if it is not, or if that change between two epochs may look like the step.
 
     sds (k,): of an epoch.
     """
@@ -176,63 +177,59 @@ def _is_straight(trajectory: Array, row: int, sds: Array) -> bool:
     left, (step, rate) = y - lines @ fit, np.linalg.norm(fit[2:], axis=1)
     freedom = left.size * (1.0 - 4.0 / len(rows))
     straight = float((left**2).sum()) < freedom + _BENT * np.sqrt(2.0 * freedom)
-    return bool(straight and step > rate)
+    return fit[3] * sds if straight and step > rate else None
 
 
 def _step_beside_bend(trajectory: Array, row: int, sds: Array) -> tuple[int, Array, Array] | None:
     """Return the epoch near `row` at which a trajectory (E, k) steps, the step (k,) and its
-    variances (k,); None if a bend alone explains it.
+    covariance (k, k); None if a bend alone explains it.
 
     sds (k,): of an epoch. The course is a cubic on either side of the bend. A heater is switched
     anywhere between two epochs: if the step is between them too, one hides a part of the other.
     """
     rows = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory)))
-    t = (rows - row) / SIDE
+    t, y = (rows - row) / SIDE, trajectory[rows] / sds
     at = np.arange(-_BESIDE, _BESIDE, 0.1)
     after = np.clip(t - at[:, None] / SIDE, 0.0, None)
     cubic = np.broadcast_to(np.vander(t, 4), (len(at), len(t), 4))
     bends = np.concatenate([np.stack([after, after**2, after**3], axis=-1), cubic], axis=-1)
-    y = trajectory[rows] / sds
-
-    def squares(models: Array) -> Array:
-        """Return the sums of squares (bends,) that models (bends, epochs, ·) leave."""
-        return np.asarray(((y - models @ (np.linalg.pinv(models) @ y)) ** 2).sum(axis=(1, 2)))
-
-    found = []
-    for k in range(-_BESIDE, _BESIDE + 1):
-        step = np.broadcast_to((rows >= row + k)[:, None], (*after.shape, 1))
-        both = np.concatenate([step, bends], axis=-1)
-        left = squares(both)
-        best = int(left.argmin())
-        apart = at - (k - 0.5)
-        together = abs(apart[best]) < 0.7
-        model = both[np.abs(apart).argmin() if together else best]
-        found.append((float(left[best]), row + k, together, np.linalg.pinv(model)))
-    least, where, together, estimator = min(found, key=itemgetter(0))
-    if squares(bends).min() - least < _CERTAIN_CHI2:
+    beyond = np.eye(len(t)) - bends @ np.linalg.pinv(bends)
+    shifts = np.arange(-_BESIDE, _BESIDE + 1)
+    steps = (rows[:, None] >= row + shifts).astype(float)
+    left, free = beyond @ y, beyond @ steps
+    least = (left**2).sum(axis=(1, 2))
+    gain = ((np.swapaxes(free, 1, 2) @ left) ** 2).sum(axis=2)
+    gain /= np.maximum((free**2).sum(axis=1), 1e-9)  # (bends, steps)
+    bend, k = np.unravel_index(int((least[:, None] - gain).argmin()), gain.shape)
+    if least.min() - least[bend] + gain[bend, k] < _CERTAIN_CHI2:
         return None
+    apart = at - (shifts[k] - 0.5)
+    together = abs(apart[bend]) < 0.7
+    model = np.column_stack([steps[:, k], bends[np.abs(apart).argmin() if together else bend]])
+    estimator = np.linalg.pinv(model)
     step, rate = (estimator @ trajectory[rows])[:2]
-    variance = estimator[0] @ estimator[0] * sds**2 + together * (rate / SIDE) ** 2 / 12.0
-    return where, step, variance
+    variance = np.diag(estimator[0] @ estimator[0] * sds**2)
+    variance += together * np.outer(rate, rate) / (12.0 * SIDE**2)
+    return row + int(shifts[k]), step, variance
 
 
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:
     """Return what is known of a jump of the pose; None if the camera jumped.
 
-    step, variance (k,): of the trajectory. If the perspective excludes neither that the mount
-    jumped nor that the camera did, it alone shows how far.
+    step (k,), variance (k, k): of the trajectory. If the perspective excludes neither that the
+    mount jumped nor that the camera did, it alone shows how far.
     """
-    ((moved, V),) = estimate_steps(M, g, {row: (step, np.zeros_like(step))})
+    ((moved, V),) = estimate_steps(M, g, {row: (step, np.zeros_like(variance))})
     if _chi2(moved, V) > _EXCLUDED:
-        return step, 1.0 / variance
-    if _chi2(step - moved, V + np.diag(variance)) > _EXCLUDED:
+        return step, np.asarray(np.linalg.inv(variance), dtype=np.float64)
+    if _chi2(step - moved, V + variance) > _EXCLUDED:
         return None
     return np.zeros_like(step), _loose(step)
 
 
 def _loose(step: Array) -> Array:
-    """Return the weights (k,) of a step that is hardly larger than this change of the image."""
-    return np.full_like(step, 1.0 / max(_LOOSE * float(step @ step), 1e-12))
+    """Return the weights (k, k) of a step that is hardly larger than this change of the image."""
+    return np.eye(len(step)) / max(_LOOSE * float(step @ step), 1e-12)
 
 
 def _chi2(difference: Array, covariance: Array) -> float:

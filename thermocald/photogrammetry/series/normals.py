@@ -149,6 +149,11 @@ def inverses_of(xx: Array, yy: Array, xy: Array) -> Array:
     return np.asarray(np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None])
 
 
+def as_matrices(elements: Array) -> Array:
+    """Return matrices (n, 2, 2) from their elements (n, 3) xx, yy, xy."""
+    return np.stack([elements[:, [0, 2]], elements[:, [2, 1]]], axis=1)
+
+
 def _of_planes(points: Array, weights: Array) -> ObservationGrid:
     """Unpickle a grid: points (2, E, T), weights (3, E, T)."""
     return ObservationGrid(np.moveaxis(points, 0, -1), np.moveaxis(weights, 0, -1))

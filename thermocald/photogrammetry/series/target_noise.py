@@ -12,6 +12,7 @@ the covariance of least squares under correlated noise, Q (Aᵀ P C P A) Q, as K
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,6 +43,7 @@ _NOISIEST = 9.0  # times the series' variance of unit weight: three times its no
 _STEP_GAIN = 20.0  # χ² that a step must explain beyond a line, over the root of the coordinates
 _LEAST_STEP_PX = 0.02
 _SIDE, _ABRUPT = 4, 0.8  # epochs on both sides of a step, between which this share must happen
+_KINKED = 5.0  # ratio of the squares that a cubic leaves without and with a kink
 _CLIP = 60.0  # times the median square, beyond which a square is a jump
 
 
@@ -243,13 +245,41 @@ def neighbours_variance(unit: Array, known: Mask, least: float = 1.0) -> Array:
     return np.clip(middle, least, _NOISIEST)[at]
 
 
+@cache
+def _local_fit(kink: int) -> Array:
+    """Return the projector (15, 15) on a cubic over 15 epochs, with a kink before one of them.
+
+    kink: 0 for none. The epochs from the kink on have a parabola of their own, so that it may be
+    anywhere between two epochs.
+    """
+    t = np.arange(_SMOOTH) - _SMOOTH // 2
+    basis = np.vander(t, 4)
+    if kink:
+        after = np.arange(_SMOOTH) >= kink
+        basis = np.column_stack([basis, np.vander(t, 3) * after[:, None]])
+    return np.asarray(basis @ np.linalg.pinv(basis.astype(float)))
+
+
+def _kinks_inside(windows: Array, hats: Array) -> Index:
+    """Return for windows (n, k, 15) before which of their epochs there is a kink, 0 for none.
+
+    hats (15, 15, 15): from `_local_fit`.
+    """
+    half = _SMOOTH // 2
+    without, within = (((windows - windows @ hats[at]) ** 2).sum(axis=-1) for at in (0, half))
+    gain = np.pad(without / np.maximum(within, 1e-300), ((half - 1, half), (0, 0)))
+    around = np.lib.stride_tricks.sliding_window_view(gain, _SMOOTH - 1, axis=0)
+    return np.where(around.max(axis=-1) > _KINKED, 1 + around.argmax(axis=-1), 0)
+
+
 def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) -> Array:
     """Estimate the excess variance (k,) of epochs about a smooth trajectory; 0 if not significant.
 
     values, variances (E, k): of consecutive epochs. The trajectory is a local cubic over 15 epochs,
     whose residuals have a thousandth of a drift with a time constant of 30 epochs; kinks: whether
-    it may have kinks beyond the noise (a lamp switched), so that a median is needed; drift: whether
-    the camera may drift, else the trajectory is constant. The test is at 5 %.
+    it may have kinks beyond the noise (a heater switched), which the cubic then has too, and a
+    median is needed; drift: whether the camera may drift, else the trajectory is constant. The test
+    is at 5 %.
     """
     half = _SMOOTH // 2
     if len(values) < 2 * _SMOOTH:
@@ -261,14 +291,14 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) ->
         # Each epoch's own variance is subtracted, so that a few large ones do not raise the excess.
         wide = (values - values.mean(axis=0)) ** 2 - variances
         return np.where(significant, np.maximum(wide.mean(axis=0), 0.0), 0.0)
-    x = np.arange(-half, half + 1) / half
-    smooth = np.linalg.pinv(np.vander(x, 4))[-1]  # weights of the cubic's value in the middle
+    hats = np.stack([_local_fit(at) for at in range(_SMOOTH)])
     inner = slice(half, len(values) - half)
     windows = np.lib.stride_tricks.sliding_window_view(values, _SMOOTH, axis=0)
-    residual = values[inner] - windows @ smooth
-    left = 1.0 - smooth[half]
-    normed = residual**2 / left / variances[inner]
-    n = len(normed)
+    model = _kinks_inside(windows, hats) if kinks else np.zeros(windows.shape[:2], np.int64)
+    smooth = hats[model, half]
+    residual = values[inner] - (windows * smooth).sum(axis=-1)
+    normed = residual**2 / (1.0 - smooth[..., half]) / variances[inner]
+    n, left = len(normed), 1.0 - hats[0, half, half]
     if kinks:
         ratio, worth = np.median(normed, axis=0) / _MEDIAN_CHI2_1, MEDIAN_WORTH * left
     else:

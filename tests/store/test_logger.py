@@ -10,7 +10,8 @@ import pytest
 
 from thermocald.errors import DataError, UsageError
 from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment, time_zone
-from thermocald.store.logger.dialect import LogOptions, log_options, stated_unit
+from thermocald.store.logger.dialect import stated_unit
+from thermocald.store.logger.options import LogOptions, log_options
 from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import interpolate_readings

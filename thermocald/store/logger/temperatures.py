@@ -34,16 +34,18 @@ from thermocald.store.logger.dialect import (
     TIME_NAME,
     UNIT_BEHIND,
     LoggerFile,
+    open_log,
+    stated_unit,
+    to_celsius,
+    without_unit,
+)
+from thermocald.store.logger.options import (
     LogOptions,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
-    open_log,
     quoted,
     require_columns,
-    stated_unit,
-    to_celsius,
-    without_unit,
 )
 from thermocald.store.recording.reader import TemperatureLog as TemperatureLog
 from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts, time_fault
@@ -106,18 +108,8 @@ def read_log(
             f"{-steps[row - 1]:.0f} s ({table.where(row)}): was the clock set, or are hours of a "
             "12-hour clock without AM and PM? The rows are put in the order of their times"
         )
-    require_columns(table.file, tuple(options.names), "--name")
-    channels = {}
-    for name in names:
-        values, unit_note = _to_celsius_column(table, name, options)
-        given = name if name in options.wanted else None
-        channel = options.names.get(name) or given or _channel_name(name)
-        while channel in channels:  # `T (1)` and `T [1]` are two columns
-            channel += "_"
-        channels[channel] = values
-        notes += unit_note
-    if table.labels:
-        channels = _split_by_label(table, next(iter(channels.values())), options)
+    channels, found = _read_channels(table, options)
+    notes += found
     if _CHANGES in time_names:
         labels = np.array(table.labels or [""] * len(times))
         times, channels, held = _hold_readings(times, channels, labels)
@@ -137,6 +129,24 @@ def read_log(
         )
         notes.append(f"doubtful: {text}{without}" if rough else f"log: {text}")
     return TemperatureLog(times, channels, tuple(notes))
+
+
+def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array], list[str]]:
+    """Return the channels {name: (n,) °C} of a table, and notes on their units and readings."""
+    require_columns(table.file, tuple(options.names), "--name")
+    channels: dict[str, Array] = {}
+    notes: list[str] = []
+    for name in table.values:
+        values, found = _to_celsius_column(table, name, options)
+        given = name if name in options.wanted else None
+        channel = options.names.get(name) or given or _channel_name(name)
+        while channel in channels:  # `T (1)` and `T [1]` are two columns
+            channel += "_"
+        channels[channel] = values
+        notes += found
+    if table.labels:
+        channels = _split_by_label(table, next(iter(channels.values())), options)
+    return channels, notes
 
 
 def _hold_readings(

@@ -188,7 +188,7 @@ def test_the_reference_keeps_its_place_when_it_is_not_read():
     assert np.isnan(row["temperature"])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(name=strategies.text(max_size=70))
 def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
     """It is refused with one line, or read back unchanged from store, page and recording."""
@@ -235,7 +235,7 @@ def test_series_of_one_name_are_told_apart(names, sources, told):
 
 @pytest.mark.parametrize(("path", "says"), [
     ("", "a path is empty"), ("nowhere/M1", "nowhere/M1: does not exist"),
-    ("x" * 5000, "x: cannot be read: File name too long"),
+    ("x" * 5000, "^x{200}…x{199}: cannot be read: File name too long"),
 ])  # fmt: skip
 def test_a_path_that_leads_nowhere_is_one_error(path, says):
     for read in (tc.open, tc.open_all):

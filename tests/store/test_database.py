@@ -119,7 +119,6 @@ def test_events_stand_with_their_epoch(filled, make_epoch):
     gone = Event(1.6e9 + 300, "device_gone", "lens thermometer unplugged")
     store.add_event(gone)
     assert store.events() == [knock, gone]
-    assert store.events(since_utc=1.6e9 + 250) == [gone]
 
 
 @pytest.mark.parametrize("name", ["c", "epoch", "status", "sd_x0"])
@@ -252,6 +251,7 @@ def test_empty_file(tmp_path):
 def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
     store, series = filled
     wal = store_path.with_name(f"{store_path.name}-wal")
+    store.append(series, make_epoch(21))
     assert wal.stat().st_size > 0
     assert store.checkpoint()
     assert wal.stat().st_size == 0
@@ -259,11 +259,11 @@ def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
         epochs = reader.epochs(series)
         next(epochs)  # a slow reader of epochs blocks no writer
         store._db.execute("PRAGMA busy_timeout = 50")
-        store.append(series, make_epoch(21))
+        store.append(series, make_epoch(22))
         assert store.checkpoint()
         reader._db.execute("BEGIN")
         reader.last_epoch(series)  # in the middle of a transaction
-        store.append(series, make_epoch(22))
+        store.append(series, make_epoch(23))
         assert not store.checkpoint()
         reader._db.execute("COMMIT")
     assert store.checkpoint()

@@ -114,6 +114,7 @@ def test_without_room_for_the_copy_nothing_is_changed(version_1, version_2, monk
     assert version(version_1) == 1
 
 
+@pytest.mark.slow
 def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, monkeypatch):  # noqa: F811
     place = address(server)
     with monkeypatch.context() as broken:

@@ -71,7 +71,7 @@ def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> l
     return []
 
 
-KINDS = ["alone", "hard link", "second daemon", "readers"]  # four times 38 kills
+KINDS, _KILLS = ["alone", "hard link", "second daemon", "readers"], 38
 
 
 def kill_one(forker: Forker, store: Path, start, rng) -> int:
@@ -109,16 +109,15 @@ def kill_one(forker: Forker, store: Path, start, rng) -> int:
     return int(reported()[-1])
 
 
-@pytest.mark.parametrize(
-    ("kind", "times"),
-    [("alone", 3), *(pytest.param(kind, 38, marks=pytest.mark.slow) for kind in KINDS)],
-)
-def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind, times):
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind):
+    """A quick one of the whole daemon is in daemon/test_faults."""
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(len(kind))
     reported, before = 0, 0
-    for k in range(times):
+    for k in range(_KILLS):
         said = kill_one(
             forker, store_path, lambda k=k: beside(forker, kind, store_path, recording, k), rng
         )
@@ -140,7 +139,7 @@ def test_what_was_reported_is_kept(forker, store_path, head, field, recording, k
             assert len(store.all_series()) <= 2
             values = store.series_columns(series, ["c"])["c"].tolist()
             assert values == [float(number) for number in range(1, before + 1)]
-    assert reported > times
+    assert reported > _KILLS
 
 
 @pytest.fixture

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.options import LogOptions
+    from thermocald.store.recording.reader import TemperatureLog
 
 
 SOURCES = ("exif", "name", "file")
@@ -297,18 +298,8 @@ def read_series(
     """
     placed, times, notes = _sort_photographs(photographs, clock)
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
-    _require_overlap(times, logged.times)
-    # the row of the log nearest to each photograph, if it is near enough
-    right = np.clip(np.searchsorted(logged.times, times), 1, len(logged.times) - 1)
-    left = right - 1
-    row = np.where(times - logged.times[left] <= logged.times[right] - times, left, right)
-    near = np.abs(logged.times[row] - times) <= LARGEST_GAP * logged.step
-    channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
-    columns = EpochColumns(
-        np.arange(1, len(times) + 1), times, np.where(near, logged.times[row], np.nan), channels,
-        tuple(str(p.path.absolute()) for p in placed), {}, logged,
-    )  # fmt: skip
-    reference = next(iter(channels))
+    columns = _pair(placed, times, logged)
+    reference = next(iter(columns.temperatures))
     at_frame = columns.at_frame(reference)
     known = np.isfinite(at_frame)
     if not known.any():
@@ -330,7 +321,7 @@ def read_series(
     for i in sorted({0, len(times) // 2, len(times) - 1}):
         reading = f"{at_frame[i]:.3f} °C" if known[i] else "no temperature"
         notes.append(f"  {placed[i].path.name}  {iso(times[i])}  {reading}")
-    thermometers = dict.fromkeys(channels, Channel())
+    thermometers = dict.fromkeys(columns.temperatures, Channel())
     series = file_name(series, "series", UsageError)
     head = Head(f"{spec.name}-{series}", series, max(interval, 0.001), spec, thermometers)
     none = np.empty((0, 3))
@@ -386,16 +377,27 @@ def _sort_photographs(
     return placed, times, notes
 
 
-def _require_overlap(frames: Array, log: Array) -> None:
-    if frames[0] <= log[-1] and frames[-1] >= log[0]:
-        return
-    gap = log[0] - frames[-1] if frames[-1] < log[0] else frames[0] - log[-1]
-    raise DataError(
-        f"photographs ({iso(frames[0])} to {iso(frames[-1])}) and log ({iso(log[0])} to "
-        f"{iso(log[-1])}) are {gap / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
-        "--log-timezone), or a clock (--camera-clock, --log-clock)"
-        + (", or are years written with two digits?" if gap > 3e7 else "?")
-    )
+def _pair(placed: Sequence[Photograph], times: Array, logged: TemperatureLog) -> EpochColumns:
+    """Return epochs of photographs with times (E,) s, each with the log's reading nearest in time.
+
+    Raises DataError if photographs and log do not overlap in time.
+    """
+    log = logged.times
+    if (gap := max(times[0] - log[-1], log[0] - times[-1])) > 0:
+        raise DataError(
+            f"photographs ({iso(times[0])} to {iso(times[-1])}) and log ({iso(log[0])} to "
+            f"{iso(log[-1])}) are {gap / 3600:.1f} h apart: is a time zone wrong "
+            "(--camera-timezone, --log-timezone), or a clock (--camera-clock, --log-clock)"
+            + (", or are years written with two digits?" if gap > 3e7 else "?")
+        )
+    right = np.clip(np.searchsorted(log, times), 1, len(log) - 1)
+    row = np.where(times - log[right - 1] <= log[right] - times, right - 1, right)
+    near = np.abs(log[row] - times) <= LARGEST_GAP * logged.step
+    channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
+    return EpochColumns(
+        np.arange(1, len(times) + 1), times, np.where(near, log[row], np.nan), channels,
+        tuple(str(p.path.absolute()) for p in placed), {}, logged,
+    )  # fmt: skip
 
 
 def _camera_of(

@@ -12,6 +12,7 @@ import subprocess
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from tests.daemon.conftest import make_recording
 from tests.daemon.forking import Forked, Forker
 from tests.store.small import write_recording
 from thermocald.errors import RecordingError, StoreError, StoreFullError
+from thermocald.store.database import file
 from thermocald.store.database.store import Store
 
 _TAKEOVER_S = 0.2  # for a second daemon after the first was killed, as it would write on for ever
@@ -165,6 +167,20 @@ def test_a_full_disk(store, series, make_epoch, make_result, small_disk):
     with pytest.raises(StoreError, match="disk"):
         append(last + 1)
     assert store.last_epoch(series) == last
+
+
+def test_the_wal_file_takes_a_quarter_of_a_small_disk(
+    store_path, head, field, make_epoch, make_result, monkeypatch
+):
+    """It filled a disk of 4 MB with 115 epochs, of which 800 find room."""
+    monkeypatch.setattr(file.shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    wal, sizes = file.helper(store_path, "wal"), []
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for number in range(1, 50):
+            store.append(series, make_epoch(number), make_result(number))
+            sizes.append(wal.stat().st_size)
+    assert max(sizes) < 350_000
 
 
 def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):

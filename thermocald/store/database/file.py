@@ -258,9 +258,10 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
                 connection.execute("PRAGMA journal_mode = WAL")  # a backup is not in WAL mode
                 # with FULL, what is committed survives a power cut; with NORMAL, a killed process
                 connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
-                limit = _WAL_LIMIT_BYTES[durable]
+                free = shutil.disk_usage(helper(path, "wal").parent).free
+                limit = min(_WAL_LIMIT_BYTES[durable], free // 4)
                 connection.execute(f"PRAGMA journal_size_limit = {limit}")
-                connection.execute(f"PRAGMA wal_autocheckpoint = {limit // _PAGE_SIZE}")
+                connection.execute(f"PRAGMA wal_autocheckpoint = {limit // _PAGE_SIZE + 1}")
             else:
                 connection.execute(f"PRAGMA mmap_size = {_MMAP_BYTES}")
             connection.execute("PRAGMA foreign_keys = ON")

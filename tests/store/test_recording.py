@@ -127,11 +127,8 @@ def test_frames_are_kept_and_found(tmp_path, field, head):
         writer.append(Epoch(3, 1.6e9 + 20, np.nan))
     recording = read_recording(tmp_path / "r")
     assert not recording.has_observations
-    assert [e.frame and e.frame.name for e in recording.epochs] == [
-        "000001.png",
-        "000002.jpg",
-        None,
-    ]
+    names = [e.frame and e.frame.name for e in recording.epochs]
+    assert names == ["000001.png", "000002.jpg", None]
     assert recording.epochs[1].frame.read_bytes() == b"\xff\xd8 jpeg"
     assert recording.epochs[2].note == "neither frame nor observations"
 
@@ -186,10 +183,8 @@ def test_unknown_keys_are_what_a_store_would_keep(recording_path):
     """A replay is resumed if the store's head equals the recording's."""
     path = recording_path / "recording.yaml"
     path.write_text(path.read_text() + "date: 2020-09-13\nwhere: {1: a, lamps: [60, null]}\n")
-    assert read_recording(recording_path).head.extra == {
-        "date": "2020-09-13",
-        "where": {"1": "a", "lamps": [60, None]},
-    }
+    kept = {"date": "2020-09-13", "where": {"1": "a", "lamps": [60, None]}}
+    assert read_recording(recording_path).head.extra == kept
 
 
 def test_files_as_windows_writes_them(recording_path):

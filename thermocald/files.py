@@ -28,7 +28,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import yaml
 
 from thermocald.errors import ConfigurationError, OutputError, ThermocaldError
-from thermocald.numbers import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
@@ -74,7 +73,8 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
 
 def shown(path: Path | str) -> str:
     """Return a path for a message, which an absurdly long one must not fill."""
-    return shortened(str(path), _LONGEST_SHOWN)
+    text, half = str(path), _LONGEST_SHOWN // 2
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:half]}…{text[-half:]}"
 
 
 def check_output(path: Path, kind: Output = "file") -> None:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from thermocald.arrays import Array
-    from thermocald.store.logger.options import LogOptions
 
 
 UNITS = ("degC", "K", "degF")
@@ -156,14 +155,16 @@ class LoggerFile:
                     yield line, _fit_width(row, width)
 
 
-def open_log(path: Path, options: LogOptions) -> LoggerFile:
-    """Detect the form of a logger's table; encoding, separator, decimal mark only if not given.
+def open_log(
+    path: Path, encoding: str | None, separator: str | None, decimal: str | None
+) -> LoggerFile:
+    """Detect the form of a logger's table: encoding, separator, decimal mark only if not given.
 
     Raises DataError if the file cannot be read or holds no table with times.
     """
     detected = _detect_encoding(path)
-    encoding = options.encoding or detected
-    is_assumed = not options.encoding and not detected.startswith("utf")
+    is_assumed = not encoding and not detected.startswith("utf")
+    encoding = encoding or detected
     try:
         with path.open(encoding=encoding, errors="replace", newline="") as file:
             begin = list(islice(file, _SAMPLE))
@@ -174,9 +175,7 @@ def open_log(path: Path, options: LogOptions) -> LoggerFile:
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
     try:
-        mark = options.separator or _detect_separator(
-            path, end if len(end) == _SAMPLE else begin + end
-        )
+        mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)
     except DataError:
         if not ours:
             raise
@@ -203,7 +202,7 @@ def open_log(path: Path, options: LogOptions) -> LoggerFile:
             head, first = [row], i + 1
     names = _column_names(head, width)
     rows = tuple(tuple(_fit_width(row, len(names))) for _, row in start[first:] + last)
-    found = options.decimal or _detect_decimal(rows, mark)
+    found = decimal or _detect_decimal(rows, mark)
     ends = [";".join(row[-2:]) for row in rows if row[-1]]
     if mark == "," and head and len(head[-1]) < width and ends and all(map(_CUT.fullmatch, ends)):
         raise DataError(

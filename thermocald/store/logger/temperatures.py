@@ -86,7 +86,7 @@ def read_log(
     Raises DataError or UsageError if something cannot be determined, naming the option to set.
     """
     options = options or LogOptions()
-    file = open_log(path, options)
+    file = open_log(path, options.encoding, options.separator, options.decimal)
     time_names = find_time_columns(file, options)
     lines = [zone[1] for line in file.above if (zone := _ZONE_LINE.search(line))]
     clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))

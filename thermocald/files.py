@@ -354,10 +354,8 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
         told = cause.problem or cause.context or ""
         wrong = next((ours for theirs, ours in _FAULTS.items() if theirs in told), told)
         raise error(f"{path}{where}: {wrong}") from cause
-    except yaml.YAMLError as cause:
-        raise error(f"{path}: is no YAML: {' '.join(str(cause).split())}") from cause
-    except _CONSTRUCTION as cause:
-        raise error(f"{path}: holds a value that is no YAML: {cause}") from cause
+    except (yaml.YAMLError, *_CONSTRUCTION) as cause:
+        raise error(f"{path}: holds what is no YAML: {' '.join(str(cause).split())}") from cause
     if document is None:
         raise error(f"{path}: is empty")
     if not isinstance(document, dict):

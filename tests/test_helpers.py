@@ -60,7 +60,9 @@ BAD = [
     ("a: 010\n", "line 1, column 4: 010 is octal in YAML"),
     ("a: [1\n", "line 2"),
     ("1: x\n", "key 1 must be text"),
-    ("a: !!python/object:os.system x\n", "could not determine a constructor"),
+    ("a: !!python/object:os.system x\n", "line 1, column 4: holds a tag, `!…`"),
+    ("a:\n\tb: 1\n", "line 2, column 1: a line or a value begins with a tab"),
+    ("a: b: c\n", "line 1, column 5: `: ` must not stand here"),
     ("a: !!bool x\n", "no YAML"),
     ("a: 2020-99-99\n", "no YAML"),
     ("[" * 5000, "file.yaml"),
@@ -202,30 +204,19 @@ def scaled(factor, item):
     return factor * item
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_results_come_in_order_and_an_error_comes_through(jobs):
-    assert list(in_order(scaled, 3, [], jobs)) == []
-    results = in_order(scaled, 3, [*range(12), "bad", 2], jobs)
-    assert [next(results) for _ in range(12)] == [3 * k for k in range(12)]
-    with pytest.raises(ValueError, match="this one is bad"):
-        next(results)
-
-
-def test_items_are_taken_as_results_are_asked_for():
-    """Items handed out are in memory, which a year of blocks must not be."""
-    taken = []
-
-    def items():
-        for k in range(100):
-            taken.append(k)
-            yield k
-
-    results = in_order(scaled, 1, items(), 2)
+@pytest.mark.parametrize(
+    ("jobs", "last", "error", "words"),
+    [(1, "bad", ValueError, "this one is bad"), (2, "bad", ValueError, "this one is bad"),
+     (2, "dies", DataError, "give fewer --jobs")],
+)  # fmt: skip
+def test_results_come_in_order_and_an_error_comes_through(jobs, last, error, words):
+    """Items are taken as results are asked for: a year of blocks must not be in memory."""
+    taken: list = []
+    items = (taken.append(item) or item for item in [*range(12), last, *range(90)])
+    results = in_order(scaled, 3, items, jobs)
     assert next(results) == 0
     assert len(taken) <= 8
-    results.close()
-
-
-def test_a_process_that_dies_is_an_error_in_words():
-    with pytest.raises(DataError, match="give fewer --jobs"):
-        list(in_order(scaled, 1, [1, "dies", 2, 3], 2))
+    assert [next(results) for _ in range(8)] == [3 * k for k in range(1, 9)]
+    with pytest.raises(error, match=words):
+        list(results)
+    assert list(in_order(scaled, 3, [], jobs)) == []

@@ -24,7 +24,7 @@ from thermocald.errors import ConfigurationError, ThermocaldError
 from thermocald.files import dump_yaml
 from thermocald.hal import load_driver
 from thermocald.store.logger.clock import DeviceClock, time_zone
-from thermocald.store.logger.dialect import LogOptions
+from thermocald.store.logger.options import LogOptions
 from thermocald.store.logger.temperatures import read_log
 
 FEW = {"max_examples": 25, "deadline": None, "derandomize": True,

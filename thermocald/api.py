@@ -73,7 +73,7 @@ def import_photographs(
     6
     """
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.dialect import log_options
+    from thermocald.store.logger.options import log_options
     from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
 
     recording, _ = read_series(

@@ -54,7 +54,7 @@ _RECORDED = {
     "readings.csv",
 }
 
-_LONGEST_NAME = 60
+_LONGEST_NAME, _LONGEST_SHOWN = 60, 400
 
 Output = Literal["file", "folder", "recording", "either"]
 """What a command writes: "recording" is a new folder, "either" a folder if it exists, else a file.
@@ -66,7 +66,15 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
     why = cause.strerror or str(cause)
     advice = _ADVICE.get(cause.errno or 0, "")
     status = 3 if cause.errno in _DISK else 2
-    return OutputError(f"{path}: cannot be written: {why}{advice}", status)
+    # no file of too long a name can be read either
+    what = "used" if cause.errno == errno.ENAMETOOLONG else "written"
+    return OutputError(f"{shown(path)}: cannot be {what}: {why}{advice}", status)
+
+
+def shown(path: Path | str) -> str:
+    """Return a path for a message, which an absurdly long one must not fill."""
+    text, half = str(path), _LONGEST_SHOWN // 2
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:half]}…{text[-half:]}"
 
 
 def check_output(path: Path, kind: Output = "file") -> None:
@@ -274,6 +282,18 @@ _MOST_VALUES = 100_000
 _MOST_BYTES = 20_000_000
 _DEEPEST = 60
 
+# PyYAML's words → ours
+_FAULTS = {
+    "cannot start any token": (
+        "a line or a value begins with a tab or a sign of YAML's: indent with spaces, quote texts"
+    ),
+    "determine a constructor": "holds a tag, `!…`: write the value without it, or quote it",
+    "mapping values": "`: ` must not stand here: indent lines alike, quote a text that holds it",
+    "did not find expected": "something before is not closed or not indented like its neighbours",
+    "expected ':'": "a line before is no `key: value`",
+    "unexpected end": "a quote before is not closed",
+    "undefined alias": "`*…` refers to nothing: quote a text that begins with *",
+}
 # raised by PyYAML's constructors for hostile scalars (`!!bool x`, `!!int ""`, 2020-99-99)
 _CONSTRUCTION = (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError)
 
@@ -323,7 +343,7 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as cause:
         what = "is not UTF-8 text" if isinstance(cause, UnicodeDecodeError) else cause
-        raise error(f"{path}: cannot be read: {getattr(cause, 'strerror', what)}") from cause
+        raise error(f"{shown(path)}: cannot be read: {getattr(cause, 'strerror', what)}") from cause
     try:
         if _is_too_deep(text):
             raise error(f"{path}: is nested deeper than {_DEEPEST} levels")
@@ -331,11 +351,11 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     except yaml.MarkedYAMLError as cause:
         mark = cause.problem_mark
         where = "" if mark is None else f", line {mark.line + 1}, column {mark.column + 1}"
-        raise error(f"{path}{where}: {cause.problem or cause.context}") from cause
-    except yaml.YAMLError as cause:
-        raise error(f"{path}: is no YAML: {' '.join(str(cause).split())}") from cause
-    except _CONSTRUCTION as cause:
-        raise error(f"{path}: holds a value that is no YAML: {cause}") from cause
+        told = cause.problem or cause.context or ""
+        wrong = next((ours for theirs, ours in _FAULTS.items() if theirs in told), told)
+        raise error(f"{path}{where}: {wrong}") from cause
+    except (yaml.YAMLError, *_CONSTRUCTION) as cause:
+        raise error(f"{path}: holds what is no YAML: {' '.join(str(cause).split())}") from cause
     if document is None:
         raise error(f"{path}: is empty")
     if not isinstance(document, dict):

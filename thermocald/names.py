@@ -137,7 +137,8 @@ class FileFolder:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._root = os.path.realpath(folder)
-        self._inside: dict[str, bool] = {}  # by sub-folder, of which a year of frames has few
+        # by sub-folder, of which a year of frames has few
+        self._is_inside = functools.cache(self._leads_inside)
 
     def find(self, relative: str | Path) -> Path | None:
         """Return the path of a regular file in the folder, None if it is absent or leads out."""
@@ -150,15 +151,12 @@ class FileFolder:
         except OSError:
             return None
         if stat.S_ISLNK(mode):
-            return Path(path) if os.path.isfile(path) and self._is_inside(path) else None
+            return Path(path) if os.path.isfile(path) and self._leads_inside(path) else None
         if not stat.S_ISREG(mode):
             return None
-        parent = os.path.dirname(path)
-        if parent not in self._inside:
-            self._inside[parent] = self._is_inside(parent)
-        return Path(path) if self._inside[parent] else None
+        return Path(path) if self._is_inside(os.path.dirname(path)) else None
 
-    def _is_inside(self, path: str) -> bool:
+    def _leads_inside(self, path: str) -> bool:
         real = os.path.realpath(path)
         return real == self._root or real.startswith(self._root.rstrip("/") + "/")
 

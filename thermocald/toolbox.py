@@ -28,7 +28,7 @@ from thermocald.series import (
     source_of,
 )
 from thermocald.store.logger.clock import device_clock
-from thermocald.store.logger.dialect import LogOptions, log_options
+from thermocald.store.logger.options import LogOptions, log_options
 
 if TYPE_CHECKING:
     from thermocald.analysis.camera.camera import CameraDifference

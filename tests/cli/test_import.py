@@ -22,7 +22,7 @@ from tests.pictures import (
 )
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.logger.dialect import log_options
+from thermocald.store.logger.options import log_options
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.testfield_file import write_testfield

@@ -20,6 +20,7 @@ from tests.store.conftest import (  # for `filled`
     make_epoch,
     make_result,
     series,
+    small_store,
     store,
     store_path,
 )
@@ -27,7 +28,10 @@ from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.server.connection import ServerAddress
 
-__all__ = ["field", "filled", "head", "make_epoch", "make_result", "series", "store", "store_path"]
+__all__ = [
+    "field", "filled", "head", "make_epoch", "make_result", "series", "small_store", "store",
+    "store_path",
+]  # fmt: skip
 
 
 def address(server: Server, query: str = "", **given: str) -> ServerAddress:

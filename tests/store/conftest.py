@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 N_TARGETS = 12
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def field() -> TestField:
     rng = np.random.default_rng(1)
     names = [f"t{i}" for i in range(N_TARGETS)]
@@ -30,14 +30,14 @@ def field() -> TestField:
     return TestField.build(names, rng.uniform(0, 2000, (N_TARGETS, 3)), 0.02, diameters)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def head() -> Head:
     camera = CameraSpec("rpi", Sensor(3280, 2464, 0.00112), 3.04)
     channels = {"temperature": Channel(0.0625), "board_temperature": Channel()}
     return Head("small", "M1", 10.0, camera, channels)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_epoch():
     """Epoch number → epoch, whose values are functions of the number."""
 
@@ -54,14 +54,20 @@ def make_epoch():
     return make
 
 
-@pytest.fixture
-def recording_path(tmp_path: Path, field: TestField, head: Head, make_epoch) -> Path:
-    path = tmp_path / "small"
+@pytest.fixture(scope="session")
+def small_recording(tmp_path_factory, field: TestField, head: Head, make_epoch) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "small"
     write_recording(path, head, field, [make_epoch(i) for i in range(1, 6)])
     return path
 
 
 @pytest.fixture
+def recording_path(tmp_path: Path, small_recording: Path) -> Path:
+    """A recording of five epochs, to be changed."""
+    return shutil.copytree(small_recording, tmp_path / "small")
+
+
+@pytest.fixture(scope="session")
 def make_result():
     """Epoch number → result with a full covariance."""
 
@@ -93,12 +99,22 @@ def series(store: Store, field: TestField, head: Head) -> StoredSeries:
     return store.create_series(head, field, start="cold", identity={"serial": "x1"})
 
 
+@pytest.fixture(scope="session")
+def small_store(tmp_path_factory, field: TestField, head: Head, make_epoch, make_result) -> Path:
+    path = tmp_path_factory.mktemp("store") / "small.db"
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(head, field, start="cold", identity={"serial": "x1"})
+        for i in range(1, 21):
+            store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
+    return path
+
+
 @pytest.fixture
-def filled(store: Store, series: StoredSeries, make_epoch, make_result):
+def filled(store_path: Path, small_store: Path):
     """An open store with epochs 1 to 20 of one series."""
-    for i in range(1, 21):
-        store.append(series, make_epoch(i), make_result(i), extra={"blur": 0.5 * i})
-    return store, series
+    shutil.copy(small_store, store_path)
+    with Store.open(store_path, "append", durable=False) as opened:
+        yield opened, opened.find_series()
 
 
 @pytest.fixture

@@ -46,12 +46,12 @@ def crafted(filled):
     return store.path
 
 
-@pytest.mark.parametrize("name", ["../../x", "/etc/x", "..", ".hidden", "a/b", "a\x1b[2Jb", " "])
 @pytest.mark.parametrize("column", ["camera", "name"])
-def test_a_name_that_leads_out_is_refused_when_it_is_read(crafted, name, column):
-    craft(crafted, f"UPDATE series SET {column} = ?", name)
-    with Store.open(crafted) as store, pytest.raises(StoreError, match="part of a file's name"):
-        store.all_series()
+def test_a_name_that_leads_out_is_refused_when_it_is_read(crafted, column):
+    for name in ("../../x", "/etc/x", "..", ".hidden", "a/b", "a\x1b[2Jb", " "):
+        craft(crafted, f"UPDATE series SET {column} = ?", name)
+        with Store.open(crafted) as store, pytest.raises(StoreError, match="part of a file's name"):
+            store.all_series()
 
 
 def test_a_head_of_another_name_is_refused(crafted):
@@ -73,15 +73,15 @@ def test_a_thermometers_name_that_leads_out_is_refused(crafted, tmp_path):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-@pytest.mark.parametrize("frame", ["/etc/passwd", "../secret.jpg", "a/../../secret.jpg"])
-def test_a_frame_that_leads_out_is_refused(crafted, tmp_path, frame):
+def test_a_frame_that_leads_out_is_refused(crafted, tmp_path):
     (tmp_path / "secret.jpg").write_bytes(b"secret")
     (tmp_path / "frames").mkdir()
-    craft(crafted, "UPDATE epoch SET frame = ? WHERE number = 3", frame)
-    with Store.open(crafted) as store, pytest.raises(StoreError, match="leads out"):
-        archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
-    assert not (tmp_path / "out").exists()
-    assert not list(tmp_path.glob(".*partial"))
+    for frame in ("/etc/passwd", "../secret.jpg", "a/../../secret.jpg"):
+        craft(crafted, "UPDATE epoch SET frame = ? WHERE number = 3", frame)
+        with Store.open(crafted) as store, pytest.raises(StoreError, match="leads out"):
+            archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
+        assert not (tmp_path / "out").exists()
+        assert not list(tmp_path.glob(".*partial"))
 
 
 def test_a_link_among_the_frames_is_not_followed_out(crafted, tmp_path):

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from thermocald.errors import ThermocaldError
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.testfield_file import read_testfield
 
 FILES = ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
 QUICK = settings(
@@ -28,7 +27,6 @@ cells = st.one_of(
     st.floats().map(repr),
     st.integers().map(str),
 )
-tables = st.lists(st.lists(cells, max_size=9).map(",".join), max_size=8).map("\n".join)
 yaml_like = st.recursive(
     st.one_of(
         st.text(string.printable, max_size=15),
@@ -77,16 +75,3 @@ def test_any_yaml(recording_path, value, key):
     assert "recording.yaml" in message
     assert "\n" not in message
     path.write_text(whole)
-
-
-@QUICK
-@given(content=tables)
-def test_any_testfield(tmp_path, content):
-    path = tmp_path / "field.csv"
-    path.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + content, newline="", errors="ignore")
-    message = ""
-    try:
-        assert len(read_testfield(path)) > 0
-    except ThermocaldError as error:
-        message = str(error)
-    assert not message or "field.csv" in message

@@ -52,23 +52,25 @@ def test_written_recording_is_read_as_it_was(recording_path, field, head, make_e
         assert same(read.observations, made.observations)
 
 
-def test_head_keeps_interior_and_unknown_keys(tmp_path, field, head, make_epoch):
+def test_names_and_keys_of_any_kind_are_kept(tmp_path, head):
+    """An interior orientation, unknown keys, names with commas and quotes, markers' codes."""
     camera = replace(head.camera, interior=InteriorOrientation(3.04, 0.01, -0.02, A1=1e-3))
     extra = {"lamp": {"power": 60}, "note": "north wall"}
-    with RecordingWriter(tmp_path / "r", replace(head, camera=camera, extra=extra), field) as w:
-        w.append(make_epoch(1))
+    codes = ["DICT_APRILTAG_36h11:17:0", "DICT_APRILTAG_36h11:17:1", ""]
+    names = ["a,b", 'say "x"', "ä ö"]
+    points = np.eye(3) * 999.123456789
+    field = TestField.build(names, points, 0.1, np.nan, "marker_corner", codes)
+    seen = Observations(np.arange(3), np.ones((3, 2)), np.ones((3, 2)))
+    epoch = Epoch(1, 0.0, np.nan, observations=seen)
+    write_recording(tmp_path / "r", replace(head, camera=camera, extra=extra), field, [epoch])
     recording = read_recording(tmp_path / "r")
     assert (recording.camera, recording.head.extra) == (camera, extra)
-
-
-def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
-    whole = read_recording(recording_path).epochs
-    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
-    monkeypatch.setattr(observation_file, "_parse_once", lambda table: table)
-    monkeypatch.setattr(table, "_ROWS", 7)  # epochs span chunks
-    streamed = list(open_recording(recording_path).iter_epochs())
-    assert [e.number for e in streamed] == [e.number for e in whole]
-    assert same_epochs(streamed, whole)
+    assert recording.epochs[0].observations.targets.tolist() == [0, 1, 2]
+    write_testfield(tmp_path / "f.csv", field)
+    for read in (recording.testfield, read_testfield(tmp_path / "f.csv")):
+        assert (read.names, read.kinds, read.codes) == (field.names, field.kinds, field.codes)
+        assert np.array_equal(read.points, field.points)
+        assert np.array_equal(read.sigmas, field.sigmas)
 
 
 def test_rows_in_any_order(recording_path):
@@ -125,36 +127,10 @@ def test_frames_are_kept_and_found(tmp_path, field, head):
         writer.append(Epoch(3, 1.6e9 + 20, np.nan))
     recording = read_recording(tmp_path / "r")
     assert not recording.has_observations
-    assert [e.frame and e.frame.name for e in recording.epochs] == [
-        "000001.png",
-        "000002.jpg",
-        None,
-    ]
+    names = [e.frame and e.frame.name for e in recording.epochs]
+    assert names == ["000001.png", "000002.jpg", None]
     assert recording.epochs[1].frame.read_bytes() == b"\xff\xd8 jpeg"
     assert recording.epochs[2].note == "neither frame nor observations"
-
-
-def test_names_with_commas_and_quotes(tmp_path, head):
-    names = ["a,b", 'say "x"', "ä ö"]
-    field = TestField.build(names, np.eye(3) * 1000)
-    seen = Observations(np.arange(3), np.ones((3, 2)), np.ones((3, 2)))
-    with RecordingWriter(tmp_path / "r", head, field) as writer:
-        writer.append(Epoch(1, 0.0, np.nan, observations=seen))
-    recording = read_recording(tmp_path / "r")
-    assert list(recording.testfield.names) == names
-    assert recording.epochs[0].observations.targets.tolist() == [0, 1, 2]
-
-
-def test_testfield_keeps_kinds_and_codes(tmp_path):
-    codes = ["DICT_APRILTAG_36h11:17:0", "DICT_APRILTAG_36h11:17:1"]
-    field = TestField.build(
-        ["a", "b"], np.eye(3)[:2] * 999.123456789, 0.1, np.nan, "marker_corner", codes
-    )
-    write_testfield(tmp_path / "f.csv", field)
-    read = read_testfield(tmp_path / "f.csv")
-    assert (read.names, read.kinds, read.codes) == (field.names, field.kinds, field.codes)
-    assert np.array_equal(read.points, field.points)
-    assert np.array_equal(read.sigmas, field.sigmas)
 
 
 def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):
@@ -207,10 +183,8 @@ def test_unknown_keys_are_what_a_store_would_keep(recording_path):
     """A replay is resumed if the store's head equals the recording's."""
     path = recording_path / "recording.yaml"
     path.write_text(path.read_text() + "date: 2020-09-13\nwhere: {1: a, lamps: [60, null]}\n")
-    assert read_recording(recording_path).head.extra == {
-        "date": "2020-09-13",
-        "where": {"1": "a", "lamps": [60, None]},
-    }
+    kept = {"date": "2020-09-13", "where": {"1": "a", "lamps": [60, None]}}
+    assert read_recording(recording_path).head.extra == kept
 
 
 def test_files_as_windows_writes_them(recording_path):
@@ -236,10 +210,16 @@ def long_from_nothing(tmp_path, monkeypatch):
 
 
 def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch):
-    """The second reading does not read the text; every number equals the text's to the bit."""
-    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
-    from_text = list(open_recording(recording_path).iter_epochs())
-    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    """The second reading does not read the text, and both give what the text has."""
+    with monkeypatch.context() as without_copy:
+        without_copy.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
+        whole = read_recording(recording_path).epochs
+        without_copy.setattr(observation_file, "LONG_FROM_BYTES", 0)
+        without_copy.setattr(observation_file, "_parse_once", lambda table: table)
+        without_copy.setattr(table, "_ROWS", 7)  # epochs span chunks
+        from_text = list(open_recording(recording_path).iter_epochs())
+    assert [e.number for e in from_text] == [e.number for e in whole]
+    assert same_epochs(from_text, whole)
     first = list(open_recording(recording_path).iter_epochs())
     assert len(list(long_from_nothing.glob("*.parquet"))) == 1
     monkeypatch.setattr(observation_file, "_typed", None)

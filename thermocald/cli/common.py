@@ -109,7 +109,7 @@ def _log_options(
 ) -> Any:
     """Return the options for reading a logger's file, for every command that reads one."""
     given = locals()
-    from thermocald.store.logger.dialect import log_options
+    from thermocald.store.logger.options import log_options
 
     return log_options(**given)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import StoreError
-from thermocald.files import is_database
+from thermocald.files import is_database, shown
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.observation_file import grid_runs
 from thermocald.store.recording.reader import EpochColumns
@@ -71,11 +71,11 @@ def require_source(source: Path) -> Path:
             source.stat()
     except (FileNotFoundError, NotADirectoryError):
         raise StoreError(
-            f"{source}: does not exist; give a recording (folder), a store (file), or "
+            f"{shown(source)}: does not exist; give a recording (folder), a store (file), or "
             "postgresql://…"
         ) from None
     except OSError as cause:
-        raise StoreError(f"{source}: cannot be read: {cause.strerror}") from cause
+        raise StoreError(f"{shown(source)}: cannot be read: {cause.strerror}") from cause
     return source
 
 

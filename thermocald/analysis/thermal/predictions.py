@@ -24,7 +24,7 @@ from thermocald.physics.device import CameraDevice, read_camera_device, read_pro
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field
 from thermocald.result import Result
-from thermocald.store.logger.dialect import LogOptions
+from thermocald.store.logger.options import LogOptions
 from thermocald.store.logger.temperatures import TemperatureLog, read_log
 from thermocald.store.recording.head import read_head
 from thermocald.store.sources import is_store, open_source, require_source

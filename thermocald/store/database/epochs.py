@@ -347,7 +347,7 @@ class Examination:
     """The result of reading a whole store.
 
     damaged: phrases; epochs: number of their rows; unfinished: the last write to the -wal file was
-    cut off, see `WalTail`.
+    cut off.
     """
 
     damaged: tuple[str, ...]

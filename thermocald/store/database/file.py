@@ -70,6 +70,7 @@ _ADVICE = {
 """Advice by the beginning of SQLite's name of an error; {}: SQLite's message."""
 # The -wal file must not fill a small card; a replay need not sync so often.
 _WAL_LIMIT_BYTES = {True: 1_000_000, False: 16_000_000}  # durable or not
+_WAL_LEAST_BYTES = 100_000  # for a disk that is full when a daemon starts, and freed later
 _MMAP_BYTES = 2**31 - 1
 _ATTEMPTS = 3
 # SQLite's own locks of a file end when this process closes any descriptor of it, so a claimed file
@@ -258,7 +259,8 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
                 connection.execute("PRAGMA journal_mode = WAL")  # a backup is not in WAL mode
                 # with FULL, what is committed survives a power cut; with NORMAL, a killed process
                 connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
-                limit = _WAL_LIMIT_BYTES[durable]
+                free = shutil.disk_usage(helper(path, "wal").parent).free
+                limit = min(_WAL_LIMIT_BYTES[durable], max(free // 4, _WAL_LEAST_BYTES))
                 connection.execute(f"PRAGMA journal_size_limit = {limit}")
                 connection.execute(f"PRAGMA wal_autocheckpoint = {limit // _PAGE_SIZE}")
             else:

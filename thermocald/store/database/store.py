@@ -223,11 +223,10 @@ class Store(SeriesReader):
                 return
             after = page[-1]["id"]
 
-    def events(self, since_utc: float = 0.0) -> list[Event]:
+    def events(self) -> list[Event]:
         """Return the events, oldest first."""
         with self._reads("events") as connection:
-            condition = "WHERE utc >= ? ORDER BY id"
-            rows = columns.examined_rows(connection, "event", condition, (since_utc,))
+            rows = columns.examined_rows(connection, "event", "ORDER BY id")
             return [
                 Event(
                     row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],

@@ -189,7 +189,7 @@ _ZONES_H = {
     "PST": -8, "PDT": -7, "JST": 9, "AEST": 10, "AEDT": 11,
 }  # fmt: skip
 """Zones by their letters; without CST, which China and America have."""
-_ZONE = rf"\s*(?P<zone>{'|'.join(_ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}:?\d{{2}}|[+-]\d{{2}})?"
+_ZONE = rf"(?:,?\s*(?P<zone>{'|'.join(_ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}(?::?\d{{2}})?))?"
 _STATED_ZONE = re.compile(
     rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?::?\d{{2}})?"
     rf"|(?:(?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in _ZONES_H if len(n) > 2)})(?![^\W_]))"
@@ -203,8 +203,9 @@ _NAMED_DATE = re.compile(
     r"(?:(?P<m1>[^\W\d_]{3,9})\.?\s+(?P<d1>\d{1,2})(?:st|nd|rd|th)?,?\s+(?P<y1>\d{4})"
     r"|(?P<d2>\d{1,2})[\s.-]+(?P<m2>[^\W\d_]{3,9})[\s.,-]+(?P<y2>\d{4}|\d{2}))(?P<rest>\D.*|)"
 )
-_OF_DATE = re.compile(  # as `date` and ctime write it: Sun Jun 14 12:00:00 CEST 2026
-    r"^[^\W\d_]{2,4}\.? ([^\W\d_]{3,4})\.? +(\d{1,2}) (\d\d:\d\d:\d\d)( [A-Z]{3,4})? (\d{4})$"
+_OF_DATE = re.compile(  # of `date` and ctime: Sun Jun 14 12:00:00 CEST 2026, So 14. Jun 12:00:00 …
+    r"^[^\W\d_]{2,4}\.? +(?:([^\W\d_]{3,4})\.? +(\d{1,2})|(\d{1,2})\.? +([^\W\d_]{3,4})\.?) "
+    r"(\d\d:\d\d:\d\d(?: [AP]M)?(?: [A-Z]{3,4})?) (\d{4})$"
 )
 _MONTHS = {
     name: number
@@ -307,7 +308,7 @@ def _month_to_number(text: str) -> str:
     """Rewrite a date with the month as a word, or in Chinese, as 2026-06-14."""
     if text.isascii() and not _WORD.search(text):
         return text
-    text = _OF_DATE.sub(r"\1 \2 \5 \3\4", text.translate(_CHINESE))
+    text = _OF_DATE.sub(r"\1\4 \2\3 \6 \5", text.translate(_CHINESE))
     found = _NAMED_DATE.fullmatch(text)
     if found is None:
         return text

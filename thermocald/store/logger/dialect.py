@@ -4,10 +4,7 @@ Lines above the table (a logger's name, its serial number) are skipped; a second
 with units is joined to the names. Rows are read one by one, so that a year of them fits into
 memory. What was detected is kept for the user to see.
 
-Units of temperatures are detected in heads of columns and in readings. The columns that hold times
-and temperatures are those that options name, or guessed. The order of day and month follows from
-the dates, or from the times of the photographs. Otherwise the file is refused, and the message
-names the option that decides.
+Units of temperatures are detected in heads of columns and in readings.
 """
 
 from __future__ import annotations
@@ -17,41 +14,24 @@ import csv
 import re
 from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, time
+from dataclasses import dataclass
+from datetime import datetime, time
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
-from thermocald.names import channel_fault
-from thermocald.store.logger.clock import (
-    ORDERS,
-    DeviceClock,
-    are_serials,
-    date_orders,
-    device_clock,
-    is_date_like,
-    parse_moment,
-)
+from thermocald.store.logger.clock import is_date_like, parse_moment
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator
 
     from thermocald.arrays import Array
 
 
 UNITS = ("degC", "K", "degF")
 
-_LETTERS = {
-    "c": "degC",
-    "℃": "degC",
-    "k": "K",
-    "f": "degF",
-    "℉": "degF",
-    "华": "degF",
-    "華": "degF",
-}
+_LETTERS = {"c": "degC", "℃": "degC", "k": "K"}  # others, also 华, stand for °F
 _STATED = re.compile(
     r"(?:°|º|˚|(?<![^\W\d_])deg(?:rees?|\.)?|(?<![^\W\d_])grad)[\s_-]*(?P<degree>[CFK])(?![^\W\d_])"
     r"|(?<![^\W\d_])(?P<before>[CFK])\s?[°º˚]"
@@ -75,7 +55,7 @@ def stated_unit(text: str) -> str | None:
     found = _STATED.search(text)
     if found is None:
         return None
-    return _LETTERS[next(filter(None, found.groups()))[0].lower()]
+    return _LETTERS.get(next(filter(None, found.groups()))[0].lower(), "degF")
 
 
 def without_unit(text: str) -> str:
@@ -116,8 +96,7 @@ _ENCODINGS = (
 )  # fmt: skip
 """Encodings that are tried after those of Western Europe and China."""
 _LETTERS_ALONE = "\u03a9\u2126\u0394"  # ohm and delta, which are part of Greek words too
-_COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
-_POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
+_DECIMAL = re.compile(r"[+-]?\d+([.,])\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
@@ -176,14 +155,16 @@ class LoggerFile:
                     yield line, _fit_width(row, width)
 
 
-def open_log(path: Path, options: LogOptions) -> LoggerFile:
-    """Detect the form of a logger's table; encoding, separator, decimal mark only if not given.
+def open_log(
+    path: Path, encoding: str | None, separator: str | None, decimal: str | None
+) -> LoggerFile:
+    """Detect the form of a logger's table: encoding, separator, decimal mark only if not given.
 
     Raises DataError if the file cannot be read or holds no table with times.
     """
     detected = _detect_encoding(path)
-    encoding = options.encoding or detected
-    is_assumed = not options.encoding and not detected.startswith("utf")
+    is_assumed = not encoding and not detected.startswith("utf")
+    encoding = encoding or detected
     try:
         with path.open(encoding=encoding, errors="replace", newline="") as file:
             begin = list(islice(file, _SAMPLE))
@@ -194,9 +175,7 @@ def open_log(path: Path, options: LogOptions) -> LoggerFile:
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
     try:
-        mark = options.separator or _detect_separator(
-            path, end if len(end) == _SAMPLE else begin + end
-        )
+        mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)
     except DataError:
         if not ours:
             raise
@@ -223,7 +202,7 @@ def open_log(path: Path, options: LogOptions) -> LoggerFile:
             head, first = [row], i + 1
     names = _column_names(head, width)
     rows = tuple(tuple(_fit_width(row, len(names))) for _, row in start[first:] + last)
-    found = options.decimal or _detect_decimal(rows, mark)
+    found = decimal or _detect_decimal(rows, mark)
     ends = [";".join(row[-2:]) for row in rows if row[-1]]
     if mark == "," and head and len(head[-1]) < width and ends and all(map(_CUT.fullmatch, ends)):
         raise DataError(
@@ -312,7 +291,7 @@ def _detect_encoding(path: Path) -> str:
 
 def _count_words(text: str) -> int:
     """Return how many words for times, temperatures and others a text has in letters beyond A-Z."""
-    patterns = (TIME_NAME, _TEMPERATURE_NAME, OTHER_NAME)
+    patterns = (TIME_NAME, TEMPERATURE_NAME, OTHER_NAME)
     words = [found[0] for pattern in patterns for found in pattern.finditer(text)]
     return sum(not word.isascii() and word not in _LETTERS_ALONE for word in words)
 
@@ -386,13 +365,12 @@ def _join_units(row: list[str], width: int) -> list[str]:
 
 
 def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
-    values = [value for row in rows for value in row]
-    comma = sum(bool(_COMMA_NUMBER.fullmatch(v)) for v in values)
-    point = sum(bool(_POINT_NUMBER.fullmatch(v)) for v in values if separator != ",")
-    return "," if comma > point else "."
+    found = (_DECIMAL.fullmatch(value) for row in rows for value in row)
+    marks = Counter(number[1] for number in found if number)
+    return "," if marks[","] > (0 if separator == "," else marks["."]) else "."
 
 
-_TEMPERATURE_NAME = re.compile(
+TEMPERATURE_NAME = re.compile(
     r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
     r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
     re.IGNORECASE,
@@ -408,221 +386,9 @@ OTHER_NAME = re.compile(
     r"|^epoch$|pixel|^(?:c|x0|y0|sigma0)$|^sd_|^#$|^no\.?$",
     re.IGNORECASE,
 )
-_MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _GOOD_SHARE = 0.8
 _ANNOTATIONS = ("#group", "#datatype", "#default")  # of InfluxDB
-_LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
-
-
-@dataclass(frozen=True, slots=True)
-class LogOptions:
-    """What the user has given about a log.
-
-    times, temperatures: names of columns, empty to guess; encoding to unit: None to detect; clock:
-    the logger's; wanted: names of temperature columns to use if they occur, such as a model's
-    thermometers; names: new names of columns by those in the file.
-    """
-
-    times: tuple[str, ...] = ()
-    temperatures: tuple[str, ...] = ()
-    encoding: str | None = None
-    separator: str | None = None
-    decimal: str | None = None
-    date_order: str | None = None
-    unit: str | None = None
-    clock: DeviceClock = field(default_factory=DeviceClock)
-    wanted: tuple[str, ...] = ()
-    names: Mapping[str, str] = field(default_factory=dict)
-
-
-def log_options(
-    *,
-    timezone: str | None = None,
-    log_timezone: str | None = None,
-    log_clock: str = "0",
-    ambiguous: str = "order",
-    time_column: Sequence[str] | None = None,
-    temperature_column: Sequence[str] | None = None,
-    encoding: str | None = None,
-    separator: str | None = None,
-    decimal: str | None = None,
-    date_order: str | None = None,
-    unit: str | None = None,
-    name: Sequence[str] | None = None,
-) -> LogOptions:
-    """Return the options of a log from the text of a command. Raises UsageError."""
-    for option, value, allowed in (
-        ("--unit", unit, UNITS),
-        ("--date-order", date_order, ORDERS),
-        ("--decimal", decimal, (",", ".")),
-    ):
-        if value is not None and value not in allowed:
-            raise UsageError(f"{option} {value}: must be one of {', '.join(allowed)}")
-    try:
-        "".encode(encoding or "utf-8")
-    except (LookupError, ValueError):
-        raise UsageError(
-            f"--encoding {encoding}: is unknown; give utf-8, cp1251, shift_jis, …"
-        ) from None
-    names = {}
-    for text in name or ():
-        column, _, label = text.rpartition("=")
-        fault = channel_fault(label) if column and label else "must be COLUMN=LABEL"
-        if fault:
-            raise UsageError(f"--name {text}: {fault}")
-        names[column] = label
-    mark = {"tab": "\t", "\\t": "\t"}.get(separator or "", separator)
-    if mark is not None and (len(mark) != 1 or mark.isalnum()):
-        raise UsageError(f"--separator {separator}: must be one character, or the word tab")
-    clock = device_clock(timezone, log_timezone, log_clock, ambiguous, "--log-timezone")
-    return LogOptions(
-        tuple(time_column or ()), tuple(temperature_column or ()), encoding, mark, decimal,
-        date_order, unit, clock, names=names,
-    )  # fmt: skip
-
-
-def require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
-    for name in names:
-        if name not in file.names:
-            raise DataError(
-                f"{file.path}: there is no column {name!r} ({option}); the columns are "
-                f"{quoted(file.names)}"
-            )
-    return names
-
-
-def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
-    if options.times:
-        return require_columns(file, options.times, "--time-column")
-    numeric, seconds = file.of_kind("number", "seconds"), file.of_kind("seconds")
-    serial = [n for n in numeric if TIME_NAME.search(n) and are_serials(file.column(n))]
-    found = serial or [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
-    if found := found or list(filter(TIME_NAME.search, seconds)):
-        return (found[0],)
-    dates, clocks = file.of_kind("date"), file.of_kind("time")
-    if dates and clocks:
-        return (dates[0], clocks[0])
-    if len(seconds) == 1:
-        return (seconds[0],)
-    shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in file.names)
-    raise DataError(
-        f"{file.path}: no column holds dates with times, as in 2026-06-14 12:00:00; change their "
-        "form (in a spreadsheet, show 45992.5 as a date with a time before it is saved), or "
-        f"give --time-column NAME (twice for a date and a time). First row: {shown}"
-    )
-
-
-def find_date_order(
-    file: LoggerFile,
-    names: tuple[str, ...],
-    options: LogOptions,
-    clock: DeviceClock,
-    near: tuple[float, float] | None,
-) -> tuple[str | None, list[str]]:
-    """Return the order of day, month and year, None if dates need none, and notes.
-
-    It follows from the numbers, such as a month above 12; else from the photographs, if only one
-    order puts the log near them; else from the rows, as a log of some days would span months or
-    years in another order. Where nothing decides, a year of two digits is taken to be last.
-    """
-    if options.date_order is not None:
-        return options.date_order, []
-    if not any(map(date_orders, file.column(names[0]))):
-        return None, []
-    first, spans = _read_in_orders(file, names)
-    one, *others = spans
-    costs: dict[str, dict[str, float]] = {}  # of each order, s, by what speaks for the least
-    if others and near is not None:
-        times = {o: clock.utc(span, lambda _: f"{file.path}") for o, span in spans.items()}
-        costs["puts the log near the photographs"] = {
-            o: float(max(t.min() - near[1], near[0] - t.max(), 0.0)) for o, t in times.items()
-        }
-    if others:
-        costs["makes the rows consecutive"] = {
-            o: abs((b.replace(tzinfo=None) - a.replace(tzinfo=None)).total_seconds())
-            for o, (a, b) in spans.items()
-        }
-    for why, cost in costs.items():
-        order, second, *_ = sorted(cost, key=cost.__getitem__)
-        if cost[second] > _LONGER * cost[order] + 86400.0:
-            return order, [f"log: {first!r} is {ORDERS[order]}: this {why}"]
-    if "mdy" in others:
-        raise DataError(
-            f"{file.path}, column {names[0]!r}: {first!r} may be "
-            f"{' or '.join(ORDERS[o] for o in spans)}: give --date-order {' or '.join(spans)}"
-        )
-    return one, [
-        f"doubtful: {first!r} is taken as {ORDERS[one]}, {spans[one][0]:%Y-%m-%d}; if it is "
-        f"{spans[other][0]:%Y-%m-%d}, give --date-order {other}"
-        for other in others
-    ]
-
-
-def _read_in_orders(
-    file: LoggerFile, names: tuple[str, ...]
-) -> tuple[str, dict[str, list[datetime]]]:
-    """Return the first date, and the first and last moment in every order that fits all dates."""
-    places = [file.names.index(name) for name in names]
-    first, dates = "", set[str]()
-    found: dict[str, list[datetime]] = {order: [] for order in ORDERS}
-    for line, row in file.rows():
-        date = row[places[0]][:10]
-        if date in dates:
-            continue
-        dates.add(date)
-        if (possible := date_orders(row[places[0]])) is None:
-            continue
-        found = {order: moments for order, moments in found.items() if order in possible}
-        if not found:
-            raise DataError(
-                f"{file.path}, line {line}, column {names[0]!r}: {row[places[0]]!r} is not in the "
-                f"order of day and month of the rows above ({first!r})"
-            )
-        text = " ".join(row[place] for place in places)
-        first = first or text
-        for order, moments in found.items():
-            moments.append(_moment(file, names, text, order))
-    every = list(found.values())
-    return first, {
-        order: [moments[0], moments[-1]]
-        for i, (order, moments) in enumerate(found.items())
-        if moments not in every[:i]
-    }
-
-
-def _moment(file: LoggerFile, names: tuple[str, ...], text: str, order: str) -> datetime:
-    try:
-        found = parse_moment(text, order)
-    except ValueError as cause:
-        raise DataError(f"{file.path}, column {names[0]!r}: {cause}") from cause
-    return found if isinstance(found, datetime) else datetime.now(UTC)
-
-
-def find_temperature_columns(
-    file: LoggerFile, times: tuple[str, ...], options: LogOptions
-) -> tuple[str, ...]:
-    if options.temperatures:
-        return require_columns(file, options.temperatures, "--temperature-column")
-    wanted = tuple(name for name in options.wanted if name in file.names)
-    numeric = [n for n in file.of_kind("number", "seconds") if n not in times]
-    of_name = [n for n in numeric if _TEMPERATURE_NAME.search(n)]
-    plain = [n for n in of_name if not OTHER_NAME.search(n)]
-    # a mean is a reading unless it is one of another column
-    readings = tuple(n.lower() for n in plain)
-    of = {n: _MEAN.sub("", n).lower().lstrip(" _.-") for n in of_name if _MEAN.search(n)}
-    means = {n for n, o in of.items() if not OTHER_NAME.search(o) and not o.startswith(readings)}
-    named = [n for n in of_name if n in {*plain, *means} and n not in wanted]
-    if wanted or named:
-        return (*wanted, *named)
-    others = [n for n in numeric if not OTHER_NAME.search(n) and n not in OUR_TIMES]
-    if len(others) == 1:
-        return (others[0],)
-    shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
-    raise DataError(
-        f"{file.path}: which column is the temperature? Give --temperature-column NAME. "
-        f"{shown[:400]}"
-    )
 
 
 def _kind(values: list[str]) -> str:
@@ -647,8 +413,3 @@ def _kind_of(value: str) -> str:
     if number and (isinstance(found, time) or not value.startswith("20")):  # 20260614 is a date
         return "number"
     return "time" if isinstance(found, time) else "date"
-
-
-def quoted(names: Iterable[str]) -> str:
-    """Return names of columns for a message."""
-    return ", ".join(repr(n) for n in names)

@@ -41,11 +41,10 @@ from thermocald.store.recording.writer import RecordingWriter
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from thermocald.arrays import Array
     from thermocald.store.logger.clock import DeviceClock
-    from thermocald.store.logger.dialect import LogOptions
+    from thermocald.store.logger.options import LogOptions
+    from thermocald.store.recording.reader import TemperatureLog
 
 
 SOURCES = ("exif", "name", "file")
@@ -297,52 +296,10 @@ def read_series(
     pitch, distance mm: used instead of EXIF's. Raises DataError for photographs of different sizes
     or cameras, for times without a zone, and if log and photographs do not overlap in time.
     """
-    one = photographs[0]
-    size = one.width, one.height
-    if other := next((p for p in photographs if (p.width, p.height) != size), None):
-        raise DataError(
-            f"{other.path}: has {other.width} × {other.height} px, {one.path.name} "
-            f"{one.width} × {one.height}: a recording has one camera in one position; import "
-            "them separately"
-        )
-    if strange := other_camera(photographs):
-        raise DataError(f"{strange}: a recording has one camera and lens; import them separately")
-    copies = find_copies([p.path for p in photographs])
-    notes = [
-        f"photographs: {photographs[i].path.name} is a copy of {photographs[k].path.name}: left out"
-        for i, k in copies.items()
-    ]
-    photographs = [p for i, p in enumerate(photographs) if i not in copies]
-    # sorted by name first, which gives the order within one second
-    named = sorted(photographs, key=lambda p: p.path.name)
-    times = clock.utc([p.moment for p in named], lambda i: str(named[i].path))
-    order = np.argsort(times, kind="stable")
-    times = times[order]
-    placed = tuple(named[i] for i in order.tolist())
-    if fault := time_fault(times):
-        raise DataError(
-            f"{placed[fault[0]].path}: was taken at {iso(times[fault[0]])}, years from the "
-            "photograph before: a clock that was not set? Correct the times, or leave some out"
-        )
-    if len(times) > 1 and np.ptp(times) == 0:
-        raise DataError(
-            f"{placed[0].path}: all photographs have its time; take them from other data (--times)"
-        )
-    if (same := np.flatnonzero(np.diff(times) == 0)).size:
-        first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
-        notes.append(
-            f"doubtful: {counted(len(same), 'photograph')} with the time of another one, the first "
-            f"{first} and {second}: the order of their names is used"
-        )
+    placed, times, notes = _sort_photographs(photographs, clock)
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
-    _require_overlap(times, logged.times)
-    row, near = _nearest_rows(times, logged.times)
-    channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
-    columns = EpochColumns(
-        np.arange(1, len(times) + 1), times, np.where(near, logged.times[row], np.nan), channels,
-        tuple(str(p.path.absolute()) for p in placed), {}, logged,
-    )  # fmt: skip
-    reference = next(iter(channels))
+    columns = _pair(placed, times, logged)
+    reference = next(iter(columns.temperatures))
     at_frame = columns.at_frame(reference)
     known = np.isfinite(at_frame)
     if not known.any():
@@ -364,7 +321,7 @@ def read_series(
     for i in sorted({0, len(times) // 2, len(times) - 1}):
         reading = f"{at_frame[i]:.3f} °C" if known[i] else "no temperature"
         notes.append(f"  {placed[i].path.name}  {iso(times[i])}  {reading}")
-    thermometers = dict.fromkeys(channels, Channel())
+    thermometers = dict.fromkeys(columns.temperatures, Channel())
     series = file_name(series, "series", UsageError)
     head = Head(f"{spec.name}-{series}", series, max(interval, 0.001), spec, thermometers)
     none = np.empty((0, 3))
@@ -373,24 +330,74 @@ def read_series(
     return recording, [*notes, *about_camera]
 
 
-def _require_overlap(frames: Array, log: Array) -> None:
-    if frames[0] <= log[-1] and frames[-1] >= log[0]:
-        return
-    gap = log[0] - frames[-1] if frames[-1] < log[0] else frames[0] - log[-1]
-    raise DataError(
-        f"photographs ({iso(frames[0])} to {iso(frames[-1])}) and log ({iso(log[0])} to "
-        f"{iso(log[-1])}) are {gap / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
-        "--log-timezone), or a clock (--camera-clock, --log-clock)"
-        + (", or are years written with two digits?" if gap > 3e7 else "?")
-    )
+def _sort_photographs(
+    photographs: Sequence[Photograph], clock: DeviceClock
+) -> tuple[list[Photograph], Array, list[str]]:
+    """Return photographs of one camera in the order of their times, these, s UTC, and notes.
+
+    Copies are left out. Raises DataError for several sizes or cameras, and for impossible times.
+    """
+    one = photographs[0]
+    size = one.width, one.height
+    if other := next((p for p in photographs if (p.width, p.height) != size), None):
+        raise DataError(
+            f"{other.path}: has {other.width} × {other.height} px, {one.path.name} "
+            f"{one.width} × {one.height}: a recording has one camera in one position; import "
+            "them separately"
+        )
+    if strange := other_camera(photographs):
+        raise DataError(f"{strange}: a recording has one camera and lens; import them separately")
+    copies = find_copies([p.path for p in photographs])
+    notes = [
+        f"photographs: {photographs[i].path.name} is a copy of {photographs[k].path.name}: left out"
+        for i, k in copies.items()
+    ]
+    kept = [p for i, p in enumerate(photographs) if i not in copies]
+    # sorted by name first, which gives the order within one second
+    named = sorted(kept, key=lambda p: p.path.name)
+    times = clock.utc([p.moment for p in named], lambda i: str(named[i].path))
+    order = np.argsort(times, kind="stable")
+    times = times[order]
+    placed = [named[i] for i in order.tolist()]
+    if fault := time_fault(times):
+        raise DataError(
+            f"{placed[fault[0]].path}: was taken at {iso(times[fault[0]])}, years from the "
+            "photograph before: a clock that was not set? Correct the times, or leave some out"
+        )
+    if len(times) > 1 and np.ptp(times) == 0:
+        raise DataError(
+            f"{placed[0].path}: all photographs have its time; take them from other data (--times)"
+        )
+    if (same := np.flatnonzero(np.diff(times) == 0)).size:
+        first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
+        notes.append(
+            f"doubtful: {counted(len(same), 'photograph')} with the time of another one, the first "
+            f"{first} and {second}: the order of their names is used"
+        )
+    return placed, times, notes
 
 
-def _nearest_rows(frames: Array, log: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the row of the log nearest to each frame, and whether it is within ten intervals."""
-    right = np.clip(np.searchsorted(log, frames), 1, len(log) - 1)
-    left = right - 1
-    row = np.where(frames - log[left] <= log[right] - frames, left, right)
-    return row, np.abs(log[row] - frames) <= LARGEST_GAP * np.median(np.diff(log))
+def _pair(placed: Sequence[Photograph], times: Array, logged: TemperatureLog) -> EpochColumns:
+    """Return epochs of photographs with times (E,) s, each with the log's reading nearest in time.
+
+    Raises DataError if photographs and log do not overlap in time.
+    """
+    log = logged.times
+    if (gap := max(times[0] - log[-1], log[0] - times[-1])) > 0:
+        raise DataError(
+            f"photographs ({iso(times[0])} to {iso(times[-1])}) and log ({iso(log[0])} to "
+            f"{iso(log[-1])}) are {gap / 3600:.1f} h apart: is a time zone wrong "
+            "(--camera-timezone, --log-timezone), or a clock (--camera-clock, --log-clock)"
+            + (", or are years written with two digits?" if gap > 3e7 else "?")
+        )
+    right = np.clip(np.searchsorted(log, times), 1, len(log) - 1)
+    row = np.where(times - log[right - 1] <= log[right] - times, right - 1, right)
+    near = np.abs(log[row] - times) <= LARGEST_GAP * logged.step
+    channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
+    return EpochColumns(
+        np.arange(1, len(times) + 1), times, np.where(near, log[row], np.nan), channels,
+        tuple(str(p.path.absolute()) for p in placed), {}, logged,
+    )  # fmt: skip
 
 
 def _camera_of(

@@ -10,9 +10,9 @@ import math
 import re
 from array import array
 from collections import Counter
-from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,16 +34,18 @@ from thermocald.store.logger.dialect import (
     TIME_NAME,
     UNIT_BEHIND,
     LoggerFile,
+    open_log,
+    stated_unit,
+    to_celsius,
+    without_unit,
+)
+from thermocald.store.logger.options import (
     LogOptions,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
-    open_log,
     quoted,
     require_columns,
-    stated_unit,
-    to_celsius,
-    without_unit,
 )
 from thermocald.store.recording.reader import TemperatureLog as TemperatureLog
 from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts, time_fault
@@ -84,9 +86,9 @@ def read_log(
     Raises DataError or UsageError if something cannot be determined, naming the option to set.
     """
     options = options or LogOptions()
-    file = open_log(path, options)
+    file = open_log(path, options.encoding, options.separator, options.decimal)
     time_names = find_time_columns(file, options)
-    lines = [found[1] for line in file.above if (found := _ZONE_LINE.search(line))]
+    lines = [zone[1] for line in file.above if (zone := _ZONE_LINE.search(line))]
     clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
@@ -106,18 +108,8 @@ def read_log(
             f"{-steps[row - 1]:.0f} s ({table.where(row)}): was the clock set, or are hours of a "
             "12-hour clock without AM and PM? The rows are put in the order of their times"
         )
-    require_columns(table.file, tuple(options.names), "--name")
-    channels = {}
-    for name in names:
-        values, unit_note = _to_celsius_column(table, name, options)
-        given = name if name in options.wanted else None
-        channel = options.names.get(name) or given or _channel_name(name)
-        while channel in channels:  # `T (1)` and `T [1]` are two columns
-            channel += "_"
-        channels[channel] = values
-        notes += unit_note
-    if table.labels:
-        channels = _split_by_label(table, next(iter(channels.values())), options)
+    channels, found = _read_channels(table, options)
+    notes += found
     if _CHANGES in time_names:
         labels = np.array(table.labels or [""] * len(times))
         times, channels, held = _hold_readings(times, channels, labels)
@@ -137,6 +129,24 @@ def read_log(
         )
         notes.append(f"doubtful: {text}{without}" if rough else f"log: {text}")
     return TemperatureLog(times, channels, tuple(notes))
+
+
+def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array], list[str]]:
+    """Return the channels {name: (n,) °C} of a table, and notes on their units and readings."""
+    require_columns(table.file, tuple(options.names), "--name")
+    channels: dict[str, Array] = {}
+    notes: list[str] = []
+    for name in table.values:
+        values, found = _to_celsius_column(table, name, options)
+        given = name if name in options.wanted else None
+        channel = options.names.get(name) or given or _channel_name(name)
+        while channel in channels:  # `T (1)` and `T [1]` are two columns
+            channel += "_"
+        channels[channel] = values
+        notes += found
+    if table.labels:
+        channels = _split_by_label(table, next(iter(channels.values())), options)
+    return channels, notes
 
 
 def _hold_readings(
@@ -198,7 +208,7 @@ class _Table:
         self._lines, self._seconds = array("i"), array("d")
         # of each row: the moment from which its seconds count, -1 for 1970
         self._of, self._moments = array("i"), list[datetime]()
-        self._minutes: dict[tuple[str, str], int] = {}
+        self._minute = cache(self._find_minute)
         self.values = {name: array("d") for name in names}
         self.units: dict[str, Counter[str]] = {name: Counter() for name in names}
         self._untimed: list[tuple[int, str]] = []
@@ -270,28 +280,32 @@ class _Table:
         return notes
 
     def _find_moment(self, line: int, text: str) -> tuple[int, float] | None:
-        """Return a moment's row and the seconds after it; None for a row that has no readings.
-
-        The times of a minute count from its beginning, which is parsed once: parsing each of them
-        would take longer than all else.
-        """
+        """Return a moment's row and the seconds after it; None for a row that has no readings."""
         found = _SECONDS.fullmatch(text)
-        minute = (found[1], found[3]) if found else ("", "")
-        known = self._minutes.get(minute, -2)
-        if found and known >= 0:
-            return known, float(found[2])
-        moment, seconds = self._moment(line, text), 0.0
+        if found and (begin := self._minute(found[1], found[3])) >= 0:
+            return begin, float(found[2])
+        moment = self._moment(line, text)
         if moment is None:
             return None
-        if found and known == -2 and found[2] != "00":
-            with suppress(ValueError):  # in some forms the last digits are minutes or a fraction
-                begin = parse_moment(f"{minute[0]}:00{minute[1]}", self._order)
-                after = timedelta(seconds=int(found[2]))
-                if isinstance(begin, datetime) and begin + after == moment:
-                    moment, seconds = begin, float(found[2])
-            self._minutes[minute] = len(self._moments) if seconds else -1
         self._moments.append(moment)
-        return len(self._moments) - 1, seconds
+        return len(self._moments) - 1, 0.0
+
+    def _find_minute(self, before: str, after: str) -> int:
+        """Return the row of a minute's first moment, given the text around the seconds; else -1.
+
+        Parsing the time of each reading would take longer than all else.
+        """
+        try:
+            begin, later = (
+                parse_moment(f"{before}:{seconds}{after}", self._order) for seconds in ("00", "30")
+            )
+        except ValueError:
+            return -1
+        # in some forms the last digits are minutes or a fraction
+        if not isinstance(begin, datetime) or later != begin + timedelta(seconds=30):
+            return -1
+        self._moments.append(begin)
+        return len(self._moments) - 1
 
     def _moment(self, line: int, text: str) -> datetime | None:
         """Return the time of a row, None for a row that has no readings."""

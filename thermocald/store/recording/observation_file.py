@@ -71,19 +71,15 @@ class ObservationRows:
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
-        """Return parts one after another; all have the quality columns of the first."""
+        """Return parts of one file, which have the same columns, one after another."""
         seen = [part.seen for part in parts]
-        covariances = None
-        if any(one.covariances is not None for one in seen):
-            covariances = np.concatenate(
-                [np.zeros(len(one)) if one.covariances is None else one.covariances for one in seen]
-            )
-        targets, points, sigmas = (
-            np.concatenate([getattr(one, name) for one in seen])
-            for name in ("targets", "points", "sigmas")
-        )
+        given = "covariances" if seen[0].covariances is not None else None
+        columns = {
+            name: np.concatenate([getattr(one, name) for one in seen])
+            for name in filter(None, ("targets", "points", "sigmas", given))
+        }
         quality = {n: np.concatenate([one.quality[n] for one in seen]) for n in seen[0].quality}
-        joined = Observations(targets, points, sigmas, covariances, quality)
+        joined = Observations(**columns, quality=quality)
         return cls(np.concatenate([part.epochs for part in parts]), joined, parts[0].first)
 
     def rows(self, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Self:

@@ -12,7 +12,7 @@ import pytest
 from tests.marks import mostly_slow
 from tests.photogrammetry.printed_sheets import rasterised
 from thermocald.analysis.field import usual_station
-from thermocald.errors import UsageError
+from thermocald.errors import ThermocaldError, UsageError
 from thermocald.output.testfield.sheets import (
     TRIM,
     Design,
@@ -247,7 +247,7 @@ def test_every_paper_has_a_sensible_default(name, landscape):
     ],
 )
 def test_impossible_designs_are_refused(design, reason, tmp_path):
-    with pytest.raises(UsageError, match=reason):
+    with pytest.raises(ThermocaldError, match=reason):
         print_testfield(design, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 

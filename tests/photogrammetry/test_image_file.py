@@ -8,7 +8,7 @@ import pytest
 import simplejpeg
 
 from tests.photogrammetry.exact_rendering import noisy
-from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
+from tests.photogrammetry.fields import SMALL_SENSOR, small_field, small_frame
 from thermocald.errors import ImageError
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.frame.tracking import Tracker
@@ -110,11 +110,8 @@ def test_a_video_after_the_end_of_a_jpeg_changes_nothing():
 
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
-    field, normals = small_field()
-    high = station(1000.0, target=(180.0, 180.0, 100.0))  # no target in the lowest rows
-    clean = draw(field, normals).render(SMALL_CAMERA, high)
     rng = np.random.default_rng(3)
-    return [noisy(clean, rng) for _ in range(3)]
+    return [noisy(small_frame(), rng) for _ in range(3)]
 
 
 def test_tracked_centres_are_the_same_to_the_last_bit(frames, monkeypatch):

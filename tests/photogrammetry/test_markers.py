@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.commands import invoke
 from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
 from tests.photogrammetry.fields import PI_CAMERA, SMALL_CAMERA, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers, parse_marker
 
@@ -133,20 +133,18 @@ def test_other_texts_than_marker_codes_are_refused(code):
         parse_marker(code)
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"),
-    [
-        ("marker_corner", "DICT_4X4_50:1:0"),
-        ("circle", "RING12:65"),
-        ("chess_corner", "CHESS:9x6:0"),
-    ],
-)
-def test_a_duplicated_code_is_refused(kind, code):
-    """Of rings and squares the last was measured, and the first never."""
+@pytest.mark.parametrize("code", ["DICT_4X4_50:1:0", "RING12:65", "CHESS:9x6:0"])
+def test_a_duplicated_code_is_refused(tmp_path, code):
+    """`testfield check` accepted it."""
     points = np.random.default_rng(1).uniform(0, 100, (5, 3))
-    field = TestField.build(list("abcde"), points, 0.1, 10.0, kind, code)
+    codes = [code, "", code, "", ""]
     with pytest.raises(TestFieldError, match="is duplicated in the test field, at targets 'a' and"):
-        measure(_frontal(1), field)
+        TestField.build(list("abcde"), points, 0.1, 10.0, "circle", codes)
+    path = tmp_path / "field.csv"
+    rows = [f"{name},{k},{k * k},0,9,1,1,1,{code}" for k, name in enumerate("abcde")]
+    path.write_text("\n".join(["target,X,Y,Z,diameter,sX,sY,sZ,code", *rows]))
+    with pytest.raises(TestFieldError, match="line 3.*code.*'a' has it"):
+        invoke("testfield", "check", path)
 
 
 def test_photographs_of_apriltags(shared):

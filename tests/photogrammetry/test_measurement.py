@@ -16,6 +16,7 @@ from tests.photogrammetry.fields import (
     draw,
     draw_marker,
     small_field,
+    small_frame,
     station,
 )
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
@@ -26,18 +27,13 @@ from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.boards import chessboard
 from thermocald.photogrammetry.targets.outline import local_maps
 
-FIELD, NORMALS = small_field()
+FIELD, _ = small_field()
 STATION = station(800.0)
 
 
-@pytest.fixture(scope="module")
-def clean() -> np.ndarray:
-    return draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION)
-
-
 @pytest.fixture
-def frame(clean) -> np.ndarray:
-    return noisy(clean, np.random.default_rng(7))
+def frame() -> np.ndarray:
+    return noisy(small_frame(), np.random.default_rng(7))
 
 
 def _truth(exterior=STATION, field: TestField = FIELD) -> np.ndarray:
@@ -121,9 +117,16 @@ MOVED = np.random.default_rng(2).permutation(FIELD.points)
     ids=["other codes", "codes elsewhere", "plain circles", "chessboard"],
 )  # fmt: skip
 def test_another_field_is_detected(frame, field, word, reason):
-    found = measure(frame, field)
+    found = measure(frame[300:700, 500:1100], field)
     assert found.status.word == word
     assert reason in found.status.reason
+    assert len(found.observations) == 0
+
+
+def test_a_mirrored_frame_is_called_so(frame):
+    """Its ring codes were "seen, but not where the field has them", its markers not found."""
+    found = measure(np.ascontiguousarray(frame[:, ::-1]), FIELD)
+    assert "is mirrored" in found.status.reason
     assert len(found.observations) == 0
 
 

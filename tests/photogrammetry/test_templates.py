@@ -12,7 +12,7 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 
 SIZE = (640, 480)
-FINE = 8  # scenes are drawn at this scale and averaged
+FINE = 4  # scenes are drawn at this scale and averaged
 CLICK = 1.0
 
 

@@ -24,13 +24,14 @@ from thermocald.output.testfield.sheets import STRIP, TRIM, Sheet, markers_of
 from thermocald.photogrammetry.targets import outline, ring_code
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.output.testfield.sheets import Board
+    from thermocald.output.testfield.sheets import Marker
+    from thermocald.photogrammetry.targets.boards import Board
 
 
 _MM_PER_INCH = 25.4
@@ -278,17 +279,19 @@ def _legend(pen: Pen, sheet: Sheet) -> None:
     pen.text(STRIP, STRIP - 4.6, words, _LEGEND_HEIGHT)
 
 
-def draw_board(board: Board, page: tuple[float, float]) -> Any:
-    """Draw a board in the middle of a page (mm), with rulers and its name, as a Figure."""
+def draw_board(
+    board: Board, page: tuple[float, float], origin: Sequence[float], markers: Iterable[Marker]
+) -> Any:
+    """Draw a board with its origin at a place on a page (mm), with rulers and its name."""
     pen = Pen(page, light=False)
     size = (page[0] - 2 * TRIM, page[1] - 2 * TRIM)
     draw_margins(pen, size)
     name = board.name.partition(" ")[2]
     pen.text(STRIP, STRIP - 4.6, f"{name}, {board.measures}", _LEGEND_HEIGHT)
-    dx, dy = board.place(page)
+    dx, dy = origin
     for x, y, side in board.squares():
         pen.fill(rectangle(x + dx, y + dy, side, side), "black")
-    for _, (x, y), side, cells in board.markers():
+    for _, (x, y), side, cells in markers:
         draw_marker(pen, (x + dx, y + dy), side, cells)
     return pen.figure
 

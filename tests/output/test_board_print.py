@@ -20,7 +20,7 @@ from thermocald.photogrammetry.targets.boards import Board
 from thermocald.photogrammetry.targets.markers import corner_shift
 from thermocald.store.recording.testfield_file import read_testfield
 
-CAMERA = CameraModel(Sensor(820, 616, 0.00448), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
+CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
 DPI = 200.0
 BOARDS = {
     "charuco": ("--charuco", "11x8", "--dictionary", "DICT_5X5_250", "--paper", "A4"),
@@ -100,7 +100,8 @@ def test_a_board_is_as_large_as_the_paper_allows():
     for kind, counts in (("charuco", (11, 8)), ("chessboard", (9, 6)), ("aprilgrid", (6, 6))):
         for page in ((297.0, 420.0), (210.0, 297.0), (841.0, 1189.0)):
             black = filled(Board(kind, *counts), page).black
-            assert all(0.5 * (side - 30.0) < b < side - 30.0 for b, side in zip(sorted(black), page))
+            for length, side in zip(sorted(black), page, strict=True):
+                assert 0.5 * (side - 30.0) < length < side - 30.0
 
 
 @pytest.mark.parametrize(

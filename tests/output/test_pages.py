@@ -34,6 +34,7 @@ from thermocald.errors import DriverMissing
 from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
+from thermocald.output.study.figures import principal_point_figure
 from thermocald.output.study.report import render_study, save_figures
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -552,8 +553,9 @@ def test_a_number_and_its_unit_share_a_line():
     assert "(−7.3\xa0±\xa00.4)·10⁻⁷\xa0mm⁻¹/K in 20\xa0minutes." in page
 
 
-def test_figures_for_a_paper(warm_up, tmp_path):
-    few = study([warm_up({"c": 0.007}, 3)()], StudySettings(sets=50))
-    paths = save_figures(few, tmp_path / "figures")
-    assert {"deviations.svg", "deviations.png", "movement.svg"} <= {p.name for p in paths}
+def test_figures_for_a_paper(warm_study, tmp_path, monkeypatch):
+    one = principal_point_figure(warm_study.cameras[0])
+    monkeypatch.setattr("thermocald.output.study.report.study_figures", lambda _: {one.name: one})
+    paths = save_figures(warm_study, tmp_path / "figures")
+    assert [p.name for p in paths] == ["principal-point.svg", "principal-point.png"]
     assert all(p.stat().st_size > 3000 for p in paths)

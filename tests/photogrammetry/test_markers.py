@@ -143,7 +143,7 @@ def test_a_duplicated_code_is_refused(tmp_path, code):
     path = tmp_path / "field.csv"
     rows = [f"{name},{k},{k * k},0,9,1,1,1,{code}" for k, name in enumerate("abcde")]
     path.write_text("\n".join(["target,X,Y,Z,diameter,sX,sY,sZ,code", *rows]))
-    with pytest.raises(TestFieldError, match="line 3.*code.*'a' has it"):
+    with pytest.raises(TestFieldError, match=r"line 4.*code.*'a' has it"):
         invoke("testfield", "check", path)
 
 

@@ -223,7 +223,7 @@ def test_every_paper_has_a_sensible_default(name, landscape):
     page = paper_size(name, landscape=landscape)
     (sheet,) = lay_out(Design(page, default_diameter(page)))
     assert 60 < len(sheet.field) < 160
-    a, b = sheet.field.points[[*sheet.scale_bar]]
+    a, b = (sheet.field.points[sheet.field.index[sheet.scale_bar[end]]] for end in "ab")
     assert a[1] == b[1]
     assert b[0] - a[0] > 0.6 * sheet.size[0]
     for (x, y, _), code in zip(sheet.field.points, sheet.field.codes, strict=True):

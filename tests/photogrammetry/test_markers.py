@@ -18,6 +18,7 @@ from thermocald.photogrammetry.targets.markers import locate_markers, parse_mark
 
 
 def measure_markers(image, field, missed=None):
+    missed = {} if missed is None else missed
     return measure_corners(image, locate_markers(image, field, missed), missed)
 
 
@@ -65,7 +66,7 @@ def test_corners_scatter_as_stated(view):
     exterior = VIEWS[view]
     image = _rendered(view)
     rng = np.random.default_rng(1)
-    found = locate_markers(noisy(image, rng), FIELD)
+    found = locate_markers(noisy(image, rng), FIELD, {})
     assert len(found) == 48
     truth = _truth(exterior)
     error, z = [], []
@@ -113,7 +114,7 @@ def test_markers_are_found_at_half_size_and_measured_at_full_size():
 
 def test_a_corner_at_the_edge_is_missed_with_a_reason():
     image = _frontal(6)
-    found = locate_markers(image, FIELD)
+    found = locate_markers(image, FIELD, {})
     x = int(np.floor(_truth(VIEWS["frontal"])[1, 0])) + 1
     missed: dict[int, str] = {}
     measure_corners(np.ascontiguousarray(image[:, :x]), found, missed)

@@ -80,7 +80,9 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     rms = float(np.sqrt(np.mean(residuals**2)))
     covered = image_coverage(sensor, points)
     if result.estimated:
-        sentence = f"{_estimates(result, sensor)}."
+        rows = interior_table(result, sensor).rows
+        found = [f"{name} is {mm} ({px} px)" for name, mm, px in rows if px]
+        sentence = f"{enumerated(found)}."
         fit = f"; σ₀ {result.sigma0:.2f}, redundancy {result.redundancy}"
         fit += f"; {CAUSES_OF_SIGMA0}" if result.sigma0 > 1.0 + MATERIAL else ""
     else:
@@ -106,22 +108,6 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
             "Errors of the camera model, which the standard deviations do not include.",
         ),
     )  # fmt: skip
-
-
-def _estimates(result: Photographs, sensor: Sensor) -> str:
-    """Return c, x0 and y0 with their standard deviations, in mm and px."""
-    assert result.interior is not None
-    sds = np.sqrt(np.diag(result.covariance)[:3])
-    found = zip(IOP_NAMES[:3], result.interior.as_array()[:3], sds, strict=True)
-    pitch = sensor.pixel_pitch
-    return enumerated(
-        [
-            f"{parameter_label(name)} is {with_sd(value, float(sd), 'mm')} "
-            f"({with_sd(value / pitch, float(sd) / pitch, 'px')})"
-            for name, value, sd in found
-            if sd > 0
-        ]
-    )
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:

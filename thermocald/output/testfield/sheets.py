@@ -108,8 +108,11 @@ class Sheet:
         return _EDGES[_TITLES.index(self.title)] if self.title in _TITLES else {}
 
     @property
-    def scale_bar(self) -> tuple[int, int] | None:
-        """The rows of the two coded circles to measure between, the ends of the lowest row."""
+    def scale_bar(self) -> dict[str, Any] | None:
+        """The two coded circles to measure between, the ends of the lowest row, and their distance.
+
+        sheet: its title; a, b: their names; nominal: the distance, mm.
+        """
         circles = np.flatnonzero(self.field.circles).tolist()
         coded = [i for i in circles if self.field.codes[i]] or circles
         if len(coded) < 2:
@@ -117,7 +120,10 @@ class Sheet:
         x, y, _ = self.field.points.T
         upwards = sorted(coded, key=lambda i: (y[i], x[i]))
         lowest = [i for i in upwards if y[i] == y[upwards[0]]]
-        return (upwards[0], lowest[-1]) if len(lowest) > 1 else (upwards[0], upwards[-1])
+        ends = [upwards[0], lowest[-1] if len(lowest) > 1 else upwards[-1]]
+        length = float(np.linalg.norm(np.subtract(*self.field.points[ends])))
+        a, b = (self.field.names[row] for row in ends)
+        return {"sheet": self.title, "a": a, "b": b, "nominal": length}
 
 
 def paper_size(
@@ -354,17 +360,9 @@ class Printed:
             "sheets": len(self.sheets) or 1,
             "targets": len(self.field),
         }
-        if self.board is not None:
-            board = self.board
-            return document | {
-                "board": board.kind, "square": board.square, "marker": board.marker
-            }  # fmt: skip
-        bars = []
-        for sheet in self.sheets:
-            if sheet.scale_bar is not None:
-                a, b = (sheet.field.names[row] for row in sheet.scale_bar)
-                length = float(np.linalg.norm(np.subtract(*sheet.field.points[[*sheet.scale_bar]])))
-                bars.append({"sheet": sheet.title, "a": a, "b": b, "nominal": length})
+        if (board := self.board) is not None:
+            sizes = {"square": board.square, "marker": board.marker}
+            return document | {"board": board.kind, **sizes}
         corners = self.field.kinds.count("marker_corner")
         plain = self.field.codes.count("")
         return document | {
@@ -372,7 +370,7 @@ class Printed:
             "coded": len(self.field) - corners - plain,
             "plain": plain,
             "markers": corners // 4,
-            "scale_bars": bars,
+            "scale_bars": [sheet.scale_bar for sheet in self.sheets if sheet.scale_bar],
         }
 
     def lines(self) -> list[str]:

@@ -51,7 +51,7 @@ def board_of(
     points: Array,
     kinds: Sequence[str],
     codes: Sequence[str],
-    sigma: float | Array | None = None,
+    sigma: float | None = None,
     diameter: float = np.nan,
 ) -> TestField:
     """Build a board of targets at points (n, 3) mm.
@@ -60,12 +60,10 @@ def board_of(
     """
     if not 4 <= len(names) <= _MOST_TARGETS:
         raise TestFieldError(f"a board of {len(names)} targets: it must have 4 to {_MOST_TARGETS}")
-    if sigma is None:
-        local = points - points.mean(axis=0)
-        spread = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local)
-        spread[:, 2] = _SIGMA_FLAT
-        sigma = spread
-    return TestField.build(names, points, sigma, diameter, kinds, codes)
+    spread = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * (points - points.mean(axis=0)))
+    spread[:, 2] = _SIGMA_FLAT
+    sigmas = spread if sigma is None else sigma
+    return TestField.build(names, points, sigmas, diameter, kinds, codes)
 
 
 def aprilgrid(
@@ -252,12 +250,11 @@ def numbered_rings(
     points: Array,
     bits: int,
     diameter: float,
-    *,
-    sigmas: Array | None = None,
+    sigma: float | None = None,
 ) -> TestField:
     """Build ring-coded targets numbered as by Metashape and AICON: the n-th code of `bits` bits.
 
-    numbers: n, from 1; points (n, 3) mm; diameter: of the inner disc, mm; sigmas (n, 3) mm.
+    numbers: n, from 1; points (n, 3) mm; diameter: of the inner disc, mm; sigma: as in `board_of`.
     """
     codes = ring_code.codes(bits)
     for number in numbers:
@@ -267,7 +264,7 @@ def numbered_rings(
             )
     return board_of(
         [str(n) for n in numbers], points, ["circle"] * len(numbers),
-        [ring_code.write(bits, codes[n - 1]) for n in numbers], sigmas, diameter,
+        [ring_code.write(bits, codes[n - 1]) for n in numbers], sigma, diameter,
     )  # fmt: skip
 
 

@@ -241,11 +241,8 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
     return rows
 
 
-def locate_markers(
-    image: Image, testfield: TestField, missed: dict[int, str] | None = None
-) -> Corners:
+def locate_markers(image: Image, testfield: TestField, missed: dict[int, str]) -> Corners:
     """Detect a test field's markers; `missed` receives {row: reason} for corners not found."""
-    missed = {} if missed is None else missed
     found: list[tuple[int, float, Array]] = []  # row, border, corner with its neighbours
     for name, known in marker_rows(testfield).items():
         expected = frozenset(marker for marker, _ in known)

@@ -121,8 +121,7 @@ def local_maps(
     return LocalMap(f[0], linear, second)
 
 
-REACH_PX = 4.0
-"""Pixels farther from the outline do not depend on the centre."""
+_REACH_PX = 4.0  # pixels farther from the outline do not depend on the centre
 _THIN = 3
 _CHUNK_PIXELS = 80_000  # of the windows that are processed together
 _CUT_PX = 2.0  # pixels this near to the outline must be in the image
@@ -160,11 +159,6 @@ class Windows:
         return replace(self, x=x, y=y, grey=grey, weight=weight)
 
 
-def window_reach(blur: float) -> float:
-    """Return how far from the outline pixels are used, px; blur: px."""
-    return max(REACH_PX, 4.0 * blur)
-
-
 def windows(
     image: Image, maps: LocalMap, coded: NDArray[np.bool_], blur: float = 0.9
 ) -> Iterator[Windows]:
@@ -173,7 +167,7 @@ def windows(
     coded (n,): targets with a code ring, whose pixels are excluded for a blur of `blur` px.
     """
     height, width = image.shape
-    reach_px = window_reach(blur)
+    reach_px = max(_REACH_PX, 4.0 * blur)
     levels = _background_and_contrast(image, maps)
     beyond = np.full((len(maps), 2), reach_px)
     clear = (RING_INNER - 1) * maps.semi_axes[coded] - _RING_CLEARANCE * blur

@@ -300,8 +300,7 @@ def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = Non
         points.append(point)
     if not numbers:
         raise TestFieldError(f"{path}: holds no line `label, X, Y, Z`")
-    sigmas = None if sigma is None else np.full((len(points), 3), sigma)
-    return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigmas=sigmas)
+    return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigma)
 
 
 def read_distances(path: Path) -> list[Distance]:

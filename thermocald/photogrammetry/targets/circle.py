@@ -229,13 +229,13 @@ def fit_circles(
     top = np.iinfo(image.dtype).max
     for w in parts:
         mine = maps.select(w.rows)
-        fitted = list(_step(w, mine, parameters[w.rows], noise, work))
+        fitted = _step(w, mine, parameters[w.rows], noise, work)
         for _ in range(_ITERATIONS - 1):  # only fits that have not converged
             left = np.flatnonzero(~fitted[5])
             if not len(left):
                 break
             again = _step(w.select(left), mine.select(left), fitted[0][left], noise, work)
-            for column, new in zip(fitted, again, strict=True):
+            for column, new in zip(cast("tuple[NDArray[Any], ...]", fitted), again, strict=True):
                 column[left] = new
         parameters[w.rows], value, residual, normal[w.rows], last_step[w.rows] = fitted[:5]
         pixels[w.rows] = w.weight.sum(axis=1)

@@ -93,7 +93,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             table.fail(row, "target", f"{name[:40]!r} must be printable")
         if first.setdefault(name, row) != row:
             table.fail(row, "target", f"target {name!r} is duplicated")
-    codes, known = [code.strip() for code in found.get("code", ("",) * len(names))], {}
+    codes = [code.strip() for code in found.get("code", ("",) * len(names))]
+    known: dict[str, str] = {}
     for row, code in enumerate(codes):
         if code and (other := known.setdefault(code, names[row])) != names[row]:
             table.fail(row, "code", f"code {code!r} is duplicated: target {other!r} has it")

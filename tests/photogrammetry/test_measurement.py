@@ -349,18 +349,9 @@ def test_the_blur_trend_has_true_sds_in_spite_of_outliers():
 
 
 def test_figures_of_a_frame():
-    rng = np.random.default_rng(2)
-    points = _points(50, rng)
-    same = {"contrast": -120.0, "grey": 180.0, "noise": 2.0, "saturation": 0.0}
-    quality = {name: np.full(50, value) for name, value in same.items()}
-    found = frame_figures(_observed(points, blur=_blur(points), **quality), SMALL_SENSOR)
-    assert found["blur_px"] == pytest.approx(0.9)
-    assert found["blur_trend_x"] == pytest.approx(0.1)
-    assert found["blur_curvature"] == pytest.approx(0.2)
-    assert (found["contrast"], found["grey"], found["saturation"]) == (-120, 180, 0)
-
-    # few targets give the blur in the middle only
+    """Few targets give the blur in the middle only."""
     points = np.array([[10.0, 10.0], [20.0, 400.0]])
-    found = frame_figures(_observed(points, blur=np.array([0.8, 1.0])), SMALL_SENSOR)
-    assert found == {"blur_px": pytest.approx(0.9)}
+    quality = {"blur": np.array([0.8, 1.0]), "contrast": np.array([-120.0, -118.0])}
+    found = frame_figures(_observed(points, **quality), SMALL_SENSOR)
+    assert found == {"blur_px": pytest.approx(0.9), "contrast": -119.0}
     assert frame_figures(Observations.none(), SMALL_SENSOR) == {}

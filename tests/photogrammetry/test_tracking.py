@@ -101,7 +101,7 @@ def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     assert np.abs(z.mean(axis=(0, 1))).max() < 4 / np.sqrt(z.shape[0] * z.shape[1])
 
 
-def test_light_and_noise_may_change(tracker, clean, rng, no_search):
+def test_light_noise_and_focus_may_change(tracker, clean, rng, no_search):
     for factor in (0.9, 0.5, 1.1):
         measured = tracker.measure(noisy(clean * factor, rng))
         assert len(measured.observations) >= 100
@@ -111,11 +111,8 @@ def test_light_and_noise_may_change(tracker, clean, rng, no_search):
     measured = tracker.measure(noisy(clean, rng, 4.0))
     assert 0.88 <= rms(_z(measured)) <= 1.12
     assert np.median(measured.observations.quality["noise"]) == pytest.approx(4.0, rel=0.1)
-
-
-def test_defocus_shows_in_the_blur(tracker, clean, rng, no_search):
-    image = cv2.GaussianBlur(clean, (0, 0), np.sqrt(1.2**2 - 0.8**2))
-    measured = tracker.measure(noisy(image, rng))
+    defocused = cv2.GaussianBlur(clean, (0, 0), np.sqrt(1.2**2 - 0.8**2))
+    measured = tracker.measure(noisy(defocused, rng))
     assert np.median(measured.observations.quality["blur"]) == pytest.approx(1.2, abs=0.02)
 
 

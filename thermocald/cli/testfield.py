@@ -64,7 +64,7 @@ def _board(
 
     Raises UsageError for two boards, or for counts that cannot be read.
     """
-    from thermocald.photogrammetry.targets.boards import Board
+    from thermocald.output.testfield.sheets import Board
 
     named = {"charuco": charuco, "chessboard": chessboard, "aprilgrid": aprilgrid}
     given = [(kind, counts) for kind, counts in named.items() if counts]

@@ -27,6 +27,7 @@ from thermocald.figures import drawing_style
 from thermocald.files import new_file
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.boards import Board as Board  # noqa: TC001  # for commands
 from thermocald.photogrammetry.targets.markers import dictionary, marker_cells
 from thermocald.store.recording.testfield_file import testfield_csv
 
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.targets.boards import Board
 
     Marker: TypeAlias = tuple[str, tuple[float, float], float, NDArray[np.bool_]]
     """Name, centre and side mm, and cells (n, n): True where black, the first row on top."""

@@ -216,7 +216,8 @@ class Board:
         """The dimensions of squares, markers or tags, in words."""
         if self.has_tags:
             return f"tags {self.marker:g} mm, {self.spacing * self.marker:g} mm apart"
-        words = f"squares {self.square:g} mm"
+        sides = f"{self.square:g}" if self.height is None else f"{self.square:g} × {self.height:g}"
+        words = f"squares {sides} mm"
         if self.kind == "charuco":
             words += f", markers {self.marker:g} mm of {self.dictionary}"
         return words + (", as OpenCV drew it before 4.6" if self.legacy else "")

@@ -212,14 +212,8 @@ class _Frame:
         again = {row for row, why in self._missed.items() if why in _WORTH_A_SECOND_LOOK}
         if len(corners) < max(_FEW_CORNERS, len(again)):
             again = set()
-        rows = [
-            row
-            for row, (kind, code) in enumerate(
-                zip(self._field.kinds, self._field.codes, strict=True)
-            )
-            if (kind == "chess_corner" and not code)
-            or (row in again and (kind == "chess_corner" or is_marker(code)))
-        ]
+        appearances = enumerate(zip(self._field.kinds, self._field.codes, strict=True))
+        rows = sorted(again.union(row for row, how in appearances if how == ("chess_corner", "")))
         if len(corners) < _FEWEST or not rows:
             return Observations.none()
         try:

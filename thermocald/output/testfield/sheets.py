@@ -28,7 +28,7 @@ from thermocald.files import new_file
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.boards import Board as Board  # noqa: TC001  # for commands
-from thermocald.photogrammetry.targets.markers import dictionary, marker_cells
+from thermocald.photogrammetry.targets.markers import dictionary, marker_cells, marker_size
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ _MARKER_EVERY = 5
 _CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))
 """Corners of a marker in OpenCV's order, as signs right and up of its centre."""
 _MARKER_SIDE = 6.0
-"""Side of a marker in radii of a disc; its white surround then still fits into the pitch."""
+"""Side of a marker in radii of a disc; its surround then still fits into the pitch."""
 # Standard deviations of a print before its survey, mm: the printer's irregularity, its scale error
 # (per mm from the sheet's centre), paper that is not flat, sheets that are mounted by hand.
 _SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
@@ -173,6 +173,8 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
             if design.dictionary and (i + 2 * j) % _MARKER_EVERY == _MARKER_EVERY // 2:
                 code = next(markers)
                 name, h = f"M{code.rpartition(':')[2]}", _MARKER_SIDE * design.diameter / 4
+                if design.light:  # with its white surround, which would reach the plain circles
+                    h /= 1 + 2 / marker_size(code.partition(":")[0])
                 corners += [
                     (f"{name}.{i}", u + h * right, v + h * up, f"{code}:{i}")
                     for i, (right, up) in enumerate(_CORNERS)

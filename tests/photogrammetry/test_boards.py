@@ -20,6 +20,7 @@ from thermocald.photogrammetry.targets import boards, markers
 from thermocald.store.recording.testfield_file import read_board, read_rings
 
 CAMERA = CameraModel(Sensor(820, 616, 0.00448), InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3))
+LARGE = CameraModel(Sensor(1640, 1232, 0.00224), CAMERA.interior)
 
 
 def seen(sheet, field, stand, roll=0.3, finer=3):
@@ -54,8 +55,8 @@ def test_standard_deviations_of_an_aprilgrid_are_true_at_any_obliquity(stand):
     field = boards.aprilgrid(4, 4, 40.0, 0.3)
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(stand), middle, 0.3)
-    clean = drawn_exactly(field, 4, 4, 40.0, 0.3).render(CAMERA, station, blur=0.7, finer=3)
-    truth = CAMERA.project(station, field.points)
+    clean = drawn_exactly(field, 4, 4, 40.0, 0.3).render(LARGE, station, blur=0.7, finer=3)
+    truth = LARGE.project(station, field.points)
     ratios = []
     for seed in range(3):
         frame = exact_rendering.noisy(clean, np.random.default_rng(seed), 1.5)

@@ -3,7 +3,7 @@
 Run: python -m benchmarks.frame        (exit status 1 if a bound is missed)
 All on one thread. A tracked epoch is decoding, about 150 centres, and the adjustment with
 covariance; a last line gives the shares of the three. Nine tenths of decoding a JPEG is reading its
-bits in order, which only restart markers shorten. The goal of 1.10 would leave the centres a third
+bits in order. The goal of 1.10 would leave the centres a third
 of the time that fetching their weights and grey values from cold memory takes. "From nothing" has
 no prior but the sensor and the lens's nominal principal distance. OpenCV's routes give no
 covariance of the parameters and do not identify targets.
@@ -39,10 +39,8 @@ if TYPE_CHECKING:
 
 ROUNDS = 40
 QUALITY = 90
-RESTART = {"row of blocks": 410, "fifth of a row": 41}  # units between two restart markers
 GOALS = {
     "tracked epoch": 1.1,
-    **{f"tracked epoch, restart markers every {name}": 1.0 for name in RESTART},
     "tracked epoch, luminance plane (YU12) of a camera": 0.4,
     "from nothing": 3.0,
 }
@@ -50,22 +48,14 @@ GOALS = {
 # caches (1.15 to 1.39, 1.10 to 1.31, 3.35 to 4.24; on one machine 6 % of it), and the reason
 MISSED = {
     "tracked epoch": (1.45, "nearly all bits have to be read"),
-    "tracked epoch, restart markers every row of blocks": (1.4, "each row holds a target"),
     "from nothing": (4.5, "a third of it is the fits of the discs, 110,000 pixels"),
 }
 
 
 class TimedImage(EncodedImage):
-    """An encoded image that sums the time to decode its parts, s."""
+    """An encoded image that sums the time to decode it, s."""
 
     seconds = 0.0
-
-    def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-        """Decode like `EncodedImage.around`."""
-        begin = time.thread_time()
-        parts = super().around(boxes, shape)
-        self.seconds += time.thread_time() - begin
-        return parts
 
     def whole(self) -> NDArray[Any]:
         """Decode like `EncodedImage.whole`."""
@@ -128,16 +118,6 @@ def main() -> int:
         return run
 
     grey = [simplejpeg.decode_jpeg(frame, "GRAY")[..., 0] for frame in frames]
-    restarted = {
-        name: [
-            cv2.imencode(
-                ".jpg", image,
-                [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_RST_INTERVAL, units],
-            )[1].tobytes()
-            for image in grey
-        ]
-        for name, units in RESTART.items()
-    }  # fmt: skip
     chroma = np.full(grey[0].size // 2, 128, np.uint8)
     planar = [memoryview(np.concatenate([image.ravel(), chroma])) for image in grey]
 
@@ -187,10 +167,6 @@ def main() -> int:
     routes: list[tuple[str, Callable[[], object], int]] = [
         ("decode", decode, 1),
         ("tracked epoch", tracked_epoch(encoded(frames), staged=True), 1),
-        *(
-            (f"tracked epoch, restart markers every {name}", tracked_epoch(encoded(files)), 1)
-            for name, files in restarted.items()
-        ),
         ("tracked epoch, luminance plane (YU12) of a camera", tracked_epoch(luminance), 1),
         ("from nothing", from_nothing, 1),
         ("decode + threshold + fitEllipse + calibrateCameraExtended", threshold_and_ellipses, 2),

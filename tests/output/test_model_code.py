@@ -5,6 +5,7 @@ from __future__ import annotations
 import runpy
 import shutil
 import subprocess
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +13,12 @@ import pytest
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.output.thermal_model import code_of, write_code
-from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    CameraModel,
+    ExteriorOrientation,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.physics.model import ModelEffect, ThermalModel
 
 SENSOR = Sensor(3280, 2464, 0.00112)
@@ -21,8 +27,6 @@ RATES = {"c": 2e-4, "x0": -4e-4, "y0": 2e-4}
 
 
 def thermal_camera(affine=False, distortion="angle"):
-    from dataclasses import replace
-
     interior = replace(INTERIOR, C1=1e-3, C2=-5e-4) if affine else INTERIOR
     effects = (
         ModelEffect("nonlinear_expansion", {"c": 1e-6, "x0": 2e-6, "y0": 0.0}),
@@ -46,8 +50,6 @@ def truth(camera, T, X):
     """The program's own projection, through its own frames."""
     state = camera.at(T)
     interior = InteriorOrientation.from_array(state.values)
-    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
-
     model = CameraModel(SENSOR, interior)
     return model.project(ExteriorOrientation.from_array(np.zeros(6)), X * np.array([1.0, -1, -1]))
 

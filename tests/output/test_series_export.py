@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,6 @@ from thermocald.store.recording.reader import read_recording
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    from dataclasses import replace
-
     place = tmp_path_factory.mktemp("export")
     s = preset_simulation("rpi-v2.1-heating", seed=1, field=corner_field("circles", 4, 150.0))
     replace(s, programme=replace(s.programme, epochs=10)).write(place / "M1")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from tests.photogrammetry.exact_rendering import Scene, look_at
@@ -70,6 +72,14 @@ SMALL_CAMERA = CameraModel(SMALL_SENSOR, PI_CAMERA.interior)
 def small_field(bits: int = 14) -> tuple[TestField, np.ndarray]:
     """Return a field of 108 targets of 15 mm, for the binned camera."""
     return corner_field(per_side=6, spacing=75.0, diameter=15.0, bits=bits)
+
+
+@cache
+def small_frame() -> np.ndarray:
+    """Return the noise-free frame of `small_field` from `station(800.0)`, drawn once."""
+    frame = draw(*small_field()).render(SMALL_CAMERA, station(800.0))
+    frame.setflags(write=False)
+    return frame
 
 
 def draw_marker(

@@ -8,16 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.commands import invoke
 from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
 from tests.photogrammetry.fields import PI_CAMERA, SMALL_CAMERA, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers, parse_marker
 
 
 def measure_markers(image, field, missed=None):
+    missed = {} if missed is None else missed
     return measure_corners(image, locate_markers(image, field, missed), missed)
 
 
@@ -65,7 +66,7 @@ def test_corners_scatter_as_stated(view):
     exterior = VIEWS[view]
     image = _rendered(view)
     rng = np.random.default_rng(1)
-    found = locate_markers(noisy(image, rng), FIELD)
+    found = locate_markers(noisy(image, rng), FIELD, {})
     assert len(found) == 48
     truth = _truth(exterior)
     error, z = [], []
@@ -113,7 +114,7 @@ def test_markers_are_found_at_half_size_and_measured_at_full_size():
 
 def test_a_corner_at_the_edge_is_missed_with_a_reason():
     image = _frontal(6)
-    found = locate_markers(image, FIELD)
+    found = locate_markers(image, FIELD, {})
     x = int(np.floor(_truth(VIEWS["frontal"])[1, 0])) + 1
     missed: dict[int, str] = {}
     measure_corners(np.ascontiguousarray(image[:, :x]), found, missed)
@@ -133,20 +134,17 @@ def test_other_texts_than_marker_codes_are_refused(code):
         parse_marker(code)
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"),
-    [
-        ("marker_corner", "DICT_4X4_50:1:0"),
-        ("circle", "RING12:65"),
-        ("chess_corner", "CHESS:9x6:0"),
-    ],
-)
-def test_a_duplicated_code_is_refused(kind, code):
-    """Of rings and squares the last was measured, and the first never."""
+def test_a_duplicated_code_is_refused(tmp_path):
+    """`testfield check` accepted it."""
     points = np.random.default_rng(1).uniform(0, 100, (5, 3))
-    field = TestField.build(list("abcde"), points, 0.1, 10.0, kind, code)
+    codes = ["RING12:65", "", "RING12:65", "", ""]
     with pytest.raises(TestFieldError, match="is duplicated in the test field, at targets 'a' and"):
-        measure(_frontal(1), field)
+        TestField.build(list("abcde"), points, 0.1, 10.0, "circle", codes)
+    path = tmp_path / "field.csv"
+    rows = [f"{'abcde'[k]},{k},{k * k},0,9,1,1,1,{code}" for k, code in enumerate(codes)]
+    path.write_text("\n".join(["target,X,Y,Z,diameter,sX,sY,sZ,code", *rows]))
+    with pytest.raises(TestFieldError, match=r"line 4.*code.*'a' has it"):
+        invoke("testfield", "check", path)
 
 
 def test_photographs_of_apriltags(shared):

@@ -16,6 +16,7 @@ from tests.photogrammetry.fields import (
     draw,
     draw_marker,
     small_field,
+    small_frame,
     station,
 )
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
@@ -26,18 +27,13 @@ from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.boards import chessboard
 from thermocald.photogrammetry.targets.outline import local_maps
 
-FIELD, NORMALS = small_field()
+FIELD, _ = small_field()
 STATION = station(800.0)
 
 
-@pytest.fixture(scope="module")
-def clean() -> np.ndarray:
-    return draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION)
-
-
 @pytest.fixture
-def frame(clean) -> np.ndarray:
-    return noisy(clean, np.random.default_rng(7))
+def frame() -> np.ndarray:
+    return noisy(small_frame(), np.random.default_rng(7))
 
 
 def _truth(exterior=STATION, field: TestField = FIELD) -> np.ndarray:
@@ -121,9 +117,16 @@ MOVED = np.random.default_rng(2).permutation(FIELD.points)
     ids=["other codes", "codes elsewhere", "plain circles", "chessboard"],
 )  # fmt: skip
 def test_another_field_is_detected(frame, field, word, reason):
-    found = measure(frame, field)
+    found = measure(frame[300:700, 500:1100], field)
     assert found.status.word == word
     assert reason in found.status.reason
+    assert len(found.observations) == 0
+
+
+def test_a_mirrored_frame_is_called_so(frame):
+    """Its ring codes were "seen, but not where the field has them", its markers not found."""
+    found = measure(np.ascontiguousarray(frame[:, ::-1]), FIELD)
+    assert "is mirrored" in found.status.reason
     assert len(found.observations) == 0
 
 
@@ -346,18 +349,9 @@ def test_the_blur_trend_has_true_sds_in_spite_of_outliers():
 
 
 def test_figures_of_a_frame():
-    rng = np.random.default_rng(2)
-    points = _points(50, rng)
-    same = {"contrast": -120.0, "grey": 180.0, "noise": 2.0, "saturation": 0.0}
-    quality = {name: np.full(50, value) for name, value in same.items()}
-    found = frame_figures(_observed(points, blur=_blur(points), **quality), SMALL_SENSOR)
-    assert found["blur_px"] == pytest.approx(0.9)
-    assert found["blur_trend_x"] == pytest.approx(0.1)
-    assert found["blur_curvature"] == pytest.approx(0.2)
-    assert (found["contrast"], found["grey"], found["saturation"]) == (-120, 180, 0)
-
-    # few targets give the blur in the middle only
+    """Few targets give the blur in the middle only."""
     points = np.array([[10.0, 10.0], [20.0, 400.0]])
-    found = frame_figures(_observed(points, blur=np.array([0.8, 1.0])), SMALL_SENSOR)
-    assert found == {"blur_px": pytest.approx(0.9)}
+    quality = {"blur": np.array([0.8, 1.0]), "contrast": np.array([-120.0, -118.0])}
+    found = frame_figures(_observed(points, **quality), SMALL_SENSOR)
+    assert found == {"blur_px": pytest.approx(0.9), "contrast": -119.0}
     assert frame_figures(Observations.none(), SMALL_SENSOR) == {}

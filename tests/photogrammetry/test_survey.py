@@ -57,7 +57,7 @@ def sheet():
     nominal = field_of((sheet,))
     truth = bent(nominal, sheet.size)
     stations = cases.convergent_stations(truth.points, 12, distance=620.0)
-    a, b = sheet.scale_bar
+    a, b = (nominal.index[sheet.scale_bar[end]] for end in "ab")
     length = np.linalg.norm(truth.points[a] - truth.points[b]) + 0.0025
     distance = Distance(nominal.names[a], nominal.names[b], float(length), 0.02)
     return nominal, truth, photograph(truth, stations), distance

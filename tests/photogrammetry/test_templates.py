@@ -12,11 +12,13 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 
 SIZE = (640, 480)
-FINE = 8  # scenes are drawn at this scale and averaged
+FINE = 8  # scenes are drawn at this scale and averaged, where standard deviations are tested
 CLICK = 1.0
 
 
-def scene(centres: np.ndarray, affine: np.ndarray, seed: int, light: float = 1.0) -> np.ndarray:
+def scene(
+    centres: np.ndarray, affine: np.ndarray, seed: int, light: float = 1.0, finer: int = 4
+) -> np.ndarray:
     """Draw white crosses on dark boards in grass, (H, W), without noise.
 
     affine (2, 3): a transformation of the whole scene, px.
@@ -24,11 +26,11 @@ def scene(centres: np.ndarray, affine: np.ndarray, seed: int, light: float = 1.0
     rng = np.random.default_rng(seed)
     grass = rng.normal(0, 1, (SIZE[1] + 80, SIZE[0] + 80)).astype(np.float32)
     grass = 90 + 60 * cv2.GaussianBlur(grass, (0, 0), 2.5)
-    to_fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])
+    to_fine = np.array([[finer, 0, (finer - 1) / 2], [0, finer, (finer - 1) / 2], [0, 0, 1.0]])
     whole = np.vstack([affine, [0, 0, 1]])
     from_grass = np.array([[1, 0, -40], [0, 1, -40], [0, 0, 1.0]])
     fine = cv2.warpAffine(
-        grass, (to_fine @ whole @ from_grass)[:2], (SIZE[0] * FINE, SIZE[1] * FINE),
+        grass, (to_fine @ whole @ from_grass)[:2], (SIZE[0] * finer, SIZE[1] * finer),
         flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT,
     )  # fmt: skip
     for k, centre in enumerate(centres):
@@ -37,7 +39,7 @@ def scene(centres: np.ndarray, affine: np.ndarray, seed: int, light: float = 1.0
         for half, grey in (((9, 9), 40.0), ((8, 2.2), 230.0), ((2.2, 8), 230.0)):
             corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half @ R.T + centre
             corners = corners @ affine[:, :2].T + affine[:, 2]
-            shifted = np.round((corners * FINE + (FINE - 1) / 2) * 16).astype(np.int32)
+            shifted = np.round((corners * finer + (finer - 1) / 2) * 16).astype(np.int32)
             cv2.fillConvexPoly(fine, shifted, grey, cv2.LINE_AA, 4)
     image = cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
     return light * cv2.GaussianBlur(image, (0, 0), 0.8)
@@ -55,11 +57,11 @@ def placed(rng: np.random.Generator, n: int = 6):
     return centres, field, Observations(np.arange(n), clicks, np.full((n, 2), CLICK))
 
 
-def prepared(seed: int, drawn: int | None = None):
+def prepared(seed: int, drawn: int | None = None, finer: int = 4):
     """Return generator, centres, clicks, and the templates of a noisy scene."""
     rng = np.random.default_rng(seed)
     centres, field, clicks = placed(rng)
-    still = scene(centres, STILL, seed if drawn is None else drawn)
+    still = scene(centres, STILL, seed if drawn is None else drawn, finer=finer)
     return rng, centres, clicks, Templates(noisy(still, rng), field, clicks)
 
 
@@ -67,7 +69,7 @@ def prepared(seed: int, drawn: int | None = None):
 def test_centres_of_crosses_are_better_than_the_clicks_and_have_true_sds():
     ratio, errors, clicked = [], [], []
     for seed in range(12):
-        _, centres, clicks, made = prepared(seed)
+        _, centres, clicks, made = prepared(seed, finer=FINE)
         found = made.reference
         error = found.points - centres
         errors.append(error)
@@ -83,12 +85,12 @@ def test_patches_are_found_again_with_true_sds():
     """Error over sd between frames of a camera that turns and zooms a little, in other light."""
     ratio = []
     for seed in range(6):
-        rng, centres, _, made = prepared(50 + seed, seed)
+        rng, centres, _, made = prepared(50 + seed, seed, FINE)
         for k in range(1, 3):
             turn, zoom = 0.004 * k, 1 + 0.001 * k
             A = zoom * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
             affine = np.column_stack([A, rng.uniform(-6, 6, 2)])
-            image = noisy(scene(centres, affine, seed, 1.0 - 0.2 * k), rng)
+            image = noisy(scene(centres, affine, seed, 1.0 - 0.2 * k, FINE), rng)
             seen = made.measure(image).observations
             assert len(seen) == 6
             true = made.reference.points @ A.T + affine[:, 2]

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from copy import copy
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.photogrammetry import board_images
 from tests.photogrammetry.exact_rendering import noisy, rms
-from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
+from tests.photogrammetry.fields import (
+    SMALL_CAMERA,
+    SMALL_SENSOR,
+    draw,
+    small_field,
+    small_frame,
+    station,
+)
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph
-from thermocald.photogrammetry.camera.camera_model import CameraModel, CameraSpec
+from thermocald.photogrammetry.camera.camera_model import CameraModel, CameraSpec, Sensor
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.frame import tracking
 from thermocald.photogrammetry.frame.measurement import Measurement
@@ -23,10 +31,6 @@ FIELD, NORMALS = small_field()
 STATION = station(800.0)
 
 
-def _render(camera=SMALL_CAMERA, exterior=STATION) -> np.ndarray:
-    return draw(FIELD, NORMALS).render(camera, exterior)
-
-
 def _shifted(px: float) -> CameraModel:
     """Return the camera with its principal point drifted by `px` in x and half as much in y."""
     shift = px * SMALL_SENSOR.pixel_pitch
@@ -34,9 +38,9 @@ def _shifted(px: float) -> CameraModel:
     return CameraModel(SMALL_SENSOR, i.with_values(x0=i.x0 + shift, y0=i.y0 - shift / 2))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def clean() -> np.ndarray:
-    return _render()
+    return small_frame()
 
 
 @pytest.fixture
@@ -45,9 +49,9 @@ def rng() -> np.random.Generator:
 
 
 @pytest.fixture(scope="module")
-def begun(clean) -> Tracker:
+def begun() -> Tracker:
     tracker = Tracker(FIELD, CameraSpec("", SMALL_SENSOR))
-    first = tracker.measure(noisy(clean, np.random.default_rng(20)))
+    first = tracker.measure(noisy(small_frame(), np.random.default_rng(20)))
     assert first.status.ok
     assert first.searched
     return tracker
@@ -90,14 +94,14 @@ def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search)
 @pytest.mark.parametrize("px", [0.12, 1.2])
 def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     camera = _shifted(px)
-    image = _render(camera)
+    image = draw(FIELD, NORMALS).render(camera, STATION)
     z = np.array([_z(tracker.measure(noisy(image, rng)), camera) for _ in range(6)])
     assert rms(z) <= 1.12
     # 200 targets × 6 frames would show a common bias of 0.001 px (sigma 0.008 px)
     assert np.abs(z.mean(axis=(0, 1))).max() < 4 / np.sqrt(z.shape[0] * z.shape[1])
 
 
-def test_light_and_noise_may_change(tracker, clean, rng, no_search):
+def test_light_noise_and_focus_may_change(tracker, clean, rng, no_search):
     for factor in (0.9, 0.5, 1.1):
         measured = tracker.measure(noisy(clean * factor, rng))
         assert len(measured.observations) >= 100
@@ -107,11 +111,8 @@ def test_light_and_noise_may_change(tracker, clean, rng, no_search):
     measured = tracker.measure(noisy(clean, rng, 4.0))
     assert 0.88 <= rms(_z(measured)) <= 1.12
     assert np.median(measured.observations.quality["noise"]) == pytest.approx(4.0, rel=0.1)
-
-
-def test_defocus_shows_in_the_blur(tracker, rng, no_search):
-    image = draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION, blur=1.2, finer=2)
-    measured = tracker.measure(noisy(image, rng))
+    defocused = cv2.GaussianBlur(clean, (0, 0), np.sqrt(1.2**2 - 0.8**2))
+    measured = tracker.measure(noisy(defocused, rng))
     assert np.median(measured.observations.quality["blur"]) == pytest.approx(1.2, abs=0.02)
 
 
@@ -129,6 +130,9 @@ def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
     assert np.abs(_z(back)).max() < 5
 
 
+BOARD_CAMERA = CameraModel(Sensor(820, 616, 0.00448), SMALL_CAMERA.interior)
+
+
 @pytest.fixture(scope="module")
 def board():
     """Return a board and photographs of it: two from one stand, one where a pattern repeats."""
@@ -138,13 +142,13 @@ def board():
     for step in (0.0, 90.0):
         middle = field.points.mean(axis=0) + np.array([step, 0, 0])
         stand = looking_at(middle + away, middle, 0.3)
-        frames.append(photograph([sheet], SMALL_CAMERA, stand, noise=0.0, finer=2))
+        frames.append(photograph([sheet], BOARD_CAMERA, stand, noise=0.0, finer=2))
     rng = np.random.default_rng(1)
     return field, [noisy(frames[k], rng, 1.5) for k in (0, 0, 1)]
 
 
 def _board_tracker(field) -> Tracker:
-    return Tracker(field, CameraSpec("", SMALL_SENSOR))
+    return Tracker(field, CameraSpec("", BOARD_CAMERA.sensor))
 
 
 def test_all_corners_of_a_board_are_tracked(board, monkeypatch):
@@ -173,7 +177,7 @@ def test_what_was_hidden_in_the_first_frames_is_found(board, monkeypatch):
     field, frames = board
     tracker = _board_tracker(field)
     hand = frames[0].copy()
-    hand[:, :900] = 110
+    hand[:, :450] = 110
     begin = [tracker.measure(hand) for _ in range(3)]
     seen = [tracker.measure(frames[k % 2]) for k in range(2)]
     whole = len(_board_tracker(field).measure(frames[1]).observations)
@@ -191,7 +195,7 @@ def test_what_was_hidden_in_the_first_frames_is_found(board, monkeypatch):
 
 def test_a_knock_leads_to_a_reported_search(tracker, rng):
     knocked = station(760.0, target=(215.0, 190.0, 200.0), roll=0.03)
-    image = _render(exterior=knocked)
+    image = draw(FIELD, NORMALS).render(SMALL_CAMERA, knocked, finer=2)
     measured = tracker.measure(noisy(image, rng))
     assert "lost" in measured.searched
     assert measured.status.ok

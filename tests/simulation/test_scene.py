@@ -75,7 +75,7 @@ def test_corners_agree_with_the_projected_truth():
     iop = InteriorOrientation(c=3.04, x0=0.012, y0=-0.018).as_array()
     eop = corner_view(field, 1330.0).as_array()
     image = Scene(SENSOR, field, CLEAN).render(iop, eop)
-    seen = measure_corners(image, locate_markers(image, field))
+    seen = measure_corners(image, locate_markers(image, field, {}), {})
     assert len(seen) >= 160
     error = seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]
     assert np.sqrt(np.mean(error**2)) < 0.01
@@ -94,7 +94,7 @@ def test_corners_have_true_sds_at_any_position_in_a_pixel():
         x0, y0 = np.array([k / 6, k / 5]) * SENSOR.pixel_pitch
         iop = InteriorOrientation(c=3.04, x0=x0, y0=y0).as_array()
         image = scene.render(iop, eop, seed=k)
-        seen = measure_corners(image, locate_markers(image, field))
+        seen = measure_corners(image, locate_markers(image, field, {}), {})
         error = seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]
         normed.append(error / seen.sigmas)
     ratio = np.sqrt(np.mean(np.concatenate(normed) ** 2, axis=0))
@@ -176,7 +176,7 @@ def test_frame_shows_the_known_drift(camera):
     a, b = camera.truth(first.monotonic), camera.truth(hot.monotonic)
     moved = (b.iop[0] - a.iop[0]) / camera.model.sensor.pixel_pitch
     assert -12.0 < moved[1] < -9.0
-    seen = measure_corners(hot.image, locate_markers(hot.image, camera.field))
+    seen = measure_corners(hot.image, locate_markers(hot.image, camera.field, {}), {})
     assert len(seen) >= 100
     expected = project(camera.model.sensor, b.iop[0], b.eop[0], camera.field.points)
     assert np.sqrt(np.mean((seen.points - expected[seen.targets]) ** 2)) < 0.04

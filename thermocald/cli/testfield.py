@@ -64,9 +64,10 @@ def _board(
 
     Raises UsageError for two boards, or for counts that cannot be read.
     """
-    from thermocald.output.testfield.sheets import KINDS, Board
+    from thermocald.output.testfield.sheets import Board
 
-    given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
+    named = {"charuco": charuco, "chessboard": chessboard, "aprilgrid": aprilgrid}
+    given = [(kind, counts) for kind, counts in named.items() if counts]
     if len(given) > 1:
         raise UsageError(f"--{given[0][0]} and --{given[1][0]}: one board at a time")
     if not given:
@@ -116,7 +117,7 @@ def print_(
 
     if board is not None:  # by default the page has the orientation of the board
         page = sheets.paper_size(paper, landscape, usual=board.columns > board.rows)
-        printed = sheets.print_board(board.filled(page), page, out, replace_printed=force)
+        printed = sheets.print_board(sheets.filled(board, page), page, out, replace_printed=force)
     else:
         design = replace(
             _design(paper, flat, landscape, diameter),
@@ -173,15 +174,16 @@ def import_(
         if rings not in (12, 14):
             raise UsageError(f"--rings {rings}: must be 12 or 14 bits")
         field, kind = read_rings(source, rings, diameter, sigma), f"rings of {rings} bits"
-    elif source is not None:
-        field, kind = read_board(source, sigma)
     else:
+        board = read_board(source) if source is not None else board
         for option, size, needless in (
             ("--square", board.square, "aprilgrid"), ("--marker", board.marker, "chessboard"),
         ):  # fmt: skip
             if not size and board.kind != needless:
                 raise UsageError(f"{option} is missing (mm)")
         field, kind = board.field(sigma), board.name
+        if source is not None:  # the sizes that were read, in mm
+            kind += f" ({board.measures})"
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     write_testfield(out, field)
     extent = [float(v) for v in field.points.max(axis=0) - field.points.min(axis=0)]

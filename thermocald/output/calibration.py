@@ -7,6 +7,7 @@ precision of a calibration and advises what to add.
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,8 @@ from thermocald.numbers import (
     with_sd,
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
+from thermocald.photogrammetry.epoch.adjustment import image_coverage
+from thermocald.photogrammetry.linalg import correlations
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 
 if TYPE_CHECKING:
@@ -36,7 +39,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
-_CELLS = (12, 9)
 _MOST_ARROWS = 3000
 _RINGS = 10
 _LITTLE_COVERED = 0.6
@@ -64,13 +66,6 @@ def render_calibration(
     ).page()
 
 
-def coverage(points: Array, sensor: Sensor) -> float:
-    """Return the fraction of the cells of a grid over the image in which a target was seen."""
-    x = np.clip((points[:, 0] + 0.5) / sensor.width * _CELLS[0], 0, _CELLS[0] - 1).astype(int)
-    y = np.clip((points[:, 1] + 0.5) / sensor.height * _CELLS[1], 0, _CELLS[1] - 1).astype(int)
-    return len(set(zip(x.tolist(), y.tolist(), strict=True))) / (_CELLS[0] * _CELLS[1])
-
-
 def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sensor) -> Answer:
     proof = residual_figure(result, sensor) if posed else None
     without: dict[str, list[str]] = {}
@@ -83,9 +78,11 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     points, residuals = _used(posed)
     left_out = sum(int(np.count_nonzero(~p.used)) for p in posed)
     rms = float(np.sqrt(np.mean(residuals**2)))
-    covered = coverage(points, sensor)
+    covered = image_coverage(sensor, points)
     if result.estimated:
-        sentence = f"{_estimates(result, sensor)}."
+        rows = interior_table(result, sensor).rows
+        found = [f"{name} is {mm} ({px} px)" for name, mm, px in rows if px]
+        sentence = f"{enumerated(found)}."
         fit = f"; σ₀ {result.sigma0:.2f}, redundancy {result.redundancy}"
         fit += f"; {CAUSES_OF_SIGMA0}" if result.sigma0 > 1.0 + MATERIAL else ""
     else:
@@ -111,22 +108,6 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
             "Errors of the camera model, which the standard deviations do not include.",
         ),
     )  # fmt: skip
-
-
-def _estimates(result: Photographs, sensor: Sensor) -> str:
-    """Return c, x0 and y0 with their standard deviations, in mm and px."""
-    assert result.interior is not None
-    sds = np.sqrt(np.diag(result.covariance)[:3])
-    found = zip(IOP_NAMES[:3], result.interior.as_array()[:3], sds, strict=True)
-    pitch = sensor.pixel_pitch
-    return enumerated(
-        [
-            f"{parameter_label(name)} is {with_sd(value, float(sd), 'mm')} "
-            f"({with_sd(value / pitch, float(sd) / pitch, 'px')})"
-            for name, value, sd in found
-            if sd > 0
-        ]
-    )
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
@@ -236,17 +217,11 @@ def interior_table(
 
 def _correlations(result: Photographs) -> Table:
     """Return the pairs whose correlation exceeds ±0.5, the strongest first."""
-    sd = np.sqrt(np.diag(result.covariance)[:10])
-    free = np.flatnonzero(sd > 0)
-    found = [
-        (float(result.covariance[i, j] / sd[i] / sd[j]), i, j)
-        for a, i in enumerate(free)
-        for j in free[a + 1 :]
-    ]
+    R = correlations(result.covariance[:10, :10])
+    pairs = [(i, j) for i, j in combinations(range(10), 2) if abs(R[i, j]) > 0.5]
     rows = [
-        (f"{parameter_label(IOP_NAMES[i])}, {parameter_label(IOP_NAMES[j])}", coefficient(r))
-        for r, i, j in sorted(found, key=lambda one: -abs(one[0]))
-        if abs(r) > 0.5
+        (f"{parameter_label(IOP_NAMES[i])}, {parameter_label(IOP_NAMES[j])}", coefficient(R[i, j]))
+        for i, j in sorted(pairs, key=lambda pair: -abs(R[pair]))
     ]
     return Table("Correlations beyond ±0.5", ("pair", "r"), tuple(rows))
 

@@ -27,7 +27,7 @@ from thermocald.figures import (
     legend_above,
     new_drawing,
 )
-from thermocald.numbers import enumerated, parameter_label, percent, shortened, with_sd
+from thermocald.numbers import enumerated, parameter_label, percent, plain, shortened, with_sd
 from thermocald.photogrammetry.linalg import best_level
 from thermocald.physics import catalogue
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
@@ -142,7 +142,6 @@ def _sections(d: Discovery) -> list[Section]:
         _candidates(d),
         Section(
             "Misfit of the base model, in numbers",
-            ("The misfit on M1, against everything that was recorded.",),
             tables=(_misfit_table(d),),
             folded=True,
         ),
@@ -495,18 +494,12 @@ def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str
 
 
 def _misfit_table(d: Discovery) -> Table:
-    def number(value: Any, decimals: int) -> str:
-        if not isinstance(value, float):
-            return str(value)
-        shown = 0 if abs(value) >= 100.0 else decimals
-        return f"{value:z,.{shown}f}".replace("-", "−") if math.isfinite(value) else "–"
-
     return Table.of(
-        "Misfit of the base model",
+        "The misfit on M1, against everything that was recorded",
         describe_misfit(d.examination)["against"],
         {
             "against": lambda r: ", ".join(map(parameter_label, r["what"].split(", "))),
-            "size in px RMS": lambda r: number(r["rms_px"], 4),
-            "significance in σ": lambda r: number(r["significance_sigmas"], 1),
+            "size in px RMS": lambda r: f"{r['rms_px']:z.4f}",
+            "significance in σ": lambda r: plain(r["significance_sigmas"], digits=3),
         },
     )

@@ -339,7 +339,7 @@ def _measure_first(
         sensor = sensor or Sensor(image.shape[1], image.shape[0], pixel_pitch)
         found = measure_codes(image, rows, grows=nominal is None)
         if nominal is not None:
-            found = measure_corners(image, locate_markers(image, nominal)).joined(found)
+            found = measure_corners(image, locate_markers(image, nominal, {}), {}).joined(found)
         notes[name] = f"{len(found)} coded targets"
         if len(found):
             seen[name] = found
@@ -373,7 +373,7 @@ def _measure_again(
             continue
         progress(f"targets in {name}")
         image = load()
-        corners = measure_corners(image, locate_markers(image, expected))
+        corners = measure_corners(image, locate_markers(image, expected, {}), {})
         rows, maps = predict_circles(expected, network.camera, stations[name].exterior, normals)
         fit = fit_circles(image, maps, have_rings(expected, rows))
         off = np.linalg.norm(fit.points - maps.centre, axis=1)

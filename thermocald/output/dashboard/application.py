@@ -27,8 +27,15 @@ from prometheus_client.core import GaugeMetricFamily
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.responses import (
+    FileResponse,
+    JSONResponse,
+    RedirectResponse,
+    Response,
+    StreamingResponse,
+)
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from thermocald.addresses import HostNames
 from thermocald.errors import DataError, ThermocaldError, UsageError
@@ -107,12 +114,6 @@ def _families(status: Mapping[str, Any]) -> Iterator[GaugeMetricFamily]:
 
 
 _STATIC = Path(__file__).parent / "static"
-_FILES = {
-    "index.html": "text/html",
-    "page.js": "text/javascript; charset=utf-8",
-    "page.css": "text/css; charset=utf-8",
-    "icon.svg": "image/svg+xml",
-}
 _HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; connect-src 'self'; "
     "img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; base-uri 'none'; "
@@ -136,9 +137,9 @@ def build_application(
     """
     application = Starlette(
         routes=[
-            Route("/", _static),
+            Route("/", lambda _: FileResponse(_STATIC / "index.html")),
             Route("/static/plotly.js", _plotly),
-            Route("/static/{name}", _static),
+            Mount("/static", StaticFiles(directory=_STATIC)),
             Route("/api/stream", _stream),
             *(Route(path, partial(_answer, read)) for path, read in _ANSWERS.items()),
         ],
@@ -229,13 +230,6 @@ def _same(a: str, b: str) -> bool:
 def _digest(token: str) -> str:
     """Return a token's hash for the cookie: a header cannot hold every token, nor should it."""
     return hashlib.sha256(token.encode(errors="replace")).hexdigest()
-
-
-def _static(request: Request) -> Response:
-    name = request.path_params.get("name", "index.html")
-    if name not in _FILES:
-        raise DataError("there is no such file")
-    return Response((_STATIC / name).read_bytes(), media_type=_FILES[name])
 
 
 @cache

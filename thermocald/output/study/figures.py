@@ -239,8 +239,8 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
         return None
     return Figure(
         "temperature-dependence", "Dependence on the temperature",
-        "Each parameter against the reference temperature, with a straight line whose fit takes "
-        "the noise of both into account.",
+        "The change of each parameter since the first epoch against the reference temperature, "
+        "with a straight line whose fit takes the noise of both into account.",
         tuple(panels),
     )  # fmt: skip
 

@@ -136,13 +136,9 @@ def _answer(camera: CameraStudy) -> Answer:
 def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
     drawn = study_figures(camera)
 
-    def section(
-        title: str, names: Sequence[str], found: Sequence[Table],
-        text: Sequence[str] = (), folded: bool = False,
-    ) -> Section:  # fmt: skip
+    def section(title: str, names: Sequence[str], found: Sequence[Table], **more: Any) -> Section:
         shown = tuple(drawn[name] for name in names if name in drawn)
-        rows = tuple(t for t in found if t.rows)
-        return Section(title, tuple(text), shown, rows, folded=folded)
+        return Section(title, figures=shown, tables=tuple(t for t in found if t.rows), **more)
 
     matrices = [name for name in drawn if name.startswith("correlation-")]
     depends = tables.dependence_tables(camera)
@@ -153,7 +149,7 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
         ),
         section(
             "How it depends on the temperature", ("temperature-dependence",),
-            depends[:1], text=detail_sentences(camera),
+            depends[:1], text=tuple(detail_sentences(camera)),
         ),
         section(
             "What it means in object space", ("object-space-errors", "errors-by-point"),
@@ -204,10 +200,9 @@ def _notes(camera: CameraStudy) -> list[str]:
 
 def _doubts(camera: CameraStudy) -> list[str]:
     """Return the doubts about all series, a line each, with the name if there are several."""
+    several = len(camera.series) > 1
     measured = [study.series for study in camera.series]
-    names = [series.name if len(measured) > 1 else "" for series in measured]
-    each = zip(measured, names, strict=True)
-    return [line for series, name in each for line in doubt_lines(series.doubts, name)]
+    return [line for s in measured for line in doubt_lines(s.doubts, s.name if several else "")]
 
 
 _CLOSE = 0.9

@@ -24,19 +24,20 @@ from thermocald.output.testfield.sheets import STRIP, TRIM, Sheet, markers_of
 from thermocald.photogrammetry.targets import outline, ring_code
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.output.testfield.sheets import Board
+    from thermocald.output.testfield.sheets import Marker
+    from thermocald.photogrammetry.targets.boards import Board
 
 
 _MM_PER_INCH = 25.4
 _POINTS_PER_MM = 72 / _MM_PER_INCH
 _RULER = 100.0
-_LEGEND_HEIGHT = 2.1
+_LEGEND_HEIGHT, _LINE_WIDTH = 2.1, 0.1
 GREY = "0.62"
 """The colour of text for people: too light to be mistaken for a target."""
 
@@ -56,11 +57,11 @@ class Pen:
             PathPatch(path, facecolor=colour, edgecolor="none", transform=self.transform)
         )
 
-    def line(self, points: Sequence[tuple[float, float]], colour: str, width: float = 0.15) -> None:
+    def line(self, points: Sequence[tuple[float, float]], colour: str) -> None:
         self.figure.add_artist(
             PathPatch(
                 Curve(np.asarray(points)), fill=False, edgecolor=colour,
-                linewidth=width * _POINTS_PER_MM, transform=self.transform, capstyle="butt",
+                linewidth=_LINE_WIDTH * _POINTS_PER_MM, transform=self.transform, capstyle="butt",
             )
         )  # fmt: skip
 
@@ -110,18 +111,18 @@ def draw_margins(pen: Pen, size: tuple[float, float]) -> None:
     w, h = size
     for x, sx in ((0.0, -1.0), (w, 1.0)):
         for y, sy in ((0.0, -1.0), (h, 1.0)):
-            pen.line([(x + sx * 1, y), (x + sx * (TRIM - 1.5), y)], "black", 0.1)
-            pen.line([(x, y + sy * 1), (x, y + sy * (TRIM - 1.5))], "black", 0.1)
+            pen.line([(x + sx * 1, y), (x + sx * (TRIM - 1.5), y)], "black")
+            pen.line([(x, y + sy * 1), (x, y + sy * (TRIM - 1.5))], "black")
     for along, length in enumerate(size):
         total = min(_RULER, 10 * int((length - STRIP - 10) / 10))
 
         def at(s: float, t: float, along: int = along) -> tuple[float, float]:
             return (STRIP + s, t) if along == 0 else (t, STRIP + s)
 
-        pen.line([at(0, 4), at(total, 4)], pen.colour, 0.1)
+        pen.line([at(0, 4), at(total, 4)], pen.colour)
         for mm in range(int(total) + 1):
             tick = 3.0 if mm % 10 == 0 else 2.0 if mm % 5 == 0 else 1.2
-            pen.line([at(mm, 4), at(mm, 4 + tick)], pen.colour, 0.1)
+            pen.line([at(mm, 4), at(mm, 4 + tick)], pen.colour)
         words = f"0 to {total:g} mm: measure it; if not {total:g}.0 mm, the printer has scaled it"
         x, y = at(0, 1.2)
         if along == 0:
@@ -266,29 +267,30 @@ def _legend(pen: Pen, sheet: Sheet) -> None:
     bar = sheet.scale_bar
     words = f"{sheet.title}, discs {sheet.design.diameter:g} mm"
     if bar is not None:
-        a, b = (sheet.field.names[row] for row in bar)
-        ends, levels = sheet.field.points[[*bar], :2].T.tolist()
-        distance = float(np.hypot(np.diff(ends), np.diff(levels))[0])
-        words += f"; scale {a}–{b}: nominal {distance:.2f} mm, measured ________ mm"
+        words += "; scale {a}–{b}: nominal {nominal:.2f} mm, measured ________ mm".format(**bar)
+        rows = [sheet.field.index[bar[end]] for end in "ab"]
+        ends, levels = sheet.field.points[rows, :2].T.tolist()
         if levels[0] == levels[1]:
             y = STRIP - 1.0
             for x in ends:
-                pen.line([(x, y - 1.2), (x, y + 1.2)], pen.colour, 0.1)
-            pen.line([(x, y) for x in ends], GREY, 0.1)
+                pen.line([(x, y - 1.2), (x, y + 1.2)], pen.colour)
+            pen.line([(x, y) for x in ends], GREY)
     pen.text(STRIP, STRIP - 4.6, words, _LEGEND_HEIGHT)
 
 
-def draw_board(board: Board, page: tuple[float, float]) -> Any:
-    """Draw a board in the middle of a page (mm), with rulers and its name, as a Figure."""
+def draw_board(
+    board: Board, page: tuple[float, float], origin: Sequence[float], markers: Iterable[Marker]
+) -> Any:
+    """Draw a board with its origin at a place on a page (mm), with rulers and its name."""
     pen = Pen(page, light=False)
     size = (page[0] - 2 * TRIM, page[1] - 2 * TRIM)
     draw_margins(pen, size)
     name = board.name.partition(" ")[2]
     pen.text(STRIP, STRIP - 4.6, f"{name}, {board.measures}", _LEGEND_HEIGHT)
-    dx, dy = board.place(page)
+    dx, dy = origin
     for x, y, side in board.squares():
         pen.fill(rectangle(x + dx, y + dy, side, side), "black")
-    for _, (x, y), side, cells in board.markers():
+    for _, (x, y), side, cells in markers:
         draw_marker(pen, (x + dx, y + dy), side, cells)
     return pen.figure
 

@@ -18,7 +18,7 @@ import importlib
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import count, product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -26,8 +26,9 @@ from thermocald.errors import UsageError
 from thermocald.figures import drawing_style
 from thermocald.files import new_file
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.targets import boards, ring_code
-from thermocald.photogrammetry.targets.markers import dictionary, marker_cells, marker_dictionaries
+from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.boards import Board as Board  # noqa: TC001  # for commands
+from thermocald.photogrammetry.targets.markers import dictionary, marker_cells, marker_size
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+
+    Marker: TypeAlias = tuple[str, tuple[float, float], float, NDArray[np.bool_]]
+    """Name, centre and side mm, and cells (n, n): True where black, the first row on top."""
 
 PAPERS = {
     "A0": (841.0, 1189.0),
@@ -58,7 +62,7 @@ _MARKER_EVERY = 5
 _CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))
 """Corners of a marker in OpenCV's order, as signs right and up of its centre."""
 _MARKER_SIDE = 6.0
-"""Side of a marker in radii of a disc; its white surround then still fits into the pitch."""
+"""Side of a marker in radii of a disc; its surround then still fits into the pitch."""
 # Standard deviations of a print before its survey, mm: the printer's irregularity, its scale error
 # (per mm from the sheet's centre), paper that is not flat, sheets that are mounted by hand.
 _SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
@@ -104,8 +108,11 @@ class Sheet:
         return _EDGES[_TITLES.index(self.title)] if self.title in _TITLES else {}
 
     @property
-    def scale_bar(self) -> tuple[int, int] | None:
-        """The rows of the two coded circles to measure between, the ends of the lowest row."""
+    def scale_bar(self) -> dict[str, Any] | None:
+        """The two coded circles to measure between, the ends of the lowest row, and their distance.
+
+        sheet: its title; a, b: their names; nominal: the distance, mm.
+        """
         circles = np.flatnonzero(self.field.circles).tolist()
         coded = [i for i in circles if self.field.codes[i]] or circles
         if len(coded) < 2:
@@ -113,7 +120,10 @@ class Sheet:
         x, y, _ = self.field.points.T
         upwards = sorted(coded, key=lambda i: (y[i], x[i]))
         lowest = [i for i in upwards if y[i] == y[upwards[0]]]
-        return (upwards[0], lowest[-1]) if len(lowest) > 1 else (upwards[0], upwards[-1])
+        ends = [upwards[0], lowest[-1] if len(lowest) > 1 else upwards[-1]]
+        length = float(np.linalg.norm(np.subtract(*self.field.points[ends])))
+        a, b = (self.field.names[row] for row in ends)
+        return {"sheet": self.title, "a": a, "b": b, "nominal": length}
 
 
 def paper_size(
@@ -163,6 +173,8 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
             if design.dictionary and (i + 2 * j) % _MARKER_EVERY == _MARKER_EVERY // 2:
                 code = next(markers)
                 name, h = f"M{code.rpartition(':')[2]}", _MARKER_SIDE * design.diameter / 4
+                if design.light:  # with its white surround, which would reach the plain circles
+                    h /= 1 + 2 / marker_size(code.partition(":")[0])
                 corners += [
                     (f"{name}.{i}", u + h * right, v + h * up, f"{code}:{i}")
                     for i, (right, up) in enumerate(_CORNERS)
@@ -240,9 +252,6 @@ def _codes(design: Design) -> Iterator[str]:
 def _marker_codes(design: Design) -> Iterator[str]:
     name = design.dictionary
     if name is not None:
-        known = marker_dictionaries()
-        if name not in known:
-            raise UsageError(f"no marker dictionary {name!r}; there are {', '.join(known)}")
         available = len(dictionary(name).bytesList)
         yield from (f"{name}:{i}" for i in range(available))
         raise UsageError(f"the field needs more than the {available} markers of {name}")
@@ -274,13 +283,8 @@ def field_of(sheets: Sequence[Sheet]) -> TestField:
     )  # fmt: skip
 
 
-def markers_of(
-    field: TestField, border: int = 1
-) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
-    """Yield the markers of a flat field: name, centre and side mm, cells (n, n).
-
-    border: width of the black border in cells; a cell is True where black, the first row on top.
-    """
+def markers_of(field: TestField, border: int = 1) -> Iterator[Marker]:
+    """Yield the markers of a flat field; border: width of the black border in cells."""
     rows = [r for r, kind in enumerate(field.kinds) if kind == "marker_corner"]
     for first in range(0, len(rows), 4):
         quad = field.points[rows[first : first + 4], :2]
@@ -293,129 +297,30 @@ def markers_of(
         yield field.names[rows[first]].rpartition(".")[0], (x, y), float(np.ptp(quad[:, 0])), turned
 
 
-KINDS = ("charuco", "chessboard", "aprilgrid")
 _APRIL_BORDER = 2
 _MARKER_SHARE = 0.75  # side of a ChArUco marker over its square's, if no size is given
 _QUIET = 0.5  # white margin of a board over a square's side
 
 
-@dataclass(frozen=True, slots=True)
-class Board:
-    """A board of columns × rows: squares of a ChArUco board, inner corners of a chessboard, tags.
+def filled(board: Board, page: tuple[float, float]) -> Board:
+    """Return a board with the largest sizes that fit on a page (mm) in place of zeros."""
+    side = board.marker if board.has_tags else board.square
+    if side == 0:
+        unit = _extent(replace(board, square=1.0, marker=1.0))
+        side = min(room / one for room, one in zip(_room(page), unit, strict=True))
+        side = float(np.floor(side) if side >= 5 else np.floor(10 * side) / 10)
+        if side <= 0:
+            raise UsageError(f"{board.name} does not fit on {page[0]:g} × {page[1]:g} mm")
+    if board.has_tags:
+        return replace(board, marker=side)
+    return replace(board, square=side, marker=board.marker or round(_MARKER_SHARE * side, 1))
 
-    square mm: side of a square (not of an AprilGrid); marker mm: side of a marker or tag with its
-    black border; spacing: gap between tags over their side; dictionary: of a ChArUco board, by its
-    OpenCV name; legacy: ChArUco as drawn by OpenCV before 4.6.
-    """
 
-    kind: str
-    columns: int
-    rows: int
-    square: float = 0.0
-    marker: float = 0.0
-    spacing: float = 0.3
-    dictionary: str = "DICT_5X5_1000"
-    legacy: bool = False
-
-    @property
-    def _tags(self) -> bool:
-        return self.kind == "aprilgrid"
-
-    def field(self, sigma: float | None = None) -> TestField:
-        """Return the test field, origin at the board's lower left; sigma: mm, None for a print."""
-        if self.kind == "charuco":
-            return boards.charuco(
-                self.columns, self.rows, self.square, self.marker, self.dictionary,
-                legacy=self.legacy, sigma=sigma,
-            )  # fmt: skip
-        if self.kind == "chessboard":
-            return boards.chessboard(self.columns, self.rows, self.square, sigma=sigma)
-        return boards.aprilgrid(self.columns, self.rows, self.marker, self.spacing, sigma=sigma)
-
-    @property
-    def name(self) -> str:
-        """The kind and size of the board, in words."""
-        kind, unit = {
-            "charuco": ("a ChArUco board", "squares"),
-            "chessboard": ("a chessboard", "inner corners"),
-            "aprilgrid": ("an AprilGrid", "tags"),
-        }[self.kind]
-        return f"{kind} of {self.columns} × {self.rows} {unit}"
-
-    @property
-    def measures(self) -> str:
-        """The dimensions of squares, markers or tags, in words."""
-        if self.kind == "charuco":
-            return (
-                f"squares {self.square:g} mm, markers {self.marker:g} mm of {self.dictionary}"
-                + (", as OpenCV drew it before 4.6" if self.legacy else "")
-            )
-        if self.kind == "chessboard":
-            return f"squares {self.square:g} mm"
-        return f"tags {self.marker:g} mm, {self._gap:g} mm apart"
-
-    def filled(self, page: tuple[float, float]) -> Board:
-        """Return the board with the largest sizes that fit on a page (mm) in place of zeros."""
-        side = self.marker if self._tags else self.square
-        if side == 0:
-            unit = replace(self, square=1.0, marker=1.0)._extent()
-            room = _room(page)
-            side = min(room[0] / unit[0], room[1] / unit[1])
-            side = np.floor(side) if side >= 5 else np.floor(10 * side) / 10
-            if side <= 0:
-                raise UsageError(f"{self.name} does not fit on {page[0]:g} × {page[1]:g} mm")
-        if self._tags:
-            return replace(self, marker=float(side))
-        marker = self.marker or round(_MARKER_SHARE * side, 1)
-        return replace(self, square=float(side), marker=marker)
-
-    def check_fits(self, page: tuple[float, float]) -> None:
-        """Raise UsageError, with what would fit, if the board is larger than the page (mm)."""
-        (w, h), room = self._extent(), _room(page)
-        if w > room[0] + 1e-6 or h > room[1] + 1e-6:
-            raise UsageError(
-                f"{self.name} ({self.measures}) needs {w:.0f} × {h:.0f} mm with its white margin; "
-                f"{page[0]:g} × {page[1]:g} mm paper has room for {room[0]:.0f} × {room[1]:.0f}; "
-                "use smaller squares or larger paper"
-            )
-
-    def place(self, page: tuple[float, float]) -> tuple[float, float]:
-        """Return the position of the origin that centres the board on a page (mm)."""
-        room, (width, height) = _room(page), self._black()
-        low = -self._gap if self._tags else 0.0
-        return STRIP + (room[0] - width) / 2 - low, STRIP + (room[1] - height) / 2 - low
-
-    @property
-    def _gap(self) -> float:
-        return self.spacing * self.marker
-
-    @property
-    def _step(self) -> float:
-        return self.marker + self._gap if self._tags else self.square
-
-    def _black(self) -> tuple[float, float]:
-        """Return the width and height of the black area, mm."""
-        more = self._gap if self._tags else self.square * (self.kind == "chessboard")
-        return self.columns * self._step + more, self.rows * self._step + more
-
-    def _extent(self) -> tuple[float, float]:
-        """Return the width and height with the white margin, mm."""
-        quiet = 2 * (self._gap if self._tags else _QUIET * self.square)
-        width, height = self._black()
-        return width + quiet, height + quiet
-
-    def squares(self) -> Iterator[tuple[float, float, float]]:
-        """Yield the black squares that are not markers: lower left x, y and side, mm."""
-        low, side = (-self._gap, self._gap) if self._tags else (0.0, self.square)
-        rows, columns = (n + (self.kind != "charuco") for n in (self.rows, self.columns))
-        white = self.legacy and self.rows % 2 == 0  # the upper left one
-        for j, i in product(range(rows), range(columns)):
-            if self._tags or (i + rows - 1 - j) % 2 == white:
-                yield i * self._step + low, j * self._step + low, side
-
-    def markers(self) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
-        """Yield the markers, as `markers_of` does."""
-        return markers_of(self.field(), _APRIL_BORDER if self._tags else 1)
+def _extent(board: Board) -> tuple[float, float]:
+    """Return the width and height of a board with its white margin, mm."""
+    (width, height), side = board.black, board.lattice[3]
+    quiet = 2 * (side if board.has_tags else _QUIET * side)
+    return width + quiet, height + quiet
 
 
 def _room(page: tuple[float, float]) -> tuple[float, float]:
@@ -457,17 +362,9 @@ class Printed:
             "sheets": len(self.sheets) or 1,
             "targets": len(self.field),
         }
-        if self.board is not None:
-            board = self.board
-            return document | {
-                "board": board.kind, "square": board.square, "marker": board.marker
-            }  # fmt: skip
-        bars = []
-        for sheet in self.sheets:
-            if sheet.scale_bar is not None:
-                a, b = (sheet.field.names[row] for row in sheet.scale_bar)
-                length = float(np.linalg.norm(np.subtract(*sheet.field.points[[*sheet.scale_bar]])))
-                bars.append({"sheet": sheet.title, "a": a, "b": b, "nominal": length})
+        if (board := self.board) is not None:
+            sizes = {"square": board.square, "marker": board.marker}
+            return document | {"board": board.kind, **sizes}
         corners = self.field.kinds.count("marker_corner")
         plain = self.field.codes.count("")
         return document | {
@@ -475,7 +372,7 @@ class Printed:
             "coded": len(self.field) - corners - plain,
             "plain": plain,
             "markers": corners // 4,
-            "scale_bars": bars,
+            "scale_bars": [sheet.scale_bar for sheet in self.sheets if sheet.scale_bar],
         }
 
     def lines(self) -> list[str]:
@@ -528,9 +425,20 @@ def print_board(
 
     page: width, height mm. Raises UsageError if the board does not fit on it.
     """
-    board.check_fits(page)
+    (width, height), room = _extent(board), _room(page)
+    if width > room[0] + 1e-6 or height > room[1] + 1e-6:
+        raise UsageError(
+            f"{board.name} ({board.measures}) needs {width:.0f} × {height:.0f} mm with its white "
+            f"margin; {page[0]:g} × {page[1]:g} mm paper has room for {room[0]:.0f} × "
+            f"{room[1]:.0f}; use smaller squares or larger paper"
+        )
     field = board.field()
-    files = _publish([_drawing().draw_board(board, page)], 1, field, folder, replace_printed)
+    # where the origin is on the page if the board is in its middle
+    low = board.lattice[3] if board.has_tags else 0.0
+    origin = [STRIP + (r - b) / 2 + low for r, b in zip(room, board.black, strict=True)]
+    markers = markers_of(field, _APRIL_BORDER if board.has_tags else 1)
+    drawn = _drawing().draw_board(board, page, origin, markers)
+    files = _publish([drawn], 1, field, folder, replace_printed)
     return Printed(folder, files, (), field, page, board)
 
 

@@ -62,6 +62,13 @@ class TestField:
         if len(set(self.names)) != n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise TestFieldError(f"target {twice!r} is duplicated in the test field")
+        first: dict[str, str] = {}
+        for name, code in zip(self.names, self.codes, strict=True):
+            if code and (other := first.setdefault(code, name)) != name:
+                raise TestFieldError(
+                    f"code {code!r} is duplicated in the test field, at targets {other!r} and "
+                    f"{name!r}"
+                )
         for array in (self.points, self.sigmas, self.diameters):
             array.setflags(write=False)
 

@@ -12,7 +12,7 @@ tilted or shifted lens from defocus; heat causes both.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
 from thermocald.photogrammetry.targets.markers import corners_turned_deg, is_marker, locate_markers
 from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_maps
-from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings
+from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings, is_ring
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -104,6 +104,10 @@ _TURNED = (
     "is OpenCV's first, in an upright AprilTag the bottom right one, and the others follow "
     "clockwise; `thermocald testfield import` writes this order"
 )
+_MIRRORED = (
+    "the frame is mirrored: the test field is found in its mirror image only. Switch mirroring off "
+    "in the camera, or photograph the field without a mirror"
+)
 _WORTH_A_SECOND_LOOK = {
     "not found", "no corner where the marker has one", "the fit does not converge"
 }  # fmt: skip
@@ -149,7 +153,16 @@ def measure(
     if not status.ok:
         return Measurement(Observations.none(), status)
     height, width = image.shape
-    return _Frame(image, testfield, camera or CameraSpec("", Sensor(width, height, 1.0))).measure()
+    camera = camera or CameraSpec("", Sensor(width, height, 1.0))
+    found = _Frame(image, testfield, camera).measure()
+    # in a mirror, a chessboard and plain circles look the same
+    if found.status.word in ("nothing_found", "other_field") and any(
+        is_marker(code) or is_ring(code) for code in testfield.codes
+    ):
+        mirrored = np.ascontiguousarray(image[:, ::-1])
+        if _Frame(mirrored, testfield, camera).measure().status.ok:
+            return replace(found, status=FrameStatus(found.status.word, _MIRRORED))
+    return found
 
 
 class _Frame:
@@ -199,14 +212,8 @@ class _Frame:
         again = {row for row, why in self._missed.items() if why in _WORTH_A_SECOND_LOOK}
         if len(corners) < max(_FEW_CORNERS, len(again)):
             again = set()
-        rows = [
-            row
-            for row, (kind, code) in enumerate(
-                zip(self._field.kinds, self._field.codes, strict=True)
-            )
-            if (kind == "chess_corner" and not code)
-            or (row in again and (kind == "chess_corner" or is_marker(code)))
-        ]
+        appearances = enumerate(zip(self._field.kinds, self._field.codes, strict=True))
+        rows = sorted(again.union(row for row, how in appearances if how == ("chess_corner", "")))
         if len(corners) < _FEWEST or not rows:
             return Observations.none()
         try:

@@ -4,8 +4,7 @@
     next frames ─► fixed weights in windows ─► moved or disturbed ones fitted again ─► observations
                         └─► too many lost ─► full search, with the reason in the measurement
 
-A tracker stores where the targets were in the last frame, and no image. Of an encoded image only
-the parts around the targets are decoded, if its format allows it.
+A tracker stores where the targets were in the last frame, and no image.
 
 A hidden circle is looked for at its predicted place. While markers that a search missed are not
 seen (somebody stood in front of them), the whole frame is searched again 1, 2, 4, 8 … frames later:
@@ -36,11 +35,10 @@ from thermocald.photogrammetry.frame.measurement import (
 )
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
-from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel
 from thermocald.photogrammetry.targets.image_file import EncodedImage
-from thermocald.photogrammetry.targets.outline import LocalMap, window_reach, windows
+from thermocald.photogrammetry.targets.outline import LocalMap, windows
 from thermocald.photogrammetry.targets.ring_code import have_rings
 
 if TYPE_CHECKING:
@@ -137,7 +135,7 @@ _LOST_SHARE = 0.3
 _RENEW_SHARE = 0.1
 _SUDDEN_LOSS = 0.95  # share of the targets that remain
 _FEWEST = 4
-_MARGIN_PX = 3.0  # around the windows; if targets move farther, the whole frame is decoded
+_MOVED_PX = 3.0  # from where a tracked target is found by a search
 
 
 _Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, Array, NDArray[np.bool_]]"
@@ -168,11 +166,6 @@ class Tracker:
         due = bool(self._missed) and self._age & (self._age - 1) == 0  # a power of two
         fewest = _SUDDEN_LOSS * self._seen if self._corners else 0.0
         if isinstance(image, EncodedImage):
-            if self._shape is not None and self._dtype == np.uint8 and not due:
-                parts = image.around(_boxes(self._circles, self._corners), self._shape)
-                found = None if parts is None else self._track(parts, _MARGIN_PX)
-                if found is not None and len(found.observations) >= fewest:
-                    return found
             image = image.whole()
         if self._shape is None:
             return self._search(image, "nothing is tracked yet")
@@ -194,7 +187,7 @@ class Tracker:
             a, b = found.observations, tracked.observations
             _, i, j = np.intersect1d(a.targets, b.targets, return_indices=True)
             off = np.abs(a.points[i] - b.points[j])
-            if len(a) <= len(b) and not (off.size and np.median(off) > _MARGIN_PX):
+            if len(a) <= len(b) and not (off.size and np.median(off) > _MOVED_PX):
                 return tracked
         # after a bad frame the targets may still be at their last places
         if found.status.ok:
@@ -231,13 +224,13 @@ class Tracker:
         add_unknown_tilts(tilts, self._testfield, found.orientation.camera, rows, maps, p)
         return rows, GradientWeights.build(image, maps, coded, p, fit.noise), tilts, seen
 
-    def _track(self, image: Image, farthest: float = np.inf) -> Measurement | None:
-        """Measure in windows; None if too many targets are lost or moved beyond `farthest` px."""
+    def _track(self, image: Image) -> Measurement | None:
+        """Measure in windows; None if too many targets are lost."""
         missed: dict[int, str] = {}
         circles = self._circles
         found = measure_corners(image, self._corners, missed)
         if circles is not None:
-            tracked = _track_circles(image, circles, missed, farthest)
+            tracked = _track_circles(image, circles, missed)
             if tracked is None:
                 return None
             found, circles = found.joined(tracked[0]), tracked[1]
@@ -249,27 +242,10 @@ class Tracker:
         return Measurement(found, OK, missed, None, self._corners)
 
 
-def _boxes(circles: _Circles | None, corners: Corners) -> NDArray[np.int64]:
-    """Return the boxes (n, 4) px used in the next frame: left, top, right, bottom (exclusive)."""
-    centres, halves = [corners.places], [np.full((len(corners), 2), CORNER_REACH_PX)]
-    if circles is not None:
-        weights = circles[1]
-        centres.append(weights.parameters[:, :2])
-        reach = window_reach(float(np.median(weights.parameters[:, 5])))
-        halves.append(weights.maps.half_extent + reach)
-    centre, half = np.concatenate(centres), np.concatenate(halves) + _MARGIN_PX + 1.0
-    low, high = np.floor(centre - half), np.ceil(centre + half) + 1.0
-    return np.column_stack([low, high]).astype(np.int64)
-
-
 def _track_circles(
-    image: Image, circles: _Circles, missed: dict[int, str], farthest: float
+    image: Image, circles: _Circles, missed: dict[int, str]
 ) -> tuple[Observations, _Circles] | None:
-    """Return observations and the new state.
-
-    Returns None if too many targets are lost, or if targets to be fitted again have moved by more
-    than `farthest` px.
-    """
+    """Return observations and the new state; None if too many targets are lost."""
     rows, weights, tilts, seen = circles
     fit = weights.apply(image)
     old, p, misfit = weights.parameters, fit.parameters, fit.misfit
@@ -291,8 +267,6 @@ def _track_circles(
     # assume that the others have moved like the calm ones
     shift = np.median(p[calm, :2] - old[calm, :2], axis=0) if calm.any() else np.zeros(2)
     if again.any():
-        if np.abs(shift).max() > farthest:
-            return None
         which = np.nonzero(again)[0]
         blur = float(np.median(old[:, 5]))
         others = fit_circles(

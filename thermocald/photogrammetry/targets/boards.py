@@ -12,6 +12,8 @@ row by row from the upper left one, whose outer square is black.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -28,13 +30,12 @@ from thermocald.photogrammetry.targets.markers import (
     halved,
     marker_rows,
     parse_marker,
-    refuse_duplicate,
     to_8_bit,
 )
 from thermocald.photogrammetry.targets.markers import dictionary as markers_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,7 +51,7 @@ def board_of(
     points: Array,
     kinds: Sequence[str],
     codes: Sequence[str],
-    sigma: float | Array | None = None,
+    sigma: float | None = None,
     diameter: float = np.nan,
 ) -> TestField:
     """Build a board of targets at points (n, 3) mm.
@@ -59,12 +60,10 @@ def board_of(
     """
     if not 4 <= len(names) <= _MOST_TARGETS:
         raise TestFieldError(f"a board of {len(names)} targets: it must have 4 to {_MOST_TARGETS}")
-    if sigma is None:
-        local = points - points.mean(axis=0)
-        spread = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local)
-        spread[:, 2] = _SIGMA_FLAT
-        sigma = spread
-    return TestField.build(names, points, sigma, diameter, kinds, codes)
+    spread = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * (points - points.mean(axis=0)))
+    spread[:, 2] = _SIGMA_FLAT
+    sigmas = spread if sigma is None else sigma
+    return TestField.build(names, points, sigmas, diameter, kinds, codes)
 
 
 def aprilgrid(
@@ -82,14 +81,10 @@ def aprilgrid(
     `first` is at the lower left; numbers increase to the right, then upwards. The corners of an
     upright tag are numbered clockwise from the bottom right one (`targets.markers`).
     """
-    if not (columns > 0 and rows > 0 and size > 0 and 0 <= spacing <= 1):
+    if not (1 <= columns <= 100 and 1 <= rows <= 100 and size > 0 and 0 <= spacing <= 1):
         raise TestFieldError(
-            f"an AprilGrid of {columns} × {rows} tags of {size:g} mm, spacing {spacing:g}: "
-            "counts and size must be above 0, the spacing (a ratio) between 0 and 1"
-        )
-    if columns * rows * 4 > _MOST_TARGETS:
-        raise TestFieldError(
-            f"an AprilGrid of {columns} × {rows} tags: it may have {_MOST_TARGETS // 4} at most"
+            f"an AprilGrid of {columns} × {rows} tags of {size:g} mm, spacing {spacing:g}: it must "
+            "have 1 to 100 tags each way, of more than 0 mm, and a spacing (a ratio) from 0 to 1"
         )
     step = size * (1 + spacing)
     square = np.array([[size, 0.0], [0.0, 0.0], [0.0, size], [size, size]])
@@ -170,17 +165,97 @@ def chessboard(
     return board_of(names, points, ["chess_corner"] * len(points), codes, sigma)
 
 
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A board of columns × rows: squares of a ChArUco board, inner corners of a chessboard, tags.
+
+    square, height mm: sides of a square (not of an AprilGrid), height None if they are equal;
+    marker mm: side of a marker or tag with its black border; spacing: gap between tags over their
+    side; dictionary: of a ChArUco board, by its OpenCV name; legacy: ChArUco as drawn by OpenCV
+    before 4.6; first: number of the first tag.
+    """
+
+    kind: str  # charuco, chessboard or aprilgrid
+    columns: int
+    rows: int
+    square: float = 0.0
+    marker: float = 0.0
+    spacing: float = 0.3
+    dictionary: str = "DICT_5X5_1000"
+    legacy: bool = False
+    first: int = 0
+    height: float | None = None
+
+    @property
+    def has_tags(self) -> bool:
+        """Whether the board is an AprilGrid, whose sizes are those of its tags."""
+        return self.kind == "aprilgrid"
+
+    def field(self, sigma: float | None = None) -> TestField:
+        """Return the test field, origin at the board's lower left; sigma: mm, None for a print."""
+        counts = self.columns, self.rows
+        if self.has_tags:
+            return aprilgrid(*counts, self.marker, self.spacing, first=self.first, sigma=sigma)
+        if self.kind == "chessboard":
+            return chessboard(*counts, self.square, self.height, sigma=sigma)
+        sides = self.square, self.marker
+        return charuco(*counts, *sides, self.dictionary, legacy=self.legacy, sigma=sigma)
+
+    @property
+    def name(self) -> str:
+        """The kind and size of the board, in words."""
+        kind, unit = {
+            "charuco": ("a ChArUco board", "squares"),
+            "chessboard": ("a chessboard", "inner corners"),
+            "aprilgrid": ("an AprilGrid", "tags"),
+        }[self.kind]
+        return f"{kind} of {self.columns} × {self.rows} {unit}"
+
+    @property
+    def measures(self) -> str:
+        """The dimensions of squares, markers or tags, in words."""
+        if self.has_tags:
+            return f"tags {self.marker:g} mm, {self.spacing * self.marker:g} mm apart"
+        sides = f"{self.square:g}" if self.height is None else f"{self.square:g} × {self.height:g}"
+        words = f"squares {sides} mm"
+        if self.kind == "charuco":
+            words += f", markers {self.marker:g} mm of {self.dictionary}"
+        return words + (", as OpenCV drew it before 4.6" if self.legacy else "")
+
+    @property
+    def lattice(self) -> tuple[int, int, float, float]:
+        """The columns and rows of the black squares that are no markers, their step, and side."""
+        more = self.kind != "charuco"
+        gap = self.spacing * self.marker
+        step, side = (self.marker + gap, gap) if self.has_tags else (self.square, self.square)
+        return self.columns + more, self.rows + more, step, side
+
+    @property
+    def black(self) -> tuple[float, float]:
+        """The width and height of the black area, mm."""
+        columns, rows, step, side = self.lattice
+        return (columns - 1) * step + side, (rows - 1) * step + side
+
+    def squares(self) -> Iterator[tuple[float, float, float]]:
+        """Yield the black squares that are not markers: lower left x, y and side, mm."""
+        columns, rows, step, side = self.lattice
+        low = -side if self.has_tags else 0.0
+        white = self.legacy and self.rows % 2 == 0  # the upper left one
+        for j, i in product(range(rows), range(columns)):
+            if self.has_tags or (i + rows - 1 - j) % 2 == white:
+                yield i * step + low, j * step + low, side
+
+
 def numbered_rings(
     numbers: Sequence[int],
     points: Array,
     bits: int,
     diameter: float,
-    *,
-    sigmas: Array | None = None,
+    sigma: float | None = None,
 ) -> TestField:
     """Build ring-coded targets numbered as by Metashape and AICON: the n-th code of `bits` bits.
 
-    numbers: n, from 1; points (n, 3) mm; diameter: of the inner disc, mm; sigmas (n, 3) mm.
+    numbers: n, from 1; points (n, 3) mm; diameter: of the inner disc, mm; sigma: as in `board_of`.
     """
     codes = ring_code.codes(bits)
     for number in numbers:
@@ -190,7 +265,7 @@ def numbered_rings(
             )
     return board_of(
         [str(n) for n in numbers], points, ["circle"] * len(numbers),
-        [ring_code.write(bits, codes[n - 1]) for n in numbers], sigmas, diameter,
+        [ring_code.write(bits, codes[n - 1]) for n in numbers], sigma, diameter,
     )  # fmt: skip
 
 
@@ -226,8 +301,7 @@ def locate_chessboards(
                 f"{code!r}: a board has at least 3 × 3 inner corners, numbered from 0"
             )
         chess_code(columns, rows, number)  # refuses a board that looks the same upside down
-        known = boards.setdefault((columns, rows), {})
-        refuse_duplicate(testfield, known.setdefault(number, row), row)
+        boards.setdefault((columns, rows), {})[number] = row
     found = Corners.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():

@@ -219,51 +219,33 @@ def fit_circles(
     """
     n = len(maps)
     coded = np.zeros(n, dtype=bool) if coded is None else coded
-    parts = list(windows(image, maps, coded, blur)) if n else []
-    parameters = np.zeros((n, 10))
+    parts = list(windows(image, maps, coded, blur))
     work = scratch("partials", (2, 10 * max((w.x.size for w in parts), default=0)), np.float32)
-    greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
-    # The first step is with a third of the pixels; its residuals where the image is flat show how
-    # the noise grows with the light.
-    for w in parts:
-        begin = w.begin if start is None else start[w.rows]
-        thin = w.thinned()
-        p, value, residual, *_, flat = _step(
-            thin, maps.select(w.rows), begin, noise, work, noise is None
-        )
-        parameters[w.rows] = p
-        if noise is None:
-            greys.append(value[flat])
-            residuals.append(residual[flat])
-    given = noise is not None
-    if noise is None:
-        noise = estimate_noise(np.concatenate(greys), np.concatenate(residuals), 3 * n)
+    given = noise
+    parameters, noise = _first_step(parts, maps, start, noise, work)
     normal = np.zeros((n, 10, 10))
     pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
     cut = np.zeros(n, dtype=bool)
     top = np.iinfo(image.dtype).max
     for w in parts:
         mine = maps.select(w.rows)
-        p, value, residual, N, step, settled, _ = fitted = _step(
-            w, mine, parameters[w.rows], noise, work
-        )
+        fitted = _step(w, mine, parameters[w.rows], noise, work)
         for _ in range(_ITERATIONS - 1):  # only fits that have not converged
-            left = np.flatnonzero(~settled)
+            left = np.flatnonzero(~fitted[5])
             if not len(left):
                 break
-            again = _step(w.select(left), mine.select(left), p[left], noise, work)
+            again = _step(w.select(left), mine.select(left), fitted[0][left], noise, work)
             for column, new in zip(cast("tuple[NDArray[Any], ...]", fitted), again, strict=True):
                 column[left] = new
-        parameters[w.rows], normal[w.rows], last_step[w.rows] = p, N, step
+        parameters[w.rows], value, residual, normal[w.rows], last_step[w.rows] = fitted[:5]
         pixels[w.rows] = w.weight.sum(axis=1)
-        weight = w.weight / noise.variance(value)
-        square[w.rows] = np.sum(weight * residual * residual, axis=1)
+        square[w.rows] = np.sum(w.weight / noise.variance(value) * residual * residual, axis=1)
         saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1)
         cut[w.rows] = w.cut
     saturation /= np.maximum(pixels, 1)
     variance = square / np.maximum(pixels - 10, 1)
     shown = np.abs(parameters[:, 7]) > _LEAST_CONTRAST * _noise_sd(parameters, noise)
-    if not given and np.count_nonzero(shown) >= _FEWEST_FOR_LEVEL:
+    if given is None and np.count_nonzero(shown) >= _FEWEST_FOR_LEVEL:
         # Its level is that of all residuals, since paper and compression cause noise at edges too;
         # but a hand or a glare of one grey value has no noise.
         level = float(np.median(variance[shown]))
@@ -277,19 +259,43 @@ def fit_circles(
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
 
 
+def _first_step(
+    parts: Sequence[Windows],
+    maps: LocalMap,
+    start: Array | None,
+    noise: NoiseModel | None,
+    work: Single,
+) -> tuple[Array, NoiseModel]:
+    """Take the first step with a third of the pixels; return the parameters (n, 10), and the noise.
+
+    The residuals where the image is flat show how the noise grows with the light.
+    """
+    parameters = np.zeros((len(maps), 10))
+    greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
+    for w in parts:
+        begin = w.begin if start is None else start[w.rows]
+        parameters[w.rows], value, residual, *_, flat = _step(
+            w.thinned(), maps.select(w.rows), begin, noise, work
+        )
+        greys.append(value[flat])
+        residuals.append(residual[flat])
+    return parameters, noise or estimate_noise(
+        np.concatenate(greys), np.concatenate(residuals), 3 * len(maps)
+    )
+
+
 def _step(
     w: Windows,
     maps: LocalMap,
     begin: Array,
     noise: NoiseModel | None,
     work: Single,
-    find_flat: bool = False,
 ) -> tuple[Array, Single, Single, Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Take one step of Gauss-Newton.
 
     Returns the parameters (n, 10), values and residuals (n, k) after it, the normal matrices
-    (n, 10, 10), the steps (n,) px, which fits have converged (n,), and with `find_flat` which
-    pixels (n, k) are in flat parts of the image. work (2, m): memory for the partials, which would
+    (n, 10, 10), the steps (n,) px, which fits have converged (n,), and which pixels (n, k) are in
+    flat parts of the image. work (2, m): memory for the partials, which would
     take longer to allocate than to fill.
     """
     p = begin.copy()
@@ -309,11 +315,9 @@ def _step(
     p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
     p[:, :2] += w.origin
     change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
-    flat = np.zeros(len(p), dtype=bool)
-    if find_flat:
-        # where a movement of a px hardly changes the grey value
-        slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
-        flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
+    # where a movement of a px hardly changes the grey value
+    slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
+    flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
     step = np.abs(delta[:, :2]).max(axis=1)
     settled = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
     return p, value + change, residual - change, N, step, settled, flat

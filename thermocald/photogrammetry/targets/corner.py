@@ -32,9 +32,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Image, Mask, Single
 
 
-REACH_PX = 10.0
-"""How far along the edges pixels are used."""
-
+_REACH_PX = 10.0  # how far along the edges pixels are used
 _CHUNK = 256  # corners that are fitted together
 _SERIES_TERMS = 9
 _ITERATIONS = 20
@@ -92,9 +90,7 @@ class Corners:
         )
 
 
-def measure_corners(
-    image: Image, corners: Corners, missed: dict[int, str] | None = None
-) -> Observations:
+def measure_corners(image: Image, corners: Corners, missed: dict[int, str]) -> Observations:
     """Measure corners in an image (H, W), grey, 8 or 16 bit.
 
     Returns observations with the quality `blur` px, `contrast`, `grey` (background), `noise` DN,
@@ -104,8 +100,7 @@ def measure_corners(
     found = Observations.none()
     for i in range(0, len(corners), _CHUNK):
         some, reasons = _fit(image, corners.select(slice(i, i + _CHUNK)))
-        if missed is not None:
-            missed.update(reasons)
+        missed.update(reasons)
         found = found.joined(some)
     return found
 
@@ -199,7 +194,7 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     """Return the pixels to fit, initial parameters (n, 7), and which corners the edge cuts off."""
     corners, n, side = found.places, len(found), _side(found)
     height, width = image.shape
-    along = np.minimum(0.45 * side, REACH_PX)
+    along = np.minimum(0.45 * side, _REACH_PX)
     half = int(np.ceil(along.max()))
     down, right = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     x, y = (np.rint(corners).astype(int).T)[..., None] + np.stack([right, down])[:, None]

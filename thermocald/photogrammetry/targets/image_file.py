@@ -1,13 +1,6 @@
-"""Image files: size from the header, grey values, parts of a JPEG, metadata.
+"""Image files: size from the header, grey values, metadata.
 
 Source: PNG (ISO/IEC 15948), 11.2.2 IHDR; JPEG (ITU T.81), B.2.2 frame header; TIFF 6.0, section 2.
-
-A JPEG can only be decoded from its start. Restart markers, which many phones and some webcams
-write, divide it into segments that can be decoded separately: those around the targets are joined
-to a smaller JPEG, which any decoder reads. The grey values are exactly those of the whole image,
-since each block of 8 × 8 px is transformed separately and the luminance is not interpolated.
-
-Source: ITU-T Recommendation T.81, B.2 (markers and headers) and A.2 (order of the blocks).
 
 JPEGs are decoded by libjpeg-turbo through simplejpeg, to the luminance only, in two thirds of the
 time of OpenCV. OpenCV decodes other files and those that simplejpeg refuses, to the same pixels.
@@ -21,13 +14,12 @@ from __future__ import annotations
 import struct
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import simplejpeg
 
-from thermocald.arrays import scratch
 from thermocald.errors import ImageError
 
 if TYPE_CHECKING:
@@ -39,9 +31,8 @@ if TYPE_CHECKING:
 _set_log_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel  # OpenCV 4, 5
 _set_log_level(2)  # errors: of a damaged file we tell
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
-_BASELINE = {0xC0, 0xC1}
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_DRI, _SOS, _EOI = 0xDD, 0xDA, 0xD9
+_SOS, _EOI = 0xDA, 0xD9
 _TIFF_SIZE, _SHORT = (256, 257), 3  # tags of width and height; the type of 16 bit
 _MOST_TAGS = 500
 
@@ -94,112 +85,12 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-_WORTH_IT = 0.98  # of the image; beyond, it is decoded as a whole
-
-
-_Layout: TypeAlias = tuple[int, int, tuple[int, int], tuple[int, int], int]
-"""A JPEG with restart markers: where its frame header states the size, where its coded bits start,
-width and height, px, of the tile that a segment covers, columns and rows of tiles, and the height
-of all minimum coded units, px."""
-
-
-def _layout(data: bytes) -> _Layout | None:
-    """Return the layout of a sequential JPEG with one scan and restart markers.
-
-    None for others, and if segments are neither equal parts of a row of units nor whole rows.
-    """
-    at = {marker: begin for marker, begin, _ in _segments(data)}
-    frame = next((at[marker] for marker in _BASELINE if marker in at), None)
-    if frame is None or not {_SOS, _DRI} <= at.keys() or (_FRAMES - _BASELINE) & at.keys():
-        return None
-
-    def word(place: int) -> int:
-        return int.from_bytes(data[place : place + 2], "big")
-
-    head, interval = at[_SOS], word(at[_DRI] + 4)
-    precision, components = data[frame + 4], data[frame + 9]
-    if precision != 8 or components not in (1, 3) or data[head + 4] != components:
-        return None
-    sampling = [data[frame + 11 + 3 * k] for k in range(components)]
-    wide, high = ([s >> 4 for s in sampling], [s & 15 for s in sampling])
-    height, width = word(frame + 5), word(frame + 7)
-    if max(wide) != wide[0] or max(high) != high[0] or not (height and width and interval):
-        return None
-    # the blocks of a single component are in order, whatever its sampling
-    unit = (8, 8) if components == 1 else (8 * wide[0], 8 * high[0])
-    across, down = -(-width // unit[0]), -(-height // unit[1])
-    if across % interval and interval % across:
-        return None
-    columns, rows = max(across // interval, 1), max(interval // across, 1)
-    return (
-        frame + 5, head + 2 + word(head + 2), (across // columns * unit[0], rows * unit[1]),
-        (columns, -(-down // rows)), down * unit[1],
-    )  # fmt: skip
-
-
-def _decode_tiles(
-    data: bytes, full: tuple[int, int], layout: _Layout, boxes: NDArray[np.int64]
-) -> NDArray[np.uint8] | None:
-    """Decode a JPEG of width and height `full` px; return as `EncodedImage.around`."""
-    low, high = np.clip(boxes.reshape(-1, 2, 2), 0, full).swapaxes(0, 1)
-    seen = (high > low).all(axis=1)
-    size_at, scan, tile, (columns, rows), coded = layout
-    tile_width, tile_height = tile
-    # which tiles meet a box, by cumulative sums of the boxes' corners
-    left, top = (low[seen] // tile).T
-    right, bottom = ((high[seen] - 1) // tile + 1).T
-    count = np.zeros((rows + 1, columns + 1), dtype=np.int64)
-    for y, x, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
-        np.add.at(count, (y, x), sign)
-    chosen = np.flatnonzero(count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1].ravel() > 0)
-    segments = _bits(data, scan, columns * rows)
-    if segments is None or not 0 < len(chosen) <= _WORTH_IT * columns * rows:
-        return None
-    row, column = np.divmod(chosen, columns)
-    lines = -(-len(chosen) // columns)
-    # the last line is filled up
-    filled = np.r_[chosen, np.repeat(chosen[-1:], lines * columns - len(chosen))]
-    width, height = columns * tile_width, lines * tile_height
-    if row[-1] == rows - 1:  # the last tiles may have fewer rows of units
-        height -= rows * tile_height - coded
-    size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
-    parts = [data[:size_at] + size + data[size_at + 4 : scan]]
-    for k, i in enumerate(filled.tolist()):
-        parts += [data[segments[i, 0] : segments[i, 1]], bytes((0xFF, 0xD0 + k % 8))]
-    parts[-1] = bytes((0xFF, _EOI))
-    packed: NDArray[np.uint8] = scratch("packed", (lines * tile_height, width), np.uint8)
-    simplejpeg.decode_jpeg(b"".join(parts), colorspace="GRAY", buffer=packed[:height])
-    shape = (tile_height, columns, tile_width)
-    image: NDArray[np.uint8] = scratch("parts", (rows * tile_height, width), np.uint8)
-    places = np.arange(len(chosen))
-    image.reshape(rows, *shape)[row, :, column] = packed.reshape(lines, *shape)[
-        places // columns, :, places % columns
-    ]
-    return np.ascontiguousarray(image[: full[1], : full[0]])
-
-
-def _bits(data: bytes, scan: int, count: int) -> NDArray[np.int64] | None:
-    """Return start and end (count, 2) of all segments' bits in `data`; None if some are missing."""
-    bits = np.frombuffer(data, np.uint8)[scan:]
-    at = np.flatnonzero(bits[:-1] == 0xFF)
-    after = bits[at + 1]
-    restart = (after & 0xF8) == 0xD0
-    others = at[~restart & (after != 0) & (after != 0xFF)]
-    if len(others) == 0 or bits[others[0] + 1] != _EOI:
-        return None
-    restart &= at < others[0]
-    marks = at[restart]
-    if len(marks) != count - 1 or np.any((after[restart] & 7) != np.arange(len(marks)) % 8):
-        return None
-    return scan + np.stack([np.r_[0, marks + 2], np.r_[marks, others[0]]], axis=1)
-
-
 _MOST_PIXELS = 250_000_000
 _MOST_BYTES = 1_000_000_000
 
 
 class EncodedImage:
-    """An image file, or its encoded bytes (H, W); only the parts needed are decoded.
+    """An image file, or its encoded bytes (H, W), decoded when asked for.
 
     size: width and height, px, by its header, None if that is not read (WebP).
     Raises ImageError if something is wrong with the file, at the latest when it is decoded.
@@ -255,21 +146,6 @@ class EncodedImage:
                 f"{self.name}: is not an image (JPEG, PNG and TIFF are read; convert HEIC)"
             )
         return image
-
-    def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-        """Return grey values (H, W) that are valid in boxes (n, 4) px.
-
-        A box is left, top, right and bottom, the last two exclusive. Elsewhere the values are
-        undefined. The next call in this thread reuses the memory. None if the file does not have
-        the shape (H, W), cannot be decoded in parts, or this would save no time.
-        """
-        if not self._is_jpeg or self.size is None or self.size[::-1] != tuple(shape):
-            return None
-        try:
-            layout = _layout(self.data)
-            return layout and _decode_tiles(self.data, self.size, layout, boxes)
-        except (IndexError, ValueError):
-            return None  # damaged; decoding the whole file reports how
 
 
 def decode_grey(source: Path | bytes) -> NDArray[Any]:

@@ -90,11 +90,6 @@ def dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(number)
 
 
-def marker_dictionaries() -> list[str]:
-    """Return the names of all dictionaries."""
-    return sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-
-
 def marker_size(name: str, border: int = 1) -> int:
     """Return the number of cells along the side of a marker with a border of `border` cells."""
     return int(dictionary(name).markerSize) + 2 * border
@@ -240,30 +235,14 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
     """Return {dictionary: {(marker, corner): row of the test field}}."""
     rows: dict[str, dict[tuple[int, int], int]] = {}
     for row, code in enumerate(testfield.codes):
-        if is_marker(code):
-            dictionary, marker, corner = parse_marker(code)
-            if corner is None:
-                continue
-            corners = rows.setdefault(dictionary, {})
-            refuse_duplicate(testfield, corners.setdefault((marker, corner), row), row)
+        dictionary, marker, corner = parse_marker(code) if is_marker(code) else ("", 0, None)
+        if corner is not None:
+            rows.setdefault(dictionary, {})[marker, corner] = row
     return rows
 
 
-def refuse_duplicate(testfield: TestField, first: int, row: int) -> None:
-    """Raise TestFieldError if a row has the code of another, the first one with it."""
-    if first != row:
-        a, b = testfield.names[first], testfield.names[row]
-        raise TestFieldError(
-            f"code {testfield.codes[row]!r} is duplicated in the test field, at targets {a!r} and "
-            f"{b!r}"
-        )
-
-
-def locate_markers(
-    image: Image, testfield: TestField, missed: dict[int, str] | None = None
-) -> Corners:
+def locate_markers(image: Image, testfield: TestField, missed: dict[int, str]) -> Corners:
     """Detect a test field's markers; `missed` receives {row: reason} for corners not found."""
-    missed = {} if missed is None else missed
     found: list[tuple[int, float, Array]] = []  # row, border, corner with its neighbours
     for name, known in marker_rows(testfield).items():
         expected = frozenset(marker for marker, _ in known)

@@ -121,8 +121,7 @@ def local_maps(
     return LocalMap(f[0], linear, second)
 
 
-REACH_PX = 4.0
-"""Pixels farther from the outline do not depend on the centre."""
+_REACH_PX = 4.0  # pixels farther from the outline do not depend on the centre
 _THIN = 3
 _CHUNK_PIXELS = 80_000  # of the windows that are processed together
 _CUT_PX = 2.0  # pixels this near to the outline must be in the image
@@ -160,11 +159,6 @@ class Windows:
         return replace(self, x=x, y=y, grey=grey, weight=weight)
 
 
-def window_reach(blur: float) -> float:
-    """Return how far from the outline pixels are used, px; blur: px."""
-    return max(REACH_PX, 4.0 * blur)
-
-
 def windows(
     image: Image, maps: LocalMap, coded: NDArray[np.bool_], blur: float = 0.9
 ) -> Iterator[Windows]:
@@ -173,18 +167,51 @@ def windows(
     coded (n,): targets with a code ring, whose pixels are excluded for a blur of `blur` px.
     """
     height, width = image.shape
-    reach_px = window_reach(blur)
-    half = np.ceil(maps.half_extent + reach_px).astype(int)
-    # Targets of similar size and shape have windows of the same size.
-    order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
+    reach_px = max(_REACH_PX, 4.0 * blur)
     levels = _background_and_contrast(image, maps)
     beyond = np.full((len(maps), 2), reach_px)
     clear = (RING_INNER - 1) * maps.semi_axes[coded] - _RING_CLEARANCE * blur
     beyond[coded] = np.clip(clear, 0.0, reach_px)
     outer = _grown_ellipses(maps, beyond)
     inner = _grown_ellipses(maps, np.full_like(beyond, -reach_px))
-    sizes = half[order].tolist()
+    near = _grown_ellipses(maps, np.full_like(beyond, _CUT_PX))
     flat = image.ravel()
+    for rows, hx, hy in _alike(np.ceil(maps.half_extent + reach_px).astype(int)):
+        ox, oy = np.arange(-hx, hx + 1), np.arange(-hy, hy + 1)
+        lx, ly = np.tile(ox, len(oy)), np.repeat(oy, len(ox))
+        origin = np.rint(maps.centre[rows]).astype(np.int64)
+        centre = maps.centre[rows] - origin
+        x, y = lx.astype(np.float32), ly.astype(np.float32)
+        powers = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)])
+        ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
+        inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
+        cut = np.any(~inside & (_squared_radius(near[rows], centre, powers) < 1.0), axis=1)
+        use = inside & (_squared_radius(outer[rows], centre, powers) <= 1.0)
+        use &= _squared_radius(inner[rows], centre, powers) >= 1.0
+        count = np.count_nonzero(use, axis=1)
+        # the pixels used, moved to the front of each row
+        filled = np.arange(max(int(count.max()), 1)) < count[:, None]
+        at = np.zeros(filled.shape, dtype=np.int64)
+        at[filled] = np.flatnonzero(use) - np.repeat(np.arange(len(rows)) * use.shape[1], count)
+        pixel = (np.take_along_axis(iy, at, 1) * width + np.take_along_axis(ix, at, 1)) * filled
+        grey = flat.take(pixel).astype(np.float32)
+        begin = np.zeros((len(rows), 10))
+        begin[:, :2] = maps.centre[rows]
+        begin[:, 5] = blur
+        begin[:, 6:8] = levels[rows]
+        yield Windows(
+            rows, pixel, origin.astype(float), x.take(at), y.take(at), grey,
+            filled.astype(np.float32), begin, cut,
+        )  # fmt: skip
+
+
+def _alike(half: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], int, int]]:
+    """Yield the rows of targets with windows of similar size, and half its width and height, px.
+
+    half (n, 2) px: half the extent of each target's own window.
+    """
+    order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
+    sizes = half[order].tolist()
     start = 0
     while start < len(order):
         stop, (hx, hy) = start + 1, sizes[start]
@@ -195,42 +222,8 @@ def windows(
             if (stop + 1 - start) * area > _CHUNK_PIXELS or area > largest:
                 break
             stop, hx, hy = stop + 1, wider, higher
-        rows = order[start:stop]
+        yield order[start:stop], hx, hy
         start = stop
-        ox, oy = np.arange(-hx, hx + 1), np.arange(-hy, hy + 1)
-        lx, ly = np.tile(ox, len(oy)), np.repeat(oy, len(ox))
-        origin = np.rint(maps.centre[rows]).astype(np.int64)
-        centre = maps.centre[rows] - origin
-        x, y = lx.astype(np.float32), ly.astype(np.float32)
-        powers = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)])
-        use = _squared_radius(outer[rows], centre, powers) <= 1.0
-        use &= _squared_radius(inner[rows], centre, powers) >= 1.0
-        cut = np.zeros(len(rows), dtype=bool)
-        reach_xy = np.array([hx, hy])
-        if np.any(origin < reach_xy) or np.any(origin + reach_xy >= (width, height)):
-            ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
-            inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
-            near = _grown_ellipses(maps.select(rows), np.full((len(rows), 2), _CUT_PX))
-            cut = np.any(~inside & (_squared_radius(near, centre, powers) < 1.0), axis=1)
-            use &= inside
-        count = np.count_nonzero(use, axis=1)
-        # the pixels used, moved to the front of each row
-        filled = np.arange(max(int(count.max()), 1)) < count[:, None]
-        at = np.zeros(filled.shape, dtype=np.int64)
-        at[filled] = np.flatnonzero(use) - np.repeat(np.arange(len(rows)) * use.shape[1], count)
-        pixel = (ly * width + lx).take(at)
-        pixel += origin[:, 1:] * width + origin[:, :1]
-        pixel *= filled
-        weight = filled.astype(np.float32)
-        grey = flat.take(pixel).astype(np.float32)
-        begin = np.zeros((len(rows), 10))
-        begin[:, :2] = maps.centre[rows]
-        begin[:, 5] = blur
-        begin[:, 6:8] = levels[rows]
-        yield Windows(
-            rows, pixel, origin.astype(float), x.take(at),
-            y.take(at), grey, weight, begin, cut,
-        )  # fmt: skip
 
 
 def _grown_ellipses(maps: LocalMap, beyond: Array) -> Array:

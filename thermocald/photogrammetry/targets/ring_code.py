@@ -40,7 +40,6 @@ from thermocald.photogrammetry.targets.markers import (
     detect_markers,
     is_marker,
     parse_marker,
-    refuse_duplicate,
     to_8_bit,
 )
 from thermocald.photogrammetry.targets.outline import RING_INNER, RING_OUTER, LocalMap, find_circles
@@ -399,7 +398,7 @@ def find_coded(
     named: dict[str, dict[int, int]] = {}
     for row, code in enumerate(testfield.codes):
         if testfield.kinds[row] == "circle" and is_ring(code):
-            refuse_duplicate(testfield, row_of.setdefault(parse(code), row), row)
+            row_of[parse(code)] = row
         elif testfield.kinds[row] == "circle" and is_marker(code):
             dictionary, marker, corner = parse_marker(code)
             if corner is None:

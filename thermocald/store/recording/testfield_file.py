@@ -19,6 +19,7 @@ from thermocald.store.recording.table import Table
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from thermocald.photogrammetry.targets.boards import Board
     from thermocald.result import Columns
 
 
@@ -92,6 +93,11 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             table.fail(row, "target", f"{name[:40]!r} must be printable")
         if first.setdefault(name, row) != row:
             table.fail(row, "target", f"target {name!r} is duplicated")
+    codes = [code.strip() for code in found.get("code", ("",) * len(names))]
+    known: dict[str, str] = {}
+    for row, code in enumerate(codes):
+        if code and (other := known.setdefault(code, names[row])) != names[row]:
+            table.fail(row, "code", f"code {code!r} is duplicated: target {other!r} has it")
     for column in _NUMBERS:
         numbers = found[column]
         table.check(column, abs(numbers) > _LARGEST_MM, f"must be within {_LARGEST_MM:g} mm")
@@ -102,8 +108,7 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             odd = (numbers > 0) & ((numbers < _SIGMAS_MM[0]) | (numbers > _SIGMAS_MM[1]))
             limits = f"{_SIGMAS_MM[0]:g} and {_SIGMAS_MM[1]:g} mm"
             table.check(column, odd, f"must be between {limits}; 0 holds the coordinate fixed")
-    empty = ("",) * len(names)
-    kinds = [text.strip() or KINDS[0] for text in found.get("kind", empty)]
+    kinds = [text.strip() or KINDS[0] for text in found.get("kind", ("",) * len(names))]
     for row, kind in enumerate(kinds):
         if kind not in KINDS:
             table.fail(row, "kind", f"{kind!r} is unknown; it is one of {', '.join(KINDS)}")
@@ -120,7 +125,7 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
         np.array([found[name] for name in ("sX", "sY", "sZ")]).T,
         found["diameter"].tolist(),
         kinds,
-        [code.strip() for code in found.get("code", empty)],
+        codes,
     )
 
 
@@ -161,15 +166,15 @@ def write_testfield(path: Path, field: TestField) -> None:
     write_text(path, testfield_csv(field))
 
 
-def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
-    """Read the board in a YAML or JSON file; return it with a description for the user.
+def read_board(path: Path) -> Board:
+    """Read the board in a YAML or JSON file.
 
     Kalibr: target_type aprilgrid or checkerboard, lengths in metres. Others: type charuco or
     chessboard with OpenCV's names for the parameters; lengths below 1 are in metres, others in mm.
     A file of calib.io's generator describes its board by its name (`calib.io_charuco_420x297_8x11_
     34_25_DICT_5X5.pdf`: 8 rows of 11 squares of 34 mm). Raises TestFieldError naming file and key.
     """
-    from thermocald.photogrammetry.targets import boards  # OpenCV is slow to import
+    from thermocald.photogrammetry.targets.boards import Board  # OpenCV is slow to import
 
     named = _CALIB_IO.fullmatch(path.name)
     # keys are compared in a plain form: `Square_Length_mm` → `squarelength`
@@ -177,7 +182,6 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         re.sub(r"[^a-z0-9]", "", k.lower().removesuffix("_mm")): v
         for k, v in read_yaml(path, TestFieldError).items()
     }  # fmt: skip
-    whose = "calib.io's" if named else "a"
     board = _BoardReader(path, plain)
     kind = str(plain.get("targettype", plain.get("type", ""))).lower()
     if not kind and any(k in plain for k in _SYNONYMS["dictionary"]):
@@ -193,33 +197,23 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         spacing = board.number("tagspacing", "1", above=0.0, high=1e6)
         start = next((key for key in ("startid", "lowid") if plain.get(key) is not None), None)
         first = 0 if start is None else int(board.number(start, "1", low=0, high=_MOST_ROWS))
-        field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
-        return field, (
-            f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, "
-            f"{spacing * size:g} mm apart"
-        )
+        return Board("aprilgrid", columns, rows, marker=size, spacing=spacing, first=first)
     if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in plain:
         wide = 1e3 * board.number("colspacingmeters", "m", above=0.0, high=1e6)
         high = 1e3 * board.number("rowspacingmeters", "m", above=0.0, high=1e6)
-        field = boards.chessboard(columns, rows, wide, high, sigma=sigma)
-        return field, f"Kalibr's checkerboard of {columns} × {rows} corners, {wide:g} × {high:g} mm"
+        return Board("chessboard", columns, rows, wide, height=high)
     square = board.length("square")
     if "charuco" not in kind:
         if {"squaresx", "numsquaresx"} & set(plain):  # one more than corners
             columns, rows = columns - 1, rows - 1
-        field = boards.chessboard(columns, rows, square, sigma=sigma)
-        return field, f"{whose} chessboard of {columns} × {rows} inner corners, {square:g} mm"
+        return Board("chessboard", columns, rows, square)
     marker = board.length("marker")
     key = board.find_key("dictionary")
     if plain.get(key) is None:
         raise board.fail(key, f"is missing; the file has {', '.join(plain)[:200]}")
     name = _dictionary(path, plain[key])
     legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
-    field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
-    return field, (
-        f"{whose} ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
-        f"{marker:g} mm of {name}"
-    )
+    return Board("charuco", columns, rows, square, marker, dictionary=name, legacy=legacy)
 
 
 class _BoardReader(QuantityReader):
@@ -307,8 +301,7 @@ def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = Non
         points.append(point)
     if not numbers:
         raise TestFieldError(f"{path}: holds no line `label, X, Y, Z`")
-    sigmas = None if sigma is None else np.full((len(points), 3), sigma)
-    return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigmas=sigmas)
+    return boards.numbered_rings(numbers, np.array(points), bits, diameter, sigma)
 
 
 def read_distances(path: Path) -> list[Distance]:

@@ -91,11 +91,6 @@ class Validity:
         if outside.any():
             T = self.worst(temperatures)
             if self.is_far(T) and not extrapolate:
-                if unit := self.other_unit(T):
-                    raise UsageError(
-                        f"{T:g} looks like {unit}: the model was fitted between {self.low:g} and "
-                        f"{self.high:g} °C; convert it"
-                    )
                 raise UsageError(
                     f"{self.place(T)}; set `extrapolate` (--extrapolate) to predict there"
                 )

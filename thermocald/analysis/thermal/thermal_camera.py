@@ -49,11 +49,10 @@ from thermocald.physics.operators import interpolation_matrix
 from thermocald.result import Result, jsonable
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
+    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.figures import Figure
     from thermocald.physics.model import ThermalModel
 
 
@@ -109,30 +108,22 @@ class ThermalCamera(Result):
         return model_lines(self.as_dict())
 
     @property
-    def _limits(self) -> tuple[float, float]:
+    def limits(self) -> tuple[float, float]:
         """The temperatures of the fit, °C; 15 K about T0 for a model that does not state them."""
         low, high, T0 = self.validity.low, self.validity.high, self.model.T0
         return (low, high) if math.isfinite(low) else (T0 - 15.0, T0 + 15.0)
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
-        sensor = self.model.sensor
-        drift = self._drift(band=not self.model.misses_an_effect)
-        return render_certificate(self.as_dict(), sensor, self._limits, drift, title)
+        return render_certificate(self, title)
 
-    def plot(self) -> Drawing:
+    def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
         Covers the range that the model was fitted on, with 95 % bands of these changes; other
         thermometers are taken to be as warm.
         """
-        return draw_figure(replace(self._drift(band=True), columns=1))
-
-    def _drift(self, *, band: bool) -> Figure:
-        T, T0 = np.linspace(*self._limits, 60), self.model.T0
-        changes, Q = map(np.array, zip(*(self.steady_change(T0, t) for t in T), strict=True))
-        sds = np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) if band else None
-        return drift_figure(T, T0, changes, sds)
+        return draw_figure(replace(drift_figure(self, band=True), columns=1))
 
     def steady_change(self, since: float, T: float) -> tuple[Array, Array]:
         """Return the change (10,) of the steady camera from one temperature to another, °C.
@@ -242,12 +233,17 @@ class ThermalCamera(Result):
         """The temperatures that the model was fitted on, without limits if it states none."""
         return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
+    @cached_property
+    def _table(self) -> tuple[Array, list[float]]:
+        """The steady camera's table, for one thermometer."""
+        return steady_table(self.model, self.parameters)
+
     def _steady(
         self, T: float, channels: Mapping[str, float] | None = None
     ) -> tuple[Array, Array, Array]:
         """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p)."""
         model, names = self.model, self.parameters
-        table, knees = steady_table(model, names, channels)
+        table, knees = steady_table(model, names, channels) if channels else self._table
         dT = T - model.T0
         basis = [1.0, dT, dT * dT]
         for knee in knees:
@@ -398,7 +394,7 @@ class ThermalCamera(Result):
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        table, knees = steady_table(self.model, ())
+        table, knees = self._table
         bends = [np.array([T, *table[:, 0, 3 + 2 * k]]) for k, T in enumerate(knees)]
         return table[:, 0, :3].T, bends
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
@@ -383,7 +384,7 @@ def test_a_delayed_epoch_has_the_camera_of_its_time():
     assert now.adjustment.interior.c == pytest.approx(results[-1].adjustment.interior.c)
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 6])
+@pytest.mark.parametrize("number", mostly_slow([0, 1, 2, 6], 1))
 def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(shared, number):
     """Two boards of a real room as control points, 25 pairs per camera.
 

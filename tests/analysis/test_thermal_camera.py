@@ -129,14 +129,6 @@ def test_missing_readings_are_refused():
     assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
 
 
-def test_binned_images_have_the_same_rays():
-    camera = ThermalCamera(thermal_model())
-    half = camera.for_images(1640, 1232)
-    centre = np.array([[100.0, 50.0]])
-    full = camera.at(30.0).rays(centre * 2 + 0.5)  # the middle of the four binned pixels
-    np.testing.assert_allclose(half.at(30.0).rays(centre), full, atol=1e-12)
-
-
 def test_second_thermometer_must_be_given():
     listed = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5})
     camera = ThermalCamera(thermal_model(listed))

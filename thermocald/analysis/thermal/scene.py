@@ -324,17 +324,12 @@ class SceneCourse(Result):
             | with_sds(keys[:3], turn, np.sqrt(C.diagonal()))
             for row, turn, C in self.movements
         ]
-        document: dict[str, Any] = jsonable(
-            {
-                "format": "thermocald-scene/1",
-                "camera": self.camera,
-                "frames": frames,
-                "per_kelvin": dict(zip(keys, slopes, strict=True)),
-                "sd_per_kelvin": dict(zip(keys, sds, strict=True)),
-                "model_misses_an_effect": self.model_misses,
-                "movements": movements,
-            }
-        )
+        document: dict[str, Any] = jsonable({
+            "format": "thermocald-scene/1", "camera": self.camera, "frames": frames,
+            "per_kelvin": dict(zip(keys, slopes, strict=True)),
+            "sd_per_kelvin": dict(zip(keys, sds, strict=True)),
+            "model_misses_an_effect": self.model_misses, "movements": movements,
+        })  # fmt: skip
         return document
 
     def lines(self) -> list[str]:

@@ -245,7 +245,7 @@ def row_blocks(
                     )
         if lines:
             block = _block(path, header, columns, lines, line, clock, order, log)
-            order = block.order or None
+            order = block.order if block.order in ORDERS else None
             yield block
         line, empty = line + len(lines), empty + len(lines)
     if not empty:
@@ -284,29 +284,42 @@ def seconds_of(text: str, clock: DeviceClock, order: str | None, log: Temperatur
 def find_order(
     texts: Sequence[str], where: str, clock: DeviceClock, log: TemperatureLog | None
 ) -> str:
-    """Return the order of day, month and year in which times are written, one of ORDERS.
+    """Return the order of day, month and year in which times are written; "any" if none needs one.
 
     Of several that fit it is the one in which the log knows a temperature, with a warning; without
-    a log it is "", not known. Raises DataError if the log does not decide.
+    a log it is "", not known. Raises DataError if none fits, or if the log does not decide.
     """
-    dates = {text[:10]: text for text in texts if date_orders(text) is not None}
-    fitting = [o for o in ORDERS if all(o in (date_orders(text) or ()) for text in dates.values())]
-    read = {o: [parse_moment(text, o) for text in dates.values()] for o in fitting}
-    one, *others = [o for i, o in enumerate(fitting) if read[o] not in [*read.values()][:i]] or [""]
-    if not others or log is None:
-        return "" if others else one or "dmy"
+    dates: dict[str, dict[str, float | datetime]] = {}
+    for text in texts:
+        if text[:10] not in dates and (orders := date_orders(text)):
+            with suppress(ValueError):  # such a row is refused on its own
+                dates[text[:10]] = {order: _moment(text, order) for order in orders}
+    if not dates:
+        return "any"
+    first = next(iter(dates))
+    fitting: dict[str, list[float | datetime]] = {}
+    for order in ORDERS:
+        if all(order in found for found in dates.values()):
+            moments = [found[order] for found in dates.values()]
+            if moments not in fitting.values():
+                fitting[order] = moments
+    if not fitting:
+        raise DataError(
+            f"{where}: {first} and later dates have no order of day and month in common"
+        )
+    if len(fitting) == 1 or log is None:
+        return next(iter(fitting)) if len(fitting) == 1 else ""
     inside = []
-    for order in (one, *others):
-        times = clock.utc([m for m in read[order] if isinstance(m, datetime)], lambda _: where)
+    for order, moments in fitting.items():
+        times = clock.utc([m for m in moments if isinstance(m, datetime)], lambda _: where)
         if log.known_at(times).any():
             inside.append(order)
-    first = next(iter(dates.values()))
     if len(inside) != 1:
         raise DataError(
-            f"{where}: {first!r} may be {' or '.join(ORDERS[o] for o in (one, *others))}: give "
-            f"--date-order {' or '.join((one, *others))}"
+            f"{where}: {first} may be {' or '.join(ORDERS[o] for o in fitting)}: give "
+            f"--date-order {' or '.join(fitting)}"
         )
-    text = f"{where}: {first!r} is {ORDERS[inside[0]]}: this puts it into the temperature log"
+    text = f"{where}: {first} is {ORDERS[inside[0]]}: this puts it into the temperature log"
     warnings.warn(text, stacklevel=3)
     return inside[0]
 

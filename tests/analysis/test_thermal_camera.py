@@ -201,3 +201,8 @@ def test_nothing_is_predicted_in_a_gap_of_the_log():
     with pytest.warns(UserWarning, match="90 of 120 times are in a gap"):
         rows = predict_along(ThermalCamera(thermal_model()), log, False).document["rows"]
     assert [row[0] for row in rows] == [*times[:20], *times[110:]]
+
+
+def test_a_model_that_no_fit_has_tested_is_not_judged():
+    """Its page said that the residuals show no missing effect."""
+    assert "smooth trajectories" not in ThermalCamera(thermal_model()).page()

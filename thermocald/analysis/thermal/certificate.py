@@ -9,9 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from thermocald.figures import BAND, Curve, Figure, Panel
+from thermocald.figures import Curve, Figure, Panel
 from thermocald.numbers import UNITS, parameter_label, percent, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.formula import say_together
@@ -23,7 +21,8 @@ from thermocald.thermal.criteria import NEGLIGIBLE_PX, SIGNIFICANT
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 
 _UNSEEN = 0.5
@@ -161,10 +160,16 @@ def _find_doubtful(document: Mapping[str, Any]) -> list[str]:
 _DISTANCE_MM = 10_000.0
 
 
-def render_certificate(camera: ThermalCamera, title: str) -> str:
-    """Return the page of a camera as HTML text; title: "" for the camera's name."""
-    document, sensor = camera.as_dict(), camera.model.sensor
-    low, high = camera.limits
+def render_certificate(
+    document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float], drift: Figure,
+    warning: str, title: str,
+) -> str:  # fmt: skip
+    """Return the page as HTML text.
+
+    document: of the thermal camera; limits: the range of its temperatures, °C; drift: over it;
+    warning: the camera's; title: "" for the camera's name.
+    """
+    low, high = limits
     left = describe_small_misfit(document)
     left = f"left over: {left}" if left else "no smooth trajectories are left beyond the noise"
     examined = document.get("misfit_px") is not None
@@ -174,8 +179,8 @@ def render_certificate(camera: ThermalCamera, title: str) -> str:
         title or f"Thermal model of {document['camera']}",
         Answer(
             _sentence(document, sensor.pixel_pitch, low, high),
-            drift_figure(camera, band=not camera.model.misses_an_effect),
-            (as_sentence(camera.warning or left),) if examined else (),
+            drift,
+            (as_sentence(warning or left),) if examined else (),
             ("Find the missing effect: thermocald discover.",) if missing
             else ("Correct measurements with: thermocald correct.",),
             (
@@ -216,23 +221,20 @@ def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float
     return f"{text}."
 
 
-def drift_figure(camera: ThermalCamera, *, band: bool) -> Figure:
-    """Draw the changes of the steady camera since T0 against temperature, with 95 % bands or not.
+def drift_figure(T: Array, T0: float, changes: Array, half: Array | None) -> Figure:
+    """Draw the changes (n, 10) since T0 of the steady camera against temperatures (n,) °C.
 
-    Other thermometers are taken to be as warm.
+    half (n, 10): of the width of their 95 % bands; None for a model that misses an effect.
     """
-    T, T0 = np.linspace(*camera.limits, 60), camera.model.T0
-    changes, Q = map(np.array, zip(*(camera.steady_change(T0, t) for t in T), strict=True))
-    half = BAND * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
     panels = []
     for name in ("c", "x0", "y0"):
         k, label = IOP_NAMES.index(name), parameter_label(name)
-        curve = Curve("", T, 1e3 * changes[:, k], half=1e3 * half[:, k] if band else None)
+        curve = Curve("", T, 1e3 * changes[:, k], half=None if half is None else 1e3 * half[:, k])
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
     return Figure(
         "drift", "Change of the camera with its temperature",
         f"Each parameter minus its value at {T0:g} °C, at steady temperatures; "
-        f"{'bands: 95 %' if band else 'no band is given'}.",
+        f"{'no band is given' if half is None else 'bands: 95 %'}.",
         tuple(panels),
     )  # fmt: skip
 

@@ -296,7 +296,7 @@ def find_order(
                 dates[text[:10]] = {order: _moment(text, order) for order in orders}
     if not dates:
         return "any"
-    first = next(iter(dates))
+    first = next(iter(dates)).split()[0]
     fitting: dict[str, list[float | datetime]] = {}
     for order in ORDERS:
         if all(order in found for found in dates.values()):

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
+    from thermocald.figures import Figure as Chart
     from thermocald.physics.model import ThermalModel
 
 
@@ -108,14 +109,15 @@ class ThermalCamera(Result):
         return model_lines(self.as_dict())
 
     @property
-    def limits(self) -> tuple[float, float]:
+    def _limits(self) -> tuple[float, float]:
         """The temperatures of the fit, °C; 15 K about T0 for a model that does not state them."""
         low, high, T0 = self.validity.low, self.validity.high, self.model.T0
         return (low, high) if math.isfinite(low) else (T0 - 15.0, T0 + 15.0)
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
-        return render_certificate(self, title)
+        sensor, drift = self.model.sensor, self._drift(band=not self.model.misses_an_effect)
+        return render_certificate(self.as_dict(), sensor, self._limits, drift, self.warning, title)
 
     def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
@@ -123,7 +125,13 @@ class ThermalCamera(Result):
         Covers the range that the model was fitted on, with 95 % bands of these changes; other
         thermometers are taken to be as warm.
         """
-        return draw_figure(replace(drift_figure(self, band=True), columns=1))
+        return draw_figure(replace(self._drift(band=True), columns=1))
+
+    def _drift(self, *, band: bool) -> Chart:
+        T, T0 = np.linspace(*self._limits, 60), self.model.T0
+        changes, Q = map(np.array, zip(*(self.steady_change(T0, t) for t in T), strict=True))
+        half = BAND * np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) if band else None
+        return drift_figure(T, T0, changes, half)
 
     def steady_change(self, since: float, T: float) -> tuple[Array, Array]:
         """Return the change (10,) of the steady camera from one temperature to another, °C.

@@ -18,7 +18,7 @@ import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
 from thermocald.arrays import floats
-from thermocald.errors import ConfigurationError, UsageError
+from thermocald.errors import ConfigurationError, GeometryError, UsageError
 from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -203,7 +203,7 @@ class Camera(Result):
                 "points beside their line or plane"
             )
             return replace(pose, status="weak_geometry", reason=why)
-        if start is None and self._has_twin(control, seen, pose):
+        if self._has_twin(control, seen, pose, start):
             why = (
                 f"{len(seen)} control points fit a second pose nearly as well: add a control "
                 "point, or give an earlier pose"
@@ -211,19 +211,34 @@ class Camera(Result):
             return replace(pose, status="ambiguous_pose", reason=why)
         return pose
 
-    def _has_twin(self, control: TestField, seen: Observations, pose: Adjustment) -> bool:
-        """Return whether a pose apart from the found one fits, from any three of the points."""
+    def _has_twin(
+        self, control: TestField, seen: Observations, pose: Adjustment,
+        earlier: ExteriorOrientation | None,
+    ) -> bool:  # fmt: skip
+        """Return whether a pose apart from the found one fits, from any three of the points.
+
+        earlier: a pose; then only one that is nearer to it counts.
+        """
         import cv2
 
         from thermocald.photogrammetry.epoch.measuring import resect
         from thermocald.photogrammetry.orientation import FLIP
 
+        here = pose.values[EOP][3:]
+
         def is_apart(centre: Array) -> bool:
-            apart = centre - pose.values[EOP][3:]
-            return bool(apart @ np.linalg.solve(pose.covariance[EOP, EOP][3:, 3:], apart) > _APART)
+            apart = centre - here
+            far = apart @ np.linalg.solve(pose.covariance[EOP, EOP][3:, 3:], apart) > _APART
+            if earlier is None:
+                return bool(far)
+            away, kept = (np.linalg.norm(one - earlier.centre) for one in (centre, here))
+            return bool(far and away < kept)
 
         points, camera = control.points[seen.targets], (self.sensor, self.interior, self.covariance)
-        ideal = directions(self.sensor, self.values, seen.points)[:, :2] * [1.0, -1.0]
+        try:
+            ideal = directions(self.sensor, self.values, seen.points)[:, :2] * [1.0, -1.0]
+        except GeometryError:  # a point outside the image, where the distortion folds back
+            return False
         worst = pose.sigma0**2 * pose.redundancy + _FITS
         for three in map(list, combinations(range(len(seen)), 3)):
             given = points[three], ideal[three], np.eye(3), None

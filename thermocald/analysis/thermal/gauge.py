@@ -8,8 +8,8 @@ no row has the status `ok`, so that a study or a fit does not take a prediction 
 
     predicted      interior orientation only: there are no control points, or none gives a pose
     resected       also the pose from the control points, with the predicted camera as prior
-    last_pose      control points hidden or too few: the last pose, with the mount's possible motion,
-                   unless most of those seen contradict it
+    last_pose      control points hidden or too few: the last pose, with the mount's possible
+                   motion, unless most of those seen contradict it
     outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
                    all if too far
     no_temperature the last reading is too old, or there is none

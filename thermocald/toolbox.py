@@ -175,15 +175,16 @@ def correct(
     require_within(width=(width, 1), height=(height, 1))
     thermal, path = _thermal(model), source_of(points)
     clock = device_clock(timezone, ambiguous=ambiguous)
-    header, near = first_times(path, clock)
-    table = read_model_log(thermal, source_of(log), _log_options(log_options), near)
+    options = _log_options(log_options)
+    header, near = first_times(path, clock, options.date_order)
+    table = read_model_log(thermal, source_of(log), options, near)
     if size is not None:
         thermal = thermal.for_images(*size)
     if temperature_sd is None:
         temperature_sd = thermal.reading_sd
     return Correction(
         path, "image" in header, thermal, table, clock, to, temperature_sd, extrapolate,
-        say or (lambda _: None),
+        say or (lambda _: None), options.date_order,
     )  # fmt: skip
 
 
@@ -230,16 +231,18 @@ def measure(
     if controls.assumed:
         tell(controls.assumed)
     plane = read_surface(source_of(surface), controls)
-    _, near = first_times(path, clock)
-    table = read_model_log(thermal, source_of(log), _log_options(log_options), near)
-    rows = list(row_blocks(path, ("x", "y", "sx", "sy"), clock))
+    options = _log_options(log_options)
+    order = options.date_order
+    _, near = first_times(path, clock, order)
+    table = read_model_log(thermal, source_of(log), options, near)
+    rows = list(row_blocks(path, ("x", "y", "sx", "sy"), clock, order, table))
     unknown = "its temperature is not known: outside the log, or in a gap of over ten intervals"
     known = [block.kept(table.known_at(block.times), unknown) for block in rows]
     if any(block.lines for block in known):  # without any, the error tells the log's span
         rows = known
     for line, why in (refused for block in rows for refused in block.refused):
         tell(f"{path}, line {line}: {why}; left out")
-    when = seconds_of(seen, clock)
+    when = seconds_of(seen, clock, order, table)
     if not table.known_at(np.array([when])).all():
         raise DataError(f"--seen {seen}: the log {log} does not tell the temperature of that time")
     return measure_places(thermal, table, controls, when, plane, rows, extrapolate)

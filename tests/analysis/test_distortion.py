@@ -37,7 +37,7 @@ def test_the_rates_of_an_opencv_camera_whose_f_changes():
 def test_the_same_series_epoch_by_epoch():
     """In `study` and `replay`, A and B are free in each epoch; c has its rate."""
     errors = []
-    for seed in SEEDS[:3]:
+    for seed in SEEDS[:2]:
         s = simulated(seed, ())
         source = seen_by_opencv(s)
         observed = []

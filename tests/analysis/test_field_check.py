@@ -98,7 +98,7 @@ def test_a_field_that_is_not_seen_is_refused(field, station, words):
         check_field(CAMERA, field, station)
 
 
-@pytest.mark.parametrize("aside_deg", [0, 20, 40])
+@pytest.mark.parametrize("aside_deg", [0, 40])
 def test_one_image_of_a_plane_field_is_insufficient_and_needs_depth(aside_deg):
     """Eight numbers of a homography cannot determine nine unknowns, from any station."""
     field = _printed("A2")

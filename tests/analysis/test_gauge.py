@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
@@ -90,6 +91,13 @@ def followed(gauge: GaugeCalibrator, epochs):
     return results, [r.adjustment.status for r in results], events
 
 
+def pose_error(result, world: World) -> float:
+    """Return a pose's error over its sds, the root mean square of its six numbers."""
+    error = result.exterior.as_array() - world.pose
+    error[:3] = np.arctan2(np.sin(error[:3]), np.cos(error[:3]))
+    return np.sqrt(error @ np.linalg.solve(result.covariance[10:, 10:], error) / 6)
+
+
 def test_predictions_without_control_points_have_true_sds():
     square = []
     for seed in range(60):
@@ -111,9 +119,7 @@ def test_resected_poses_have_true_sds():
         gauge = GaugeCalibrator(thermal_camera(), world.field, snooping_alpha=0.0)
         result = gauge.calibrate(world.epoch(1, T)).adjustment
         assert result.status == "resected", result.reason
-        error = result.exterior.as_array() - POSE
-        error[:3] = np.arctan2(np.sin(error[:3]), np.cos(error[:3]))
-        square.append(error @ np.linalg.solve(result.covariance[10:, 10:], error) / 6)
+        square.append(pose_error(result, world) ** 2)
     assert np.sqrt(np.mean(square)) == pytest.approx(1.0, abs=0.12)
 
 
@@ -253,12 +259,48 @@ def test_two_moved_stones_of_twelve_are_left_out(shift, at_least):
         world.points[rng.choice(12, 2, False)] += moved
         result = gauge.calibrate(world.epoch(2, 20.0, rng.permutation(12))).adjustment
         if result.status == "resected":
-            error = result.exterior.as_array() - POSE
-            error[:3] = np.arctan2(np.sin(error[:3]), np.cos(error[:3]))
-            square.append(error @ np.linalg.solve(result.covariance[10:, 10:], error) / 6)
+            square.append(pose_error(result, world) ** 2)
     assert len(square) >= at_least
     assert np.sqrt(np.mean(square)) == pytest.approx(1.0, abs=0.25)
     assert np.max(square) < 3.0**2
+
+
+def test_four_points_nearly_on_a_line_have_a_true_pose_or_none():
+    """Surveyed to 30 mm, some had another pose, up to a thousand sds off, without a word."""
+    ratio = []
+    for seed in range(40):
+        world, rng = World(9000 + seed, 4), np.random.default_rng(seed)
+        along = rng.uniform(8_000, 28_000, 4)
+        across, up = rng.normal(size=(2, 4)) * [[500.0], [300.0]]
+        world.points = np.column_stack([0.25 * along + across, along, up])
+        surveyed = world.points + rng.normal(0, 30.0, (4, 3))
+        world.field = TestField.build(world.field.names, surveyed, 30.0)
+        result = GaugeCalibrator(thermal_camera(), world.field).calibrate(world.epoch(1, 30.0))
+        if result.adjustment.status == "resected":
+            ratio.append(pose_error(result.adjustment, world))
+    assert len(ratio) >= 5
+    assert np.max(ratio) < 3.0
+
+
+@pytest.mark.parametrize(("seen", "most"), [(1, 18), (2, 18), (3, 1)])
+def test_a_knock_in_fog_leaves_no_false_pose(seen, most):
+    """The last pose was given whatever one or two points showed; three gave 13 sds unknocked."""
+    for knocked in (False, True):
+        ratio = []
+        for seed in range(40):
+            world = World(700 + seed)
+            gauge = GaugeCalibrator(thermal_camera(), world.field, mount_sd_deg=0.01)
+            gauge.calibrate(world.epoch(1, 20.0))
+            if knocked:
+                turn = world.rng.choice([-1, 1], 3) * world.rng.uniform(0.05, 0.2, 3)
+                world.pose = POSE + np.concatenate([np.deg2rad(turn), world.rng.normal(0, 30, 3)])
+            epoch = world.epoch(2, 21.0, world.rng.choice(12, seen, False), 60.0)
+            result = gauge.calibrate(epoch).adjustment
+            assert result.exterior is not None or "was the camera moved?" in result.reason
+            if result.exterior is not None:
+                ratio.append(pose_error(result, world))
+        assert np.sum(np.array(ratio) > 3.0) <= most * knocked
+        assert len(ratio) == 40 or knocked
 
 
 def test_a_repeated_frame_is_no_second_pose():
@@ -342,7 +384,7 @@ def test_a_delayed_epoch_has_the_camera_of_its_time():
     assert now.adjustment.interior.c == pytest.approx(results[-1].adjustment.interior.c)
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 6])
+@pytest.mark.parametrize("number", mostly_slow([0, 1, 2, 6], 1))
 def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(shared, number):
     """Two boards of a real room as control points, 25 pairs per camera.
 

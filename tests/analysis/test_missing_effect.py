@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.audit_thermal import rate_errors, seen
 from tests.analysis.test_thermal_model import LAG, for_fit, misread, reduced, run, simulated
+from tests.marks import mostly_slow
 from thermocald.analysis.thermal.certificate import model_lines
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -80,7 +81,7 @@ def outside(monkeypatch):
     monkeypatch.setattr(catalogue, "get", lambda name: own.get(name) or inside(name))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", mostly_slow(CASES, "lag", "tanh"))
 def test_a_camera_outside_the_family(outside, name):
     """The base model is fitted to M1; for M2, heated differently, no false band is stated."""
     effect = ModelEffect(*CASES[name])

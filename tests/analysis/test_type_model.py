@@ -44,7 +44,7 @@ def values_of(model):
 def test_a_camera_measured_at_few_temperatures_is_better_than_alone_and_than_its_type():
     rng = np.random.default_rng(8)
     pulls, own, shrunk, kind = [], [], [], []
-    for _ in range(60):
+    for _ in range(40):
         _, fleet = cameras(rng, 10, 0.1)
         (true,), (new,) = cameras(rng, 1, 1.0)
         found = shrink_to_type(new, type_model(fleet, "rpi-v2.1"))

@@ -8,6 +8,7 @@ import itertools
 import json
 import re
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -470,6 +471,34 @@ def test_a_row_without_a_temperature_is_left_out_and_the_others_are_measured(gau
     assert [one["line"] for one in document["refused"]] == [5]
     assert "points.csv, line 5: its temperature is not known" in done.stderr
     assert (done.returncode, done.stderr.count("error")) == (1, 1)
+
+
+def test_the_order_of_day_and_month_is_told_by_the_log_or_asked_for(gauge):
+    """Of 06/07/2026 in points.csv and in --seen, day first was once taken without a word."""
+    july = datetime(2026, 7, 6, 6, tzinfo=UTC).timestamp() - MORNING
+    for name in ("log.csv", "points.csv"):
+        head, *rows = (row.split(",", 1) for row in (gauge / name).read_text().splitlines())
+        moments = [datetime.fromtimestamp(float(time) + july, UTC) for time, _ in rows]
+        written = "%d/%m/%Y %H:%M:%S" if name == "points.csv" else "%Y-%m-%d %H:%M:%S"
+        rows = [f"{at.strftime(written)},{row[1]}" for at, row in zip(moments, rows, strict=True)]
+        write_rows(gauge / name, ",".join(head), rows)
+    seen = "--seen", "06/07/2026 06:00:00", "--timezone", "UTC", "--unit", "degC"
+    said = " ".join(measured(gauge, *seen).stderr.split())
+    told = "is day/month/year: this puts it into the temperature log"
+    assert f"points.csv, column time: 06/07/2026 {told}" in said
+    assert f"the time '06/07/2026 06:00:00': 06/07/2026 {told}" in said
+    log = (gauge / "log.csv").read_text()
+    head, rows = log.split("\n", 1)
+    (gauge / "log.csv").write_text("\n".join([head, rows.replace("07-06 ", "06-07 ") + rows]))
+    asked = "06/07/2026 may be day/month/year or month/day/year: give --date-order dmy or mdy"
+    done = called(gauge, *seen)
+    assert (done.returncode, asked in " ".join(done.stderr.split())) == (1, True)
+    assert told not in measured(gauge, *seen, "--date-order", "dmy").stderr
+    with (gauge / "points.csv").open("a") as file:
+        file.write("07/13/2026 12:00:00,stone,1640,1700,0.2,0.2\n13/07/2026 12:00:00,a,9,9,1,1\n")
+    assert "have no order of day and month in common" in " ".join(
+        called(gauge, *seen).stderr.split()
+    )
 
 
 def test_control_points_seen_while_the_thermometer_failed_are_named(gauge):

@@ -43,7 +43,7 @@ class Correction(Result):
 
     path: the CSV, `-` is standard input; of_images: whether it lists images, not points; to: °C to
     correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say: receives a
-    line for each row that cannot be corrected.
+    line for each row that cannot be corrected; date_order: of the CSV's dates, None to find it.
     """
 
     path: Path
@@ -55,6 +55,7 @@ class Correction(Result):
     temperature_sd: float
     extrapolate: bool = False
     say: Callable[[str], None] = print
+    date_order: str | None = None
     points: int = 0
     extrapolated_rows: int = 0
     images: list[dict[str, Any]] = field(default_factory=list)
@@ -112,7 +113,7 @@ class Correction(Result):
         Rows of standard input are corrected as they arrive. Rows that cannot be corrected are added
         to `refused`. Raises DataError if no row can be corrected.
         """
-        for block in row_blocks(self.path, ("x", "y"), self.clock):
+        for block in self._blocks(("x", "y")):
             yield self._corrected(self._possible(block))
         self._require_any(self.points)
 
@@ -123,7 +124,7 @@ class Correction(Result):
         corrected, UsageError if one would be overwritten.
         """
         make_folder(out)
-        for block in row_blocks(self.path, (), self.clock):
+        for block in self._blocks(()):
             possible = self._possible(block)
             if not possible.lines:
                 continue
@@ -156,6 +157,9 @@ class Correction(Result):
                 f"{'s' if len(self.refused) > 1 else ''} {lines}"
                 + (", …" if len(self.refused) > _MOST_NAMED else "")
             )
+
+    def _blocks(self, columns: tuple[str, ...]) -> Iterator[RowBlock]:
+        return row_blocks(self.path, columns, self.clock, self.date_order, self.log)
 
     def _possible(self, block: RowBlock) -> RowBlock:
         """Return the rows within the image whose temperature is known; refuse the others."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from thermocald.figures import BAND, Curve, Figure, Panel
+from thermocald.figures import Curve, Figure, Panel
 from thermocald.numbers import UNITS, parameter_label, percent, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.formula import say_together
@@ -162,14 +162,17 @@ _DISTANCE_MM = 10_000.0
 
 def render_certificate(
     document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float], drift: Figure,
-    title: str,
+    warning: str, title: str,
 ) -> str:  # fmt: skip
     """Return the page as HTML text.
 
     document: of the thermal camera; limits: the range of its temperatures, °C; drift: over it;
-    title: "" for the camera's name.
+    warning: the camera's; title: "" for the camera's name.
     """
     low, high = limits
+    left = describe_small_misfit(document)
+    left = f"left over: {left}" if left else "no smooth trajectories are left beyond the noise"
+    examined = document.get("misfit_px") is not None
     missing = bool(document.get("effect_missing"))
     series = ", ".join(str(s["name"]) for s in document.get("series", ()))
     return Chapter(
@@ -177,7 +180,7 @@ def render_certificate(
         Answer(
             _sentence(document, sensor.pixel_pitch, low, high),
             drift,
-            (_assess_misfit(document),),
+            (as_sentence(warning or left),) if examined else (),
             ("Find the missing effect: thermocald discover.",) if missing
             else ("Correct measurements with: thermocald correct.",),
             (
@@ -218,37 +221,20 @@ def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float
     return f"{text}."
 
 
-def _assess_misfit(document: Mapping[str, Any]) -> str:
-    if why := document.get("not_examined"):
-        return f"Whether an effect is missing was not examined: {why}."
-    if document.get("effect_missing"):
-        left = document.get("misfit_px")
-        size = "" if left is None else f" of {left:.3f} px"
-        return (
-            f"An effect is missing: the residuals have smooth trajectories{size}. They are "
-            "included in the standard deviations, and no 95 % band is given."
-        )
-    if left := describe_small_misfit(document):
-        return f"Left over: {left}."
-    return "The residuals have no smooth trajectories beyond the noise."
-
-
-def drift_figure(T: Array, T0: float, changes: Array, sds: Array | None) -> Figure:
+def drift_figure(T: Array, T0: float, changes: Array, half: Array | None) -> Figure:
     """Draw the changes (n, 10) since T0 of the steady camera against temperatures (n,) °C.
 
-    sds (n, 10): of the changes, for 95 % bands; None for a model that misses an effect.
+    half (n, 10): of the width of their 95 % bands; None for a model that misses an effect.
     """
     panels = []
     for name in ("c", "x0", "y0"):
-        k = IOP_NAMES.index(name)
-        half = None if sds is None else 1e3 * BAND * sds[:, k]
-        curve = Curve("", T, 1e3 * changes[:, k], half=half)
-        label = parameter_label(name)
+        k, label = IOP_NAMES.index(name), parameter_label(name)
+        curve = Curve("", T, 1e3 * changes[:, k], half=None if half is None else 1e3 * half[:, k])
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
-    band = "no band is given" if sds is None else "bands: 95 %"
     return Figure(
         "drift", "Change of the camera with its temperature",
-        f"Each parameter minus its value at {T0:g} °C, at steady temperatures; {band}.",
+        f"Each parameter minus its value at {T0:g} °C, at steady temperatures; "
+        f"{'no band is given' if half is None else 'bands: 95 %'}.",
         tuple(panels),
     )  # fmt: skip
 

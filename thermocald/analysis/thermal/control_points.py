@@ -162,8 +162,9 @@ class ControlPoints:
         elif pose.ok:
             return pose
         # one that fits nevertheless shows no other mistake
-        remedy = "; correct the click or leave it out" if pose.ok else self._remedy(camera)
-        raise DataError(why + remedy)
+        fits = pose.status in ("ambiguous_pose", "weak_geometry")
+        remedy = "" if fits else self._remedy(camera)
+        raise DataError(why + ("; correct the click or leave it out" if pose.ok else remedy))
 
     def find_twin(self, camera: Camera, pose: Adjustment) -> str:
         """Return the exchange of names with which another pose fits, as a sentence; "" without one.

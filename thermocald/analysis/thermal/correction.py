@@ -18,6 +18,7 @@ import csv
 import json
 import math
 import sys
+import warnings
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -45,7 +46,7 @@ from thermocald.photogrammetry.targets.image_file import (
     with_metadata,
 )
 from thermocald.result import jsonable, with_sds
-from thermocald.store.logger.clock import DeviceClock, parse_moment
+from thermocald.store.logger.clock import ORDERS, DeviceClock, date_orders, parse_moment
 
 if TYPE_CHECKING:
     import io
@@ -198,7 +199,7 @@ class RowBlock:
     """A block of rows of a CSV.
 
     lines (n): numbers, the header's is 1; rows: fields as text; times (n,) s UTC; values (n, k):
-    the other requested columns; refused: (line, reason) of unusable rows.
+    the other requested columns; refused: (line, reason) of unusable rows; order: of the dates.
     """
 
     header: list[str]
@@ -207,6 +208,7 @@ class RowBlock:
     times: Array
     values: Array
     refused: list[tuple[int, str]]
+    order: str = ""
 
     def kept(self, wanted: NDArray[np.bool_], reason: str) -> RowBlock:
         """Return the block with the wanted (n,) rows only; the others are refused for a reason."""
@@ -218,12 +220,15 @@ class RowBlock:
         )  # fmt: skip
 
 
-def row_blocks(path: Path, columns: tuple[str, ...], clock: DeviceClock) -> Iterator[RowBlock]:
+def row_blocks(
+    path: Path, columns: tuple[str, ...], clock: DeviceClock, order: str | None = None,
+    log: TemperatureLog | None = None,
+) -> Iterator[RowBlock]:  # fmt: skip
     """Read a CSV with a column `time` and others, a block at a time; `-` is standard input.
 
-    A block of standard input is what has arrived. clock: for times without a zone. Raises DataError
-    for a missing column and for times whose zone is not given; a row that cannot be read is refused
-    on its own.
+    A block of standard input is what has arrived. clock: for times without a zone; order, log: of
+    the dates, None to find it as `find_order` does. Raises DataError for a missing column and for
+    times whose zone or order is not known; a row that cannot be read is refused on its own.
     """
     header: list[str] = []
     line = empty = 0
@@ -239,33 +244,84 @@ def row_blocks(path: Path, columns: tuple[str, ...], clock: DeviceClock) -> Iter
                         + (hint if len(header) == 1 else "")
                     )
         if lines:
-            yield _block(path, header, columns, lines, line, clock)
+            block = _block(path, header, columns, lines, line, clock, order, log)
+            order = block.order if block.order in ORDERS else None
+            yield block
         line, empty = line + len(lines), empty + len(lines)
     if not empty:
         raise DataError(f"{path}: holds no rows")
 
 
-def first_times(path: Path, clock: DeviceClock) -> tuple[list[str], tuple[float, float] | None]:
-    """Return the columns of a CSV and the time span, s UTC, of its first rows.
+def first_times(
+    path: Path, clock: DeviceClock, order: str | None
+) -> tuple[list[str], tuple[float, float] | None]:
+    """Return the columns of a CSV and the time span, s UTC, of its first rows, None if not known.
 
     Returns [] and None for standard input, which can be read only once.
     """
     if path == STANDARD_INPUT:
         return [], None
-    block = next(row_blocks(path, (), clock))
-    times = block.times
-    return block.header, (float(times.min()), float(times.max())) if len(times) else None
+    block = next(row_blocks(path, (), clock, order))
+    times, known = block.times, block.order and len(block.times)
+    return block.header, (float(times.min()), float(times.max())) if known else None
 
 
-def seconds_of(text: str, clock: DeviceClock) -> float:
-    """Return a time that a user wrote, s UTC. Raises DataError if it is not a time."""
+def seconds_of(text: str, clock: DeviceClock, order: str | None, log: TemperatureLog) -> float:
+    """Return a time that a user wrote, s UTC; order, log: as in `row_blocks`.
+
+    Raises DataError if it is not a time.
+    """
+    where = f"the time {text!r}"
     try:
-        moment = _moment(text)
+        moment = _moment(text, order or find_order([text], where, clock, log))
     except ValueError:
         raise DataError(f"{text!r} is not a time: write 2026-05-04T09:00:00Z, or seconds") from None
     if isinstance(moment, datetime):
-        return float(clock.utc([moment], lambda _: f"the time {text!r}")[0])
+        return float(clock.utc([moment], lambda _: where)[0])
     return moment
+
+
+def find_order(
+    texts: Sequence[str], where: str, clock: DeviceClock, log: TemperatureLog | None
+) -> str:
+    """Return the order of day, month and year in which times are written; "any" if none needs one.
+
+    Of several that fit it is the one in which the log knows a temperature, with a warning; without
+    a log it is "", not known. Raises DataError if none fits, or if the log does not decide.
+    """
+    dates: dict[str, dict[str, float | datetime]] = {}
+    for text in texts:
+        if text[:10] not in dates and (orders := date_orders(text)):
+            with suppress(ValueError):  # such a row is refused on its own
+                dates[text[:10]] = {order: _moment(text, order) for order in orders}
+    if not dates:
+        return "any"
+    first = next(iter(dates)).split()[0]
+    fitting: dict[str, list[float | datetime]] = {}
+    for order in ORDERS:
+        if all(order in found for found in dates.values()):
+            moments = [found[order] for found in dates.values()]
+            if moments not in fitting.values():
+                fitting[order] = moments
+    if not fitting:
+        raise DataError(
+            f"{where}: {first} and later dates have no order of day and month in common"
+        )
+    if len(fitting) == 1 or log is None:
+        return next(iter(fitting)) if len(fitting) == 1 else ""
+    inside = []
+    for order, moments in fitting.items():
+        times = clock.utc([m for m in moments if isinstance(m, datetime)], lambda _: where)
+        if log.known_at(times).any():
+            inside.append(order)
+    if len(inside) != 1:
+        raise DataError(
+            f"{where}: {first} may be {' or '.join(ORDERS[o] for o in fitting)}: give "
+            f"--date-order {' or '.join(fitting)}"
+        )
+    text = f"{where}: {first} is {ORDERS[inside[0]]}: this puts it into the temperature log"
+    warnings.warn(text, stacklevel=3)
+    return inside[0]
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
@@ -289,22 +345,24 @@ def _lines(path: Path) -> Iterator[list[str]]:
 
 def _block(
     path: Path, header: list[str], columns: tuple[str, ...], lines: list[str], line: int,
-    clock: DeviceClock,
+    clock: DeviceClock, order: str | None, log: TemperatureLog | None,
 ) -> RowBlock:  # fmt: skip
     kept: list[tuple[int, dict[str, str], float | datetime, list[float]]] = []
     refused: list[tuple[int, str]] = []
     reader = csv.reader(lines)
-    for row in reader:
-        number = line + reader.line_num
-        if not row:
-            continue
+    numbered = [(line + reader.line_num, row) for row in reader if row]
+    if order is None:
+        place = header.index("time")
+        texts = [row[place].strip() for _, row in numbered if len(row) == len(header)]
+        order = find_order(texts, f"{path}, column time", clock, log)
+    for number, row in numbered:
         if len(row) != len(header):
             refused.append((number, f"has {len(row)} fields, the header {len(header)}"))
             continue
         fields = dict(zip(header, map(str.strip, row), strict=True))
         try:
             values = [_number(name, fields[name]) for name in columns]
-            kept.append((number, fields, _moment(fields["time"]), values))
+            kept.append((number, fields, _moment(fields["time"], order), values))
         except ValueError as cause:
             refused.append((number, str(cause)))
     dated = [(i, m) for i, (_, _, m, _) in enumerate(kept) if isinstance(m, datetime)]
@@ -315,16 +373,16 @@ def _block(
     found = np.array([values for *_, values in kept], dtype=float)
     return RowBlock(
         header, [n for n, *_ in kept], [fields for _, fields, _, _ in kept], times,
-        found.reshape(len(kept), len(columns)), refused,
+        found.reshape(len(kept), len(columns)), refused, order,
     )  # fmt: skip
 
 
-def _moment(text: str) -> float | datetime:
+def _moment(text: str, order: str) -> float | datetime:
     with suppress(ValueError):
         if math.isfinite(seconds := float(text)):
             return seconds
     with suppress(ValueError):
-        if isinstance(moment := parse_moment(text), datetime):
+        if isinstance(moment := parse_moment(text, order), datetime):
             return moment
     raise ValueError(f"column time: {text!r} is not a time")
 

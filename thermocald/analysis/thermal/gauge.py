@@ -6,9 +6,10 @@
 It is a calibrator, which the daemon's pipeline runs like the others. But nothing is calibrated, and
 no row has the status `ok`, so that a study or a fit does not take a prediction for a measurement.
 
-    predicted      interior orientation only: there are no control points
+    predicted      interior orientation only: there are no control points, or none gives a pose
     resected       also the pose from the control points, with the predicted camera as prior
-    last_pose      control points hidden or too few: the last pose, with the mount's possible motion
+    last_pose      control points hidden or too few: the last pose, with the mount's possible
+                   motion, unless most of those seen contradict it
     outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
                    all if too far
     no_temperature the last reading is too old, or there is none
@@ -58,12 +59,12 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.targets.image_file import EncodedImage
-    from thermocald.store.series import StoredEpoch
+    from thermocald.store.series import EpochResult, StoredEpoch
 
 
 _FEWEST = 3  # control points, if there is an earlier pose
-_CONFIRMED = 2  # epochs in a row that must show another pose
 _MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
+_ELSEWHERE_CHI2 = 18.4  # two degrees of freedom, one in ten thousand
 _SUDDEN_K = 2.0  # change between two frames below which a missing effect has little influence
 _UNMODELLED_PX = 0.05  # error of a control point from frame to frame: light, air, the template
 _LONG_S = 30 * 86400.0  # after this long at one temperature everything has settled
@@ -214,6 +215,17 @@ class Pose:
     seen: Observations
 
 
+def _pose_of(
+    epoch: Epoch, predicted: PredictedCamera, seen: Observations, result: Adjustment | EpochResult
+) -> Pose:
+    """Return the pose of an epoch's result; its rejected points are left out."""
+    assert result.covariance is not None
+    return Pose(
+        epoch.frame_time, predicted, ExteriorOrientation.from_array(result.values[EOP]),
+        result.covariance[EOP, EOP], seen.select(~np.isin(seen.targets, result.rejected)),
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Movement:
     """A movement of the camera since a time.
@@ -276,8 +288,8 @@ class GaugeCalibrator(EpochCalibrator):
         self.pose: Pose | None = None
         """The last pose from control points."""
         self._reference: Pose | None = None
-        self._still: Pose | None = None
-        self._moved: list[Pose] = []
+        self._still: Pose | None = None  # the last that agrees with the reference
+        self._moved: Pose | None = None  # the one after it, if that does not
         self._number = 0
         self.movement: Movement | None = None
         """The movement of the camera that the last epoch showed, if any."""
@@ -315,19 +327,12 @@ class GaugeCalibrator(EpochCalibrator):
         for one in stored:
             self.predictor.take(one.epoch.temperature_time, one.epoch.temperatures)
             self._number = one.epoch.number
-            covariance, result = one.result.covariance, one.result
-            if result.status == "resected" and covariance is not None:
-                if (seen := one.epoch.observations) is None:
-                    continue
-                keep = ~np.isin(seen.targets, result.rejected)
-                known = self.predictor.at(one.epoch.frame_time)
-                if known is not None:
-                    pose = Pose(
-                        one.epoch.frame_time, known,
-                        ExteriorOrientation.from_array(result.values[EOP]),
-                        covariance[EOP, EOP], seen.select(keep),
-                    )  # fmt: skip
-                    self.pose, self._reference = pose, self._reference or pose
+            result = one.result
+            if result.status == "resected" and result.covariance is not None:
+                seen, known = one.epoch.observations, self.predictor.at(one.epoch.frame_time)
+                if seen is not None and known is not None:
+                    self.pose = self._still = _pose_of(one.epoch, known, seen, result)
+                    self._reference = self._reference or self.pose
 
     def calibrate(
         self,
@@ -407,14 +412,9 @@ class GaugeCalibrator(EpochCalibrator):
             result = again if again.ok else result
         if not result.ok:
             return self._without_pose(epoch, now, seen, f"{result.status}: {result.reason}")
-        assert result.exterior is not None
-        keep = seen.select(~np.isin(seen.targets, result.rejected))
-        pose = Pose(
-            epoch.frame_time, now, result.exterior, result.covariance[EOP, EOP], keep
-        )  # fmt: skip
         if in_order:
-            self._watch(pose)
-            self.pose = pose
+            self.pose = _pose_of(epoch, now, seen, result)
+            self._watch(self.pose)
         return replace(result, status="resected", reason="")
 
     def _unposed(
@@ -440,28 +440,40 @@ class GaugeCalibrator(EpochCalibrator):
         result.covariance[EOP, EOP] = last.covariance
         turned = math.radians(self._mount or 0.0) ** 2 * hours
         result.covariance[range(10, 13), range(10, 13)] += turned
+        if seen is not None and len(seen) and self._most_are_elsewhere(result, last.eop, seen):
+            why = f"{why}; most are not where the last pose puts them: was the camera moved?"
+            return self._unposed("predicted", why, now, seen)
         return replace(result, exterior=last.eop)
+
+    def _most_are_elsewhere(
+        self, last: Adjustment, eop: ExteriorOrientation, seen: Observations
+    ) -> bool:
+        """Test whether more than half of the control points contradict the last pose."""
+        assert last.interior is not None
+        iop, points = last.interior.as_array(), self.testfield.points[seen.targets]
+        at, A, B = partials(self.sensor, iop, eop.as_array(), points)
+        C = A @ last.covariance @ A.swapaxes(1, 2)
+        C += (B * self.testfield.sigmas[seen.targets, None] ** 2) @ B.swapaxes(1, 2)
+        C[:, range(2), range(2)] += seen.sigmas**2
+        left = (seen.points - at)[..., None]
+        chi2 = (left.swapaxes(1, 2) @ np.linalg.solve(C, left)).ravel()
+        return bool(np.mean(chi2 > _ELSEWHERE_CHI2) > 0.5)
 
     def _watch(self, pose: Pose) -> None:
         """Compare a pose with the reference; two different poses in a row are a movement."""
-        if self._reference is None:
-            self._reference = self._still = pose
-            return
-        found = self.compare(self._reference, pose)
+        found = None if self._reference is None else self.compare(self._reference, pose)
         if found is None or found.chi2 <= _MOVED_CHI2:
-            self._still = pose
-            self._moved.clear()
-            return
-        self._moved.append(pose)
-        if len(self._moved) >= _CONFIRMED:
+            self._reference, self._still, self._moved = self._reference or pose, pose, None
+        elif self._moved is None or self._still is None:
+            self._moved = pose
+        else:
             # the step between two consecutive frames shows whether it was sudden, not thermal
-            then, now = self._still or self._reference, self._moved[0]
+            then, now = self._still, self._moved
             step = self.compare(then, now)
             warmer = now.predicted.camera.temperature - then.predicted.camera.temperature
             sudden = step is not None and step.chi2 > _MOVED_CHI2 and abs(warmer) < _SUDDEN_K
             self.movement = replace(found, since=now.time, sudden=sudden)
-            self._reference = self._still = pose
-            self._moved.clear()
+            self._reference, self._still, self._moved = pose, pose, None
 
     def compare(self, then: Pose, now: Pose) -> Movement | None:
         """Return the camera's movement between two poses; None if they share too few points.

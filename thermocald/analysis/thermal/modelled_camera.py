@@ -21,7 +21,9 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Steady
 from thermocald.physics.history import History
+from thermocald.store.logger.clock import iso
 from thermocald.store.logger.dialect import to_celsius
+from thermocald.store.recording.reader import TemperatureLog
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -91,11 +93,6 @@ class Validity:
         if outside.any():
             T = self.worst(temperatures)
             if self.is_far(T) and not extrapolate:
-                if unit := self.other_unit(T):
-                    raise UsageError(
-                        f"{T:g} looks like {unit}: the model was fitted between {self.low:g} and "
-                        f"{self.high:g} °C; convert it"
-                    )
                 raise UsageError(
                     f"{self.place(T)}; set `extrapolate` (--extrapolate) to predict there"
                 )
@@ -232,21 +229,6 @@ class Along:
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
-def require_known(log: Array, readings: Array, times: Array) -> None:
-    """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
-    from thermocald.store.recording.reader import TemperatureLog
-
-    outside = ~TemperatureLog(log, {"": readings}).known_at(times)
-    if outside.any():
-        from thermocald.store.logger.clock import iso
-
-        raise DataError(
-            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
-            f"({iso(log[0])} to {iso(log[-1])}) or in a gap of over ten of its intervals, the "
-            f"first is {iso(times[outside][0])}"
-        )
-
-
 def read_history(
     times: ArrayLike,
     temperatures: ArrayLike | Mapping[str, ArrayLike],
@@ -276,8 +258,13 @@ def read_history(
     if (np.diff(t) < 0).any():
         raise UsageError("the times run backwards: give a log in the order of time")
     reference = next(iter(readings))
-    if at is not None:
-        require_known(t, readings[reference], instants)
+    log = TemperatureLog(t, {"": readings[reference]})
+    if at is not None and (outside := ~log.known_at(instants)).any():
+        raise DataError(
+            f"{int(outside.sum())} of {len(instants)} times are outside the temperature log "
+            f"({iso(t[0])} to {iso(t[-1])}) or in a gap of over ten of its intervals, the "
+            f"first is {iso(instants[outside][0])}"
+        )
     begin = float(min(t[0], instants.min()))
     return begin, instants, History(instants - begin, t - begin, readings, reference, T0)
 

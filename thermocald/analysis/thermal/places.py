@@ -188,32 +188,30 @@ class Places(Result):
         return shift
 
     def as_dict(self) -> dict[str, Any]:
+        shifts = self.shift_mm
         places = [
             {
-                "name": name, "temperature": T,
-                **with_sds("XYZ", p, sd),
-                "without_correction": dict(zip("XYZ", w, strict=True)), "correction_mm": shift,
+                "name": name, "temperature": self.temperatures[k],
+                **with_sds("XYZ", self.points[k], self.sd[k]),
+                "without_correction": dict(zip("XYZ", self.without[k], strict=True)),
+                "correction_mm": shifts[k],
             }
-            for name, T, p, sd, w, shift in zip(
-                self.names, self.temperatures.tolist(), self.points.tolist(), self.sd.tolist(),
-                self.without.tolist(), self.shift_mm.tolist(), strict=True,
-            )
+            for k, name in enumerate(self.names)
         ]  # fmt: skip
-        return {
-            "format": "thermocald-places/1", "unit": self.unit, "places": places,
-            "covariance": self.covariance.tolist(),
-            "levels": jsonable(self.levels),
-            "pose": {
-                "sigma0": self.pose.sigma0, "redundancy": self.pose.redundancy,
-                "control_points": self.pose.n_observations, "rejected": list(self.rejected),
-                "sd_angles_deg": np.degrees(self.pose.sd[EOP][:3]).tolist(),
-                "centre": self.centre.tolist(),
-                "sd_centre_mm": self.pose.sd[EOP][3:].tolist(),
-                "unchecked": list(self.unchecked), "unnoticed_mm": self.unnoticed_mm,
-            },
-            "refused": [{"line": line, "reason": why} for line, why in self.refused],
-            "doubts": list(self.doubts),
+        pose = {
+            "sigma0": self.pose.sigma0, "redundancy": self.pose.redundancy,
+            "control_points": self.pose.n_observations, "rejected": self.rejected,
+            "sd_angles_deg": np.degrees(self.pose.sd[EOP][:3]), "centre": self.centre,
+            "sd_centre_mm": self.pose.sd[EOP][3:],
+            "unchecked": self.unchecked, "unnoticed_mm": self.unnoticed_mm,
         }  # fmt: skip
+        document: dict[str, Any] = jsonable({
+            "format": "thermocald-places/1", "unit": self.unit, "places": places,
+            "covariance": self.covariance, "levels": self.levels, "pose": pose,
+            "refused": [{"line": line, "reason": why} for line, why in self.refused],
+            "doubts": self.doubts,
+        })  # fmt: skip
+        return document
 
     def lines(self) -> list[str]:
         digits = 1 if self.unit == "mm" else 4

@@ -41,7 +41,7 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
 from thermocald.photogrammetry.targets.image_file import decode_grey
-from thermocald.result import Result, new_figure, with_sds
+from thermocald.result import Result, jsonable, new_figure, with_sds
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -301,14 +301,11 @@ class SceneCourse(Result):
         spread[1:] = self.covariance[rows, :3, :3]
         spread[1:, range(3), range(3)] += self.unsure[rows, :3] ** 2
         found = []
-        for k in range(1, len(values)):
-            beyond = []
-            for after in range(k, min(k + 2, len(values))):
-                turn, C = values[after] - values[k - 1], spread[after] + spread[k - 1]
-                beyond.append(turn @ np.linalg.solve(C, turn) > _MOVED_CHI2)
-            if all(beyond):
-                turn, C = values[k] - values[k - 1], spread[k] + spread[k - 1]
-                found.append((int(rows[k - 1]), turn, C))
+        for row, k in enumerate(rows.tolist()):
+            turns, C = values[row + 1 :] - values[row], spread[row + 1 :] + spread[row]
+            pairs = list(zip(turns, C, strict=True))
+            if all(turn @ np.linalg.solve(Q, turn) > _MOVED_CHI2 for turn, Q in pairs[:2]):
+                found.append((k, *pairs[0]))
         return found
 
     def as_dict(self) -> dict[str, Any]:
@@ -316,27 +313,24 @@ class SceneCourse(Result):
         keys = ("turn_x", "turn_y", "turn_z", "c")
         frames = [
             {
-                "frame": name, "time": time, "temperature": T, "features": int(count),
-                "reason": why, **with_sds(keys, v, sd),
+                "frame": name, "time": self.times[k], "temperature": self.temperatures[k],
+                "features": self.features[k], "reason": self.reasons[k],
+                **with_sds(keys, self.values[k], self.sd[k]),
             }
-            for name, time, T, count, why, v, sd in zip(
-                self.names, self.times.tolist(), self.temperatures.tolist(), self.features,
-                self.reasons, self.values.tolist(), self.sd.tolist(), strict=True,
-            )
+            for k, name in enumerate(self.names)
         ]  # fmt: skip
-        return {
+        movements = [
+            {k: frames[row][k] for k in ("frame", "time")}
+            | with_sds(keys[:3], turn, np.sqrt(C.diagonal()))
+            for row, turn, C in self.movements
+        ]
+        document: dict[str, Any] = jsonable({
             "format": "thermocald-scene/1", "camera": self.camera, "frames": frames,
-            "per_kelvin": dict(zip(keys, slopes.tolist(), strict=True)),
-            "sd_per_kelvin": dict(zip(keys, sds.tolist(), strict=True)),
-            "model_misses_an_effect": self.model_misses,
-            "movements": [
-                {
-                    "frame": self.names[row], "time": float(self.times[row]),
-                    **with_sds(keys[:3], turn, np.sqrt(C.diagonal())),
-                }
-                for row, turn, C in self.movements
-            ],
-        }  # fmt: skip
+            "per_kelvin": dict(zip(keys, slopes, strict=True)),
+            "sd_per_kelvin": dict(zip(keys, sds, strict=True)),
+            "model_misses_an_effect": self.model_misses, "movements": movements,
+        })  # fmt: skip
+        return document
 
     def lines(self) -> list[str]:
         out = [f"{int(self.seen.sum())} of {len(self.names)} frames follow the reference frame"]

@@ -49,11 +49,11 @@ from thermocald.physics.operators import interpolation_matrix
 from thermocald.result import Result, jsonable
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
+    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
-    from thermocald.figures import Figure
+    from thermocald.figures import Figure as Chart
     from thermocald.physics.model import ThermalModel
 
 
@@ -116,11 +116,10 @@ class ThermalCamera(Result):
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
-        sensor = self.model.sensor
-        drift = self._drift(band=not self.model.misses_an_effect)
-        return render_certificate(self.as_dict(), sensor, self._limits, drift, title)
+        sensor, drift = self.model.sensor, self._drift(band=not self.model.misses_an_effect)
+        return render_certificate(self.as_dict(), sensor, self._limits, drift, self.warning, title)
 
-    def plot(self) -> Drawing:
+    def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
         Covers the range that the model was fitted on, with 95 % bands of these changes; other
@@ -128,11 +127,11 @@ class ThermalCamera(Result):
         """
         return draw_figure(replace(self._drift(band=True), columns=1))
 
-    def _drift(self, *, band: bool) -> Figure:
+    def _drift(self, *, band: bool) -> Chart:
         T, T0 = np.linspace(*self._limits, 60), self.model.T0
         changes, Q = map(np.array, zip(*(self.steady_change(T0, t) for t in T), strict=True))
-        sds = np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) if band else None
-        return drift_figure(T, T0, changes, sds)
+        half = BAND * np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) if band else None
+        return drift_figure(T, T0, changes, half)
 
     def steady_change(self, since: float, T: float) -> tuple[Array, Array]:
         """Return the change (10,) of the steady camera from one temperature to another, °C.
@@ -403,9 +402,9 @@ class ThermalCamera(Result):
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        factors, knees = self._table[0][:, 0], self._table[1]
-        bends = [np.array([T, *factors[:, 3 + 2 * k]]) for k, T in enumerate(knees)]
-        return factors[:, :3].T, bends
+        table, knees = self._table
+        bends = [np.array([T, *table[:, 0, 3 + 2 * k]]) for k, T in enumerate(knees)]
+        return table[:, 0, :3].T, bends
 
 
 def load_camera(path: Path | str) -> ThermalCamera:
@@ -448,8 +447,7 @@ class LiveCamera:
         model = thermal.model
         self._drive = model.followers()
         self.keeps_all = None in self._drive or not model.is_of_now
-        self._times: list[float] = []
-        self._rows: list[tuple[float, ...]] = []
+        self._readings: list[tuple[float, ...]] = []  # the time s, then °C of each channel
         self._channels: tuple[str, ...] = ()
         self._seen: tuple[float, ...] = ()  # when each channel was last measured, s
         self._updates = 0
@@ -479,24 +477,21 @@ class LiveCamera:
         >>> live.update(0.0, 25.0).sd["c"] > 0
         True
         """
-        thermal, (t, row) = self.thermal, self._checked(time, temperature)
-        if self.keeps_all:  # the state changes only if `along` raises nothing
-            rows = np.array([*self._rows, row]).T
-            history_of = dict(zip(self._channels, rows, strict=True))
-            self._now = thermal.along([*self._times, t], history_of, [t])[0]
-            self._remember(t, row)
-            return self._now
-        others = {name: np.array([T]) for name, T in zip(self._channels[1:], row[1:], strict=True)}
+        thermal, (t, *row) = self.thermal, self._checked(time, temperature)
+        model, others = thermal.model, zip(self._channels[1:], row[1:], strict=True)
         (beyond,), drift = thermal._beyond(  # an error leaves the state unchanged
-            np.array(row[:1]), others, thermal.model.rate_vector, extrapolate=False
-        )
-        self._remember(t, row)
-        times = np.array(self._times)
-        readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
-        drive = _push(self._drive, t, row[0])
-        driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
-        begin, model = times[0], thermal.model
-        history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
+            np.array(row[:1]), {name: np.array([T]) for name, T in others}, model.rate_vector,
+            extrapolate=False,
+        )  # fmt: skip
+        self._remember((t, *row))
+        times, *columns = np.array(self._readings).T
+        readings, since = dict(zip(self._channels, columns, strict=True)), times - times[0]
+        history = History(since[-1:], since, readings, self._channels[0], model.T0)
+        if self.keeps_all:
+            drive, driven = model.drive(history), None
+        else:
+            drive = _push(self._drive, t, row[0])
+            driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         (values,), slopes, J = predict_orientations(
             model, thermal.parameters, history, drive, driven
         )
@@ -547,9 +542,7 @@ class LiveCamera:
             self._maps = Maps(steady.sensor, steady.values, target)
         return self._maps.of(self._now.values)
 
-    def _checked(
-        self, time: Any, temperature: float | Mapping[str, float]
-    ) -> tuple[float, tuple[float, ...]]:
+    def _checked(self, time: Any, temperature: float | Mapping[str, float]) -> tuple[float, ...]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
         if np.ndim(time):
             raise UsageError("time: give one time for a reading")
@@ -558,19 +551,19 @@ class LiveCamera:
         names, row = tuple(given), tuple(float(v) for v in given.values())
         if not row:
             raise UsageError("there is no reading: give a temperature, or {channel: °C}")
-        if self._times:
-            if t <= self._times[-1]:
-                raise UsageError(f"time {t} is not later than the last reading, {self._times[-1]}")
+        if self._readings:
+            before, *last = self._readings[-1]
+            if t <= before:
+                raise UsageError(f"time {t} is not later than the last reading, {before}")
             if names != self._channels:
                 raise UsageError(f"channels {names}: the first reading had {self._channels}")
-            last = self._rows[-1]
             row = tuple(b if math.isnan(n) else n for b, n in zip(last, row, strict=True))
         elif any(math.isnan(v) for v in row):
             raise UsageError("the first reading is NaN: begin with one that was measured")
         measured = [not math.isnan(float(v)) for v in given.values()]
         seen = tuple(t if m else s for m, s in zip(measured, self._seen or row, strict=True))
         if self._updates > 1:
-            usual = (self._times[-1] - self._times[0]) / (self._updates - 1)
+            usual = (self._readings[-1][0] - self._readings[0][0]) / (self._updates - 1)
             oldest = min(zip(seen, names, strict=True))
             if t - oldest[0] > _LARGEST_GAP * usual:
                 raise DataError(
@@ -578,17 +571,15 @@ class LiveCamera:
                     f"intervals of {usual:.0f} s: the camera's temperature is not known"
                 )
         self._channels, self._seen = names, seen
-        return t, row
+        return t, *row
 
-    def _remember(self, time: float, row: tuple[float, ...]) -> None:
+    def _remember(self, reading: tuple[float, ...]) -> None:
         """Store a reading; unless all are needed, drop all but first, extremes and last three."""
         self._updates += 1
-        self._times.append(time)
-        self._rows.append(row)
-        last = len(self._times) - 1
-        if not self.keeps_all and last >= _NEEDED + 2 * len(row):
-            T = np.array(self._rows)
+        self._readings.append(reading)
+        last = len(self._readings) - 1
+        if not self.keeps_all and last >= _NEEDED + 2 * len(self._channels):
+            T = np.array(self._readings)[:, 1:]
             extremes = {*T.argmax(axis=0).tolist(), *T.argmin(axis=0).tolist()}
             needed = sorted({0, *extremes, last - 2, last - 1, last})
-            self._times = [self._times[i] for i in needed]
-            self._rows = [self._rows[i] for i in needed]
+            self._readings = [self._readings[i] for i in needed]

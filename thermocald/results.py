@@ -92,7 +92,46 @@ class Discovery(discoveries.Discovery, Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald discover` prints."""
-        return discovery_lines(self)
+        first, last = self.stages[0], self.stages[-1]
+        lines = [f"verdict: {self.headline}"]
+        if self.verdict == "adequate":
+            lines.append(say_adequate(self.examination))
+        for effect in self.effects:
+            lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
+            for name, e in effect.estimates.items():
+                if isinstance(e["value"], float):
+                    sd = math.nan if e["sd"] is None else e["sd"]
+                    lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
+            evidence = effect.evidence
+            if "false_alarm_probability" in evidence:
+                drawn = evidence["surrogates"]
+                lines.append(
+                    f"    probability of a false name {evidence['false_alarm_probability']:.3f} "
+                    f"(gain {drawn['gain']:.0f}; the largest of {drawn['count']} surrogates "
+                    f"{drawn['gains_of_surrogates'][-1]:.0f})"
+                )
+            if proposal := evidence.get("proposal"):
+                lines.append(
+                    f"    constants of the first recording explain "
+                    f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of the second; "
+                    f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
+                )
+            lines += [
+                f"    not excluded: {a['effect']}; {a['experiment']}"
+                for a in effect.alternatives
+                if not a.get("resembles")
+            ]
+        lines += [*mount_lines(self.examination), *field_lines(self.examination)]
+        sources = [e.source.name for e in self.examination.fitter.series]
+        names = tell_apart([Path(source).name or source for source in sources], sources)
+        gaps = zip(first.gaps, last.gaps, strict=True)
+        for name, (before, after) in zip(names, gaps, strict=True):
+            lines.append(
+                f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
+                f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
+                f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
+            )
+        return [*lines, *doubt_lines(self.doubts)]
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text; title: by default the series' name."""
@@ -287,46 +326,3 @@ class FieldCheck(checks.FieldCheck, Result):
         from thermocald.output.calibration import seen_figure
 
         return draw_figure(seen_figure(self))
-
-
-def discovery_lines(found: Discovery) -> list[str]:
-    """Return the lines that `thermocald discover` prints."""
-    first, last = found.stages[0], found.stages[-1]
-    lines = [f"verdict: {found.headline}"]
-    if found.verdict == "adequate":
-        lines.append(say_adequate(found.examination))
-    for effect in found.effects:
-        lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
-        for name, e in effect.estimates.items():
-            if isinstance(e["value"], float):
-                sd = math.nan if e["sd"] is None else e["sd"]
-                lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
-        if "false_alarm_probability" in effect.evidence:
-            surrogates = effect.evidence["surrogates"]
-            lines.append(
-                f"    probability of a false name {effect.evidence['false_alarm_probability']:.3f} "
-                f"(gain {surrogates['gain']:.0f}; the largest of {surrogates['count']} surrogates "
-                f"{surrogates['gains_of_surrogates'][-1]:.0f})"
-            )
-        if proposal := effect.evidence.get("proposal"):
-            lines.append(
-                f"    constants of the first recording explain "
-                f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of the second; "
-                f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
-            )
-        lines += [
-            f"    not excluded: {a['effect']}; {a['experiment']}"
-            for a in effect.alternatives
-            if not a.get("resembles")
-        ]
-    lines += [*mount_lines(found.examination), *field_lines(found.examination)]
-    sources = [e.source.name for e in found.examination.fitter.series]
-    names = tell_apart([Path(source).name or source for source in sources], sources)
-    gaps = zip(first.gaps, last.gaps, strict=True)
-    for name, (before, after) in zip(names, gaps, strict=True):
-        lines.append(
-            f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
-            f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
-            f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
-        )
-    return [*lines, *doubt_lines(found.doubts)]

@@ -1,4 +1,4 @@
-"""Further functions of `import thermocald`: camera files, predictions, corrections, test fields.
+"""Further functions of `import thermocald`: photographs, camera files, predictions, test fields.
 
 Each does what a command does; units and errors are those of `thermocald.api`.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
-from thermocald.api import Field, read_testfield
+from thermocald.api import Field, Paths, paths_of, read_testfield
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry import camera_files
 from thermocald.series import (
@@ -27,6 +27,7 @@ from thermocald.series import (
     require_within,
     source_of,
 )
+from thermocald.series import open as open_series
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.dialect import LogOptions, log_options
 
@@ -42,6 +43,66 @@ if TYPE_CHECKING:
 
 Model = ThermalCamera | Path | str
 LogRead = LogOptions | Mapping[str, Any] | None
+
+
+def import_photographs(
+    photographs: Paths,
+    *,
+    log: Path | str,
+    testfield: Field | None = None,
+    timezone: str | None = None,
+    ambiguous: str = "refuse",
+    camera_timezone: str | None = None,
+    camera_clock: str = "0",
+    log_options: LogRead = None,
+    pixel_pitch: float | None = None,
+    principal_distance: float | None = None,
+    camera: Path | str | None = None,
+    series: str = "M1",
+    times: str = "exif",
+    out: Path | str | None = None,
+    say: Say = None,
+) -> Series:
+    """Make a series from photographs and a logger's temperatures (CSV in any dialect).
+
+    testfield: without one, the series only shows how the files are interpreted. timezone: for times
+    without one (`Europe/Berlin`, `+02:00`); such times are refused if it is not given; ambiguous:
+    which of the two hours in autumn is meant. camera_timezone, camera_clock: the camera's own zone
+    and the advance of its clock (`+00:03:12`). pixel_pitch, principal_distance (mm) or camera (a
+    camera file): needed if EXIF does not give them. times: where a photograph's time is read,
+    `exif`, `name` (file name) or `file` (file date). out: a new folder for the recording; if not
+    given, the photographs are read in place. say: called with a line for each thing that was
+    recognised and, with out, each that a calibration of some photographs shows to be doubtful.
+    Raises DataError if times or columns cannot be understood, UsageError if a choice is needed.
+
+    >>> photos = tc.import_photographs("photos", log="logger.csv", timezone="Europe/Berlin",
+    ...                                testfield="M1/testfield.csv", pixel_pitch=0.00112)
+    >>> len(photos)
+    6
+    """
+    from thermocald.daemon.soundness import calibration_doubts
+    from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
+    from thermocald.store.recording.reader import read_recording
+    from thermocald.store.recording.sense import doubt_lines
+
+    tell = say or (lambda _: None)
+    recording, notes = read_series(
+        read_photographs(paths_of(photographs), times),
+        device_clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone"),
+        source_of(log), _log_options(log_options or {"timezone": timezone}),
+        testfield=None if testfield is None else read_testfield(testfield), series=series,
+        camera=None if camera is None else source_of(camera), pitch=pixel_pitch,
+        distance=principal_distance,
+    )  # fmt: skip
+    for note in notes:
+        tell(note)
+    if out is None:
+        return Series(recording)
+    write_photographs(source_of(out), recording)
+    if say is not None:  # whether the camera's data are plausible
+        for doubt in doubt_lines(calibration_doubts(read_recording(source_of(out)))):
+            say(doubt)
+    return open_series(out)
 
 
 def convert_camera(
@@ -329,7 +390,7 @@ def fit_calibrations(
 
 
 def survey_testfield(
-    photographs: Sequence[Path | str],
+    photographs: Paths,
     *,
     scale: tuple[str, str, float] | None = None,
     scale_sd: float = 0.1,
@@ -374,7 +435,7 @@ def survey_testfield(
             raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
     if hold_camera and camera is None:
         raise UsageError("--hold-camera needs --camera")
-    paths = images_of([source_of(p) for p in photographs])
+    paths = images_of(paths_of(photographs))
     tell = say or (lambda _: None)
     copies = find_copies(paths)
     for copy, first in copies.items():

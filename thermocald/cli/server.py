@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -14,29 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import (
-    DEFAULT_FREE,
-    FreeOption,
-    JobsOption,
-    JsonOption,
-    StoreArgument,
-    StoreConfigOption,
-    log_to_stderr,
-    progress,
-    say,
-    show,
-    write_json,
-    write_parts,
-)
+from thermocald.cli.common import log_to_stderr, progress, say, show, write_json, write_parts
 from thermocald.config import load_config
 from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
-    from thermocald.fleet.reprocess import Outcome
-
+    from thermocald.fleet.reprocess import Block, Outcome
 
 _Address = Annotated[
     str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, by its owner.")
@@ -88,17 +74,17 @@ group = subcommands(init=init, grant=grant, dashboard=dashboard)
 
 
 def forward(
-    store: StoreArgument = None,
+    store: opt.Store = None,
     to: str | None = typer.Option(
         None, metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"
     ),
-    config: StoreConfigOption = None,
+    config: opt.StoreConfig = None,
     station: str | None = expert(None, help="Name of this station; default: the host's name."),
     once: bool = typer.Option(
         False, "--once", help="Send the waiting rows and exit; default: run until stopped."
     ),
     cursor: Path | None = expert(None, help="File that records which rows have been sent."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Send epochs, events, readings and chosen frames to a PostgreSQL server, each exactly once.
 
@@ -144,7 +130,7 @@ def fleet(
         ..., metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?station=…"
     ),
     report: Path | None = typer.Option(None, help="Write a page to an HTML file."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Show late or dead stations, sensors and clocks, unusual cameras, and calibrations due.
 
@@ -195,10 +181,10 @@ def reprocess(
     out: Path = typer.Option(..., "--out", "-o", help="Folder for the results."),
     do: str = typer.Option("calibrate", help="calibrate epochs, or discover or study series."),
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
-    jobs: JobsOption = 1,
-    free: FreeOption = DEFAULT_FREE,
+    jobs: opt.Jobs = 1,
+    free: opt.Free = opt.DEFAULT_FREE,
     sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's simulation."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Calibrate every epoch of every recording again, or analyse every series separately.
 
@@ -209,47 +195,52 @@ def reprocess(
 
     Example: thermocald reprocess archive --out again --jobs 2
     """
-    from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
-    from thermocald.series import free_names
+    from thermocald.fleet.reprocess import calibrate_block, run_tasks
 
+    blocks, what = do == "calibrate", "blocks" if do == "calibrate" else "series"
     sources = [Path(archive) for archive in archives]
-    tasks: Sequence[Any]
-    if do == "calibrate":
-        for source in sources:
-            if is_server(source):
-                raise UsageError(
-                    f"{source_name(source)}: a server has no recordings to calibrate again; "
-                    "--do discover and --do study read one"
-                )
-        tasks, what = find_blocks(sources, out, free_names(free)), "blocks"
-    else:
-        tasks, what = find_series_tasks(sources, out, do), "series"
-    work = calibrate_block if do == "calibrate" else partial(analyse, do, sets)
+    tasks = _find_blocks(sources, out, free) if blocks else find_series_tasks(sources, out, do)
     with progress(len(tasks), what) as advance:
         outcomes = []
+        work = calibrate_block if blocks else partial(analyse, do, sets)
         for outcome in run_tasks(work, tasks, engine, jobs):
             outcomes.append(outcome)
             advance(1)
     count, failed = len(outcomes), [o for o in outcomes if o.error]
-    document: dict[str, Any]
-    if do == "calibrate":
-        epochs = sum(o.epochs for o in outcomes)
-        calibrated = sum(o.calibrated for o in outcomes)
-        document = {"blocks": count, "epochs": epochs, "calibrated": calibrated}
-        places = [{"recording": o.task.recording, "first": o.task.first} for o in failed]
+    document: dict[str, Any] = {what: count}
+    summary = f"{count - len(failed)} of {count} series analysed"
+    if blocks:
+        epochs, calibrated = sum(o.epochs for o in outcomes), sum(o.calibrated for o in outcomes)
+        document |= {"epochs": epochs, "calibrated": calibrated}
         summary = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
-    else:
-        document = {"series": count}
-        places = [{"source": source_name(o.task[0])} for o in failed]
-        summary = f"{count - len(failed)} of {count} series analysed"
-    errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
+    errors = [{**_place(o.task), "error": o.error} for o in failed]
     write_json({**document, "failed": errors}, json)
     if json != "-":
         say(f"{out}: {summary}")
-    if not failed:
-        return
-    first = failed[0]
-    if first.not_written:
-        raise OutputError(first.error, first.not_written)
-    where = places[0].get("source") or f"{first.task.recording}, epoch {first.task.first + 1} on"
-    raise DataError(f"{len(failed)} of {count} {what} failed; {where}: {first.error}")
+    if failed and failed[0].not_written:
+        raise OutputError(failed[0].error, failed[0].not_written)
+    if failed:
+        where = (
+            errors[0].get("source")
+            or f"{errors[0]['recording']}, epoch {errors[0]['first'] + 1} on"
+        )
+        raise DataError(f"{len(failed)} of {count} {what} failed; {where}: {failed[0].error}")
+
+
+def _find_blocks(sources: list[Path], out: Path, free: str) -> list[Block]:
+    from thermocald.fleet.reprocess import find_blocks
+    from thermocald.series import free_names
+
+    if server := next(filter(is_server, sources), None):
+        raise UsageError(
+            f"{source_name(server)}: a server has no recordings to calibrate again; --do discover "
+            "and --do study read one"
+        )
+    return find_blocks(sources, out, free_names(free))
+
+
+def _place(task: Any) -> dict[str, Any]:
+    """Return where a block or a series is, as the document names it."""
+    if isinstance(task, tuple):
+        return {"source": source_name(task[0])}
+    return {"recording": task.recording, "first": task.first}

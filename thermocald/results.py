@@ -19,9 +19,14 @@ from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
+from thermocald.figures import draw_figure
 from thermocald.names import tell_apart
 from thermocald.numbers import percent, plain, typeset_powers, with_sd
-from thermocald.output.study.report import study_document, study_lines
+from thermocald.output import calibration as calibration_report
+from thermocald.output import discovery as discovery_report
+from thermocald.output.study import report as study_report
+from thermocald.output.study.figures import deviation_figure
+from thermocald.photogrammetry.camera_files import write_camera
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
 from thermocald.store.logger.photographs import known_photograph
@@ -49,32 +54,25 @@ class Study(Result, studies.Study):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald study --json` writes."""
-        document = study_document(self)
+        document = study_report.study_document(self)
         if self.reference:
             document["reference"] = jsonable(self.reference)
         return document
 
     def lines(self) -> list[str]:
         """Return what `thermocald study` prints."""
-        return study_lines(self, self.reference)
+        return study_report.study_lines(self, self.reference)
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text."""
-        from thermocald.output.study.report import render_study
-
-        return render_study(self, title or self.heading)
+        return study_report.render_study(self, title or self.heading)
 
     def save_figures(self, folder: Path | str) -> list[Path]:
         """Write every figure as SVG and PNG; return the files."""
-        from thermocald.output.study.report import save_figures
-
-        return save_figures(self, Path(folder))
+        return study_report.save_figures(self, Path(folder))
 
     def plot(self) -> Figure:
         """Draw the changes of the first camera's interior orientation."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.study.figures import deviation_figure
-
         return draw_figure(deviation_figure(self.cameras[0]))
 
 
@@ -135,16 +133,11 @@ class Discovery(discoveries.Discovery, Result):
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text; title: by default the series' name."""
-        from thermocald.output.discovery import report_html
-
-        return report_html(self, title or self.name)
+        return discovery_report.report_html(self, title or self.name)
 
     def plot(self) -> Figure:
         """Draw the gap before and after each effect and the noise, px."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.discovery import gap_figure
-
-        return draw_figure(gap_figure(self))
+        return draw_figure(discovery_report.gap_figure(self))
 
     @cached_property
     def model(self) -> ThermalModel:
@@ -244,8 +237,6 @@ class Calibration(Photographs, Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
-        from thermocald.output.calibration import interior_table
-
         document = self.as_dict()
         lines: list[str] = []
         if document["status"] == "ok":
@@ -255,7 +246,7 @@ class Calibration(Photographs, Result):
                 f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
                 + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
             )
-            table = interior_table(self, self.file.sensor, str)
+            table = calibration_report.interior_table(self, self.file.sensor, str)
             rows = [("", *table.headings[1:]), *table.rows]
             width = [max(len(row[k]) for row in rows) for k in range(3)]
             lines += [
@@ -279,25 +270,18 @@ class Calibration(Photographs, Result):
 
     def page(self, title: str = "") -> str:
         """Return residuals and coverage as HTML text; title: by default the camera's name."""
-        from thermocald.output.calibration import render_calibration
-
         name = title or self.file.name
-        return render_calibration(self, self.file.sensor, name, self._notes)
+        return calibration_report.render_calibration(self, self.file.sensor, name, self._notes)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.calibration import residual_figure
-
-        return draw_figure(residual_figure(self, self.file.sensor))
+        return draw_figure(calibration_report.residual_figure(self, self.file.sensor))
 
     def save(self, path: Path | str) -> Path:
         """Write the camera in this program's format: `.json` with covariance, `.yaml` without.
 
         Raises DataError if nothing was estimated.
         """
-        from thermocald.photogrammetry.camera_files import write_camera
-
         if self.interior is None or not self.estimated:
             why = self.reason
             raise DataError(f"{path}: not written, the camera was not calibrated: {why}")
@@ -316,13 +300,8 @@ class FieldCheck(checks.FieldCheck, Result):
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text."""
-        from thermocald.output.calibration import render_field_check
-
-        return render_field_check(self, title)
+        return calibration_report.render_field_check(self, title)
 
     def plot(self) -> Figure:
         """Draw the visible targets in the image, px."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.calibration import seen_figure
-
-        return draw_figure(seen_figure(self))
+        return draw_figure(calibration_report.seen_figure(self))

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.camera.camera import Camera, CameraDifference
 from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.api import Field, Paths, paths_of, read_testfield
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry import camera_files
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, RASPBERRY_PI_V2
+from thermocald.photogrammetry.field.testfield import Distance
 from thermocald.series import (
     COLDEST_C,
     Progress,
@@ -32,7 +34,6 @@ from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.dialect import LogOptions, log_options
 
 if TYPE_CHECKING:
-    from thermocald.analysis.camera.camera import CameraDifference
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
     from thermocald.analysis.thermal.scene import SceneCourse
@@ -139,8 +140,6 @@ def compare_cameras(
     >>> found.rms_px > 0, found.has_sd
     (True, True)
     """
-    from thermocald.analysis.camera.camera import CameraDifference
-
     a, b = (camera_files.read(source_of(p), pixel_pitch=pixel_pitch) for p in (first, second))
     names = str(first), str(second)
     return CameraDifference(names, a.model, b.model, (a.covariance, b.covariance))
@@ -418,8 +417,6 @@ def survey_testfield(
     thermocald.errors.UsageError: the scale is missing: --scale A B MM, or --distances FILE
     """
     from thermocald.analysis.camera.photographs import images_of
-    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-    from thermocald.photogrammetry.field.testfield import Distance
     from thermocald.photogrammetry.survey import survey
     from thermocald.photogrammetry.targets.image_file import decode_grey
     from thermocald.store.logger.photographs import find_copies
@@ -488,7 +485,6 @@ def check_testfield(
     True
     """
     from thermocald.analysis.field import assess_field
-    from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
     from thermocald.results import FieldCheck
 
     require_within(sigma_px=(sigma_px, 1e-4))

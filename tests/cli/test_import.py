@@ -181,23 +181,6 @@ def test_points_take_no_time_for_utc_that_does_not_say_so(tmp_path):
         next(row_blocks(tmp_path / "points.csv", ("x", "y"), device_clock(None)))
 
 
-def test_the_readme_leads_to_a_plot_in_ten_commands():
-    """At most ten, with options that exist; test_first_hour runs them."""
-    from pathlib import Path
-
-    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    block = text.split("## Your first plot")[1].split("```text\n")[1].split("```")[0]
-    commands = block.strip().splitlines()
-    assert len(commands) <= 10
-    for command in commands[1:]:
-        words = command.split()
-        names = words[1:3] if words[1] == "testfield" else words[1:2]
-        told = succeed(*names, "--help", COLUMNS="200")
-        for option in (w for w in words if w.startswith("--")):
-            assert option in told.output, command
-    assert "study.html" in commands[-1]
-
-
 def log_of(place, values, head="Time;Temperature", step=15):
     """A log of values from 11:59:45 in Berlin on, every `step` s."""
     rows = "".join(

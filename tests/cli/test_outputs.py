@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import itertools
 import os
 import shutil
 import socket
@@ -26,6 +27,7 @@ import thermocald as tc
 from tests.cli.test_testfield import photograph
 from tests.commands import call, every_command, finish
 from tests.golden.workshop import photographs
+from tests.marks import mostly_slow
 from thermocald.errors import OutputError
 from thermocald.files import new_file, write_text
 from thermocald.photogrammetry import camera_files
@@ -186,7 +188,7 @@ def capabilities(dropped: int):
 
 @pytest.fixture
 def refusing(tmp_path):
-    """Map a kind to a folder that cannot be written: read-only, full, or another user's."""
+    """Map a kind to a folder that cannot be written: full, or another user's."""
     tool = shutil.which("mount")
     with ExitStack() as undo:
 
@@ -197,15 +199,13 @@ def refusing(tmp_path):
                 folder.chmod(0o555)
                 undo.enter_context(capabilities(_OVERRIDE_PERMISSIONS))
                 return folder
-            options = ["ro"] if kind == "read-only" else ["size=4k"]
-            command = [tool or "mount", "-t", "tmpfs", "-o", *options, "tmpfs", str(folder)]
+            command = [tool or "mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", str(folder)]
             done = subprocess.run(command, capture_output=True, check=False) if tool else None
             if done is None or done.returncode:
                 pytest.skip("nothing can be mounted here: needs root")
             undo.callback(subprocess.run, ["umount", "-l", str(folder)], check=False)
-            if kind == "full":
-                with suppress(OSError):
-                    (folder / "filler").write_bytes(b"x" * 100_000)
+            with suppress(OSError):
+                (folder / "filler").write_bytes(b"x" * 100_000)
             return folder
 
         yield make
@@ -218,15 +218,14 @@ def test_every_command_that_writes_is_tried():
 
 
 QUICK = ["camera convert", "check", "testfield print", "testfield import", "import"]
-SLOW = [name for name in COMMANDS if name not in QUICK]
 
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [
-        *((name, kind) for name in QUICK for kind in ("read-only", "full", "denied")),
-        *(pytest.param(n, k, marks=pytest.mark.slow) for n in SLOW for k in ("full", "denied")),
-    ],
+    mostly_slow(
+        itertools.product(COMMANDS, ("full", "denied")),
+        *itertools.product(QUICK, ("full", "denied")),
+    ),
 )
 def test_a_place_that_cannot_be_written_is_one_sentence(world, refusing, tmp_path, name, kind):
     words = world.words(name, to=tmp_path / kind)
@@ -283,10 +282,7 @@ def read_pipe(path: Path) -> tuple[Thread, list[bytes]]:
 
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "link", "dangling", "link to pipe", "folder"])
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=() if name in QUICK_FILES else pytest.mark.slow) for name in FILES],
-)
+@pytest.mark.parametrize("name", mostly_slow(FILES, *QUICK_FILES))
 def test_what_is_not_a_file_is_never_replaced(world, tmp_path, name, kind):
     out, target = tmp_path / "out", tmp_path / "folder/target.yaml"
     target.parent.mkdir()

@@ -19,6 +19,7 @@ import pytest
 
 from tests.docs.blocks import PAGES, ROOT, Block, all_blocks, blocks, name
 from tests.docs.worlds import AFTER, WORLDS
+from tests.marks import mostly_slow
 from thermocald.store.database.store import Store
 
 NOT_RUN = {
@@ -235,17 +236,11 @@ def runnable(page: Path) -> bool:
     )
 
 
-QUICK = {"docs/reference/store.md"}
-
-
 @pytest.mark.timeout(1500)  # a tutorial is several series and their analysis
 @pytest.mark.parametrize(
     "page",
-    [
-        pytest.param(p, marks=() if name(p) in QUICK else pytest.mark.slow, id=name(p))
-        for p in PAGES
-        if runnable(p)
-    ],
+    mostly_slow([p for p in PAGES if runnable(p)], ROOT / "docs/reference/store.md"),
+    ids=name,
 )
 def test_the_commands_of_a_page_run(page, shelf, tmp_path):
     if name(page) in WORLDS:

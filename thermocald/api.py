@@ -91,7 +91,7 @@ def calibrate(
     from thermocald.photogrammetry.camera_files import read_camera
     from thermocald.results import Calibration
 
-    require_within(pixel_pitch=(pixel_pitch, 1e-6))
+    require_within(pixel_pitch=(pixel_pitch, 1e-5, 1))
     paths = images_of(paths_of(images))
     if camera is not None:
         file = read_camera(source_of(camera), pixel_pitch)
@@ -425,7 +425,7 @@ def _study_settings(**given: Any) -> StudySettings:
         thermometer_sd=(s.thermometer_sd, 0.0), jobs=(s.jobs, 1, 256),
     )  # fmt: skip
     if s.window % 2 == 0:
-        raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")
+        raise UsageError(f"--window is {s.window}; it must be odd, so that it has a centre")
     return s
 
 

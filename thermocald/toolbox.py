@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.api import Field, Paths, paths_of, read_testfield
 from thermocald.errors import DataError, UsageError
+from thermocald.names import checked
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, RASPBERRY_PI_V2
 from thermocald.photogrammetry.field.testfield import Distance
@@ -86,6 +88,9 @@ def import_photographs(
     from thermocald.store.recording.reader import read_recording
     from thermocald.store.recording.sense import doubt_lines
 
+    if testfield is None and out is not None:
+        raise UsageError("testfield is missing: without it no recording is written")
+    require_within(pixel_pitch=(pixel_pitch, 1e-5, 1), principal_distance=(principal_distance, 0.1))
     tell = say or (lambda _: None)
     recording, notes = read_series(
         read_photographs(paths_of(photographs), times),
@@ -422,6 +427,7 @@ def survey_testfield(
     from thermocald.store.logger.photographs import find_copies
     from thermocald.store.recording.testfield_file import read_distances, write_testfield
 
+    require_within(pixel_pitch=(pixel_pitch, 1e-5, 1))
     measured = [] if scale is None else [Distance(*scale, scale_sd)]
     if distances is not None:
         measured += read_distances(source_of(distances))
@@ -488,6 +494,9 @@ def check_testfield(
     from thermocald.results import FieldCheck
 
     require_within(sigma_px=(sigma_px, 1e-4))
+    for name, value in (("place", place), ("look_at", look_at), ("roll", roll)):
+        if value is not None and not np.isfinite(value).all():
+            raise UsageError(f"{name} is {value}; it must be finite")
     if camera is None:
         model = RASPBERRY_PI_V2
     elif isinstance(camera, Camera):
@@ -503,4 +512,12 @@ def _thermal(model: Model) -> ThermalCamera:
 
 
 def _log_options(given: LogRead) -> LogOptions:
-    return given if isinstance(given, LogOptions) else log_options(**(given or {}))
+    if isinstance(given, LogOptions):
+        return given
+    known, options = signature(log_options).parameters, dict(given or {})
+    for name, value in options.items():
+        if name not in known:
+            raise UsageError(f"log_options: there is no {name!r}; there are: {', '.join(known)}")
+        if name in ("name", "temperature_column", "time_column") and isinstance(value, str):
+            options[name] = [value]
+    return checked(log_options)(**options)

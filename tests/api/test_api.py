@@ -307,6 +307,10 @@ def test_a_model_and_a_programme_are_simulated(inside, tmp_path):
     np.testing.assert_allclose(series.truth[0], series.simulation.truth.iop[0])
 
 
+def imported(**more):
+    return tc.import_photographs("photos", log="logger.csv", **more)
+
+
 OUT_OF_BOUNDS = {
     "must be one of per_epoch": lambda M1, field: M1.calibrate(exterior="still"),
     "there is no such file or folder": lambda M1, field: tc.import_photographs(
@@ -345,6 +349,17 @@ OUT_OF_BOUNDS = {
     "at which temperature": lambda M1, field: tc.fit_calibrations({"cold.json": None}),
     "give one of": lambda M1, field: tc.predict("camera.yaml", 35.0, log="M1"),
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
+    "roll is nan": lambda M1, field: tc.check_testfield(field, roll=np.nan),
+    "place is .nan, 0": lambda M1, field: tc.check_testfield(field, place=(np.nan, 0, 0)),
+    "pixel_pitch is -1": lambda M1, field: tc.survey_testfield(["photos"], pixel_pitch=-1.0),
+    "principal_distance is 0": lambda M1, field: imported(principal_distance=0.0),
+    "pixel_pitch is -0.01": lambda M1, field: imported(pixel_pitch=-0.01),
+    "testfield is missing": lambda M1, field: imported(out="new"),
+    "there is no 'timezon'": lambda M1, field: imported(log_options={"timezon": "UTC"}),
+    "there is no column 'T 1'": lambda M1, field: imported(
+        timezone="UTC", log_options={"timezone": "UTC", "temperature_column": "T 1"}
+    ),
+    "unit is 3; it must be text": lambda M1, field: imported(log_options={"unit": 3}),
     "series is 'M1'; it must be a Series .from open.": lambda M1, field: tc.fit("M1"),
     "verify is <Series": lambda M1, field: tc.discover(M1, verify=M1),
     "channels belong to a temperature": lambda M1, field: tc.predict(

@@ -170,7 +170,7 @@ def test_odd_epochs_do_not_harm_the_others(plain, tmp_path):
     write_rows(odd / "epochs.csv", heads)
     part, sd_part, _ = rate_of_c(odd, tmp_path / "camera.yaml")
     assert abs(part - whole) < 2 * np.hypot(sd, sd_part)
-    assert sd_part < 2 * sd
+    assert sd_part < 2.5 * sd  # each alone: 1.5 times
     assert "board_temperature" not in (tmp_path / "camera.yaml").read_text()
     run("discover", odd)
 

@@ -186,8 +186,6 @@ def study(
             if not inputs
             else "--reference studies the presets; give no recordings with it"
         )
-    if window % 2 == 0:
-        raise UsageError(f"--window is {window}; it must be odd, so that it has a centre")
     settings: dict[str, Any] = {
         "window": window, "alpha": alpha, "sets": sets, "seed": seed,
         "distance_mm": 1000 * distance, "grid": grid, "focus_mm": 1000 * focus,

@@ -371,10 +371,10 @@ def test_a_backup_does_not_replace_a_device(world, tmp_path):
     assert stat.S_ISFIFO((tmp_path / "pipe").lstat().st_mode)
 
 
-def test_standard_output_on_a_full_disk_is_one_sentence(world):
+def test_standard_output_on_a_full_disk_is_one_sentence():
     with open("/dev/full", "wb") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "thermocald", "check", world["M1"], "--json", "-"],
+            [sys.executable, "-m", "thermocald", "--version"],
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 3

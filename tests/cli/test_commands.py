@@ -52,6 +52,8 @@ def test_a_store_gives_what_is_stored(recording, store):
     for mine, theirs in zip(a, b, strict=True):
         assert abs(float(mine["c"]) - float(theirs["c"])) < 4 * float(mine["sd_c"])
     assert a[0]["sd_C1"] == ""  # held fixed
+    refused = run("export", store, "--free", "c")
+    assert (refused.returncode, "stored epochs are not adj" in refused.stderr) == (2, True)
 
 
 def test_an_interrupted_replay_goes_on(recording, tmp_path):

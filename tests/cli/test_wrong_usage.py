@@ -49,6 +49,10 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         ),
         (("discover", "M1", "--plan", "--report", "r"), "--report does nothing with --plan"),
         (("camera", "at", "m", "--temperature", "9", "--frame", "f"), "--frame needs --renew"),
+        (("camera", "at", "m", "--temperature", "9", "--to", "ros"), "--to needs --out"),
+        (("fit", "a", "-o", "o", "--timezone", "UTC"), "--timezone needs --log"),
+        (("predict", "--model", "m", "--log", "l", "--distance", "5"), "--distance does nothing"),
+        (("reprocess", "a", "-o", "o", "--do", "study", "--free", "c"), "--free needs --do calib"),
         # the names are those of the help
         (("correct", "p", "--size", "9", "--model"), "error: option '--model' requires"),
         (("measure", "--model", "/dev/null/m"), r"error: missing argument 'POINTS\.csv'"),

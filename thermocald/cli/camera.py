@@ -119,7 +119,6 @@ def at(
         thermal = thermal.for_images(*series_export.image_size(renew))
     with warnings_said():
         found = tc.predict(thermal, temperature, extrapolate=extrapolate)
-    say_warning(thermal)
     document, lines = found.as_dict(), found.lines()
     if out is not None:
         assert found.state is not None
@@ -133,6 +132,7 @@ def at(
             statement = renewed.write(out)
         document |= {"out": str(out), "out_format": to, "statement": statement}
         lines.append(f"{out} ({to}): {statement}")
+    say_warning(thermal)
     show(document, json, *lines)
 
 

@@ -33,13 +33,13 @@ _OUTPUTS: dict[str, Output] = {
     "testfield print out": "folder",
 }  # fmt: skip
 _READING = (
-    "temperature_column name unit date_order time_column log_timezone log_clock encoding separator "
-    "decimal"
+    "timezone temperature_column name unit date_order time_column log_timezone log_clock ambiguous "
+    "encoding separator decimal"
 )
 # by command and option: the options that do nothing without it
 _NEEDED = {
     "archive": {"config": "retention"},
-    "camera at": {"renew": "reference frame"},
+    "camera at": {"out": "to", "renew": "reference frame"},
     "discover": {"plan": "preset testfield programme strength seeds"},
     "fit": {"log": _READING},
     "predict": {"log": _READING, "programme": "camera wanted", "temperature": "channel"},
@@ -51,6 +51,7 @@ _NEEDED = {
 _IDLE = {
     "discover": {"plan": "verify model_out effect_out report jobs"},
     "fit": {"log": "jobs"},
+    "predict": {"log": "distance", "test": "distance"},
     "replay": {"model": "store exterior free jobs"},
     "study": {"reference": "exterior free"},
 }

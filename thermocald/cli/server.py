@@ -18,6 +18,7 @@ from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import log_to_stderr, progress, say, show, write_json, write_parts
 from thermocald.config import load_config
 from thermocald.errors import DataError, OutputError, UsageError
+from thermocald.numbers import counted
 from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
@@ -145,6 +146,7 @@ def fleet(
 
 
 ANALYSES = ("discover", "study")
+_SETS = 100_000
 
 
 def find_series_tasks(sources: list[Path], out: Path, analysis: str) -> list[tuple[Path, Path]]:
@@ -183,7 +185,7 @@ def reprocess(
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: opt.Jobs = 1,
     free: opt.Free = opt.DEFAULT_FREE,
-    sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's simulation."),
+    sets: int = expert(_SETS, min=100, max=10_000_000, help="Draws of a study's simulation."),
     json: opt.Json = None,
 ) -> None:
     """Calibrate every epoch of every recording again, or analyse every series separately.
@@ -197,6 +199,11 @@ def reprocess(
     """
     from thermocald.fleet.reprocess import calibrate_block, run_tasks
 
+    for name, given, usual, of in (
+        ("--free", free, opt.DEFAULT_FREE, "calibrate"), ("--sets", sets, _SETS, "study"),
+    ):  # fmt: skip
+        if given != usual and do != of:
+            raise UsageError(f"{name} needs --do {of}")
     blocks, what = do == "calibrate", "blocks" if do == "calibrate" else "series"
     sources = [Path(archive) for archive in archives]
     tasks = _find_blocks(sources, out, free) if blocks else find_series_tasks(sources, out, do)
@@ -212,7 +219,8 @@ def reprocess(
     if blocks:
         epochs, calibrated = sum(o.epochs for o in outcomes), sum(o.calibrated for o in outcomes)
         document |= {"epochs": epochs, "calibrated": calibrated}
-        summary = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
+        done = counted(count - len(failed), "block")
+        summary = f"{calibrated} of {epochs} epochs calibrated in {done}"
     errors = [{**_place(o.task), "error": o.error} for o in failed]
     write_json({**document, "failed": errors}, json)
     if json != "-":

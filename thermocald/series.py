@@ -348,7 +348,7 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
     `none` frees no parameter. Raises UsageError for an unknown name.
     """
     names = [n.strip() for n in given.split(",")] if isinstance(given, str) else list(given)
-    if names in (["none"], [""]):
+    if names == ["none"]:
         return ()
     for name in names:
         if name not in IOP_NAMES:

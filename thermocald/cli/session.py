@@ -113,7 +113,8 @@ def stop(camera: CameraOption = None, config: opt.Config = None) -> None:
     say(f"{name}/{one['series']}: {one['taken']} of {one['epochs']} epochs, stopped")
 
 
-def _configuration(config: Path | None, mock: bool = False) -> Config:
+def _configuration(config: Path | None, mock: bool | None = None) -> Config:
+    """Read the configuration; mock: whether to use that of the rendered camera, None: never."""
     from thermocald.config import load_config
     from thermocald.hal import load_driver
 
@@ -123,7 +124,8 @@ def _configuration(config: Path | None, mock: bool = False) -> Config:
         if config is not None:
             raise UsageError("give --config or --mock, not both")
         return mock_config()
-    return load_config(require_config(config, "--config FILE, or --mock"), load_driver)
+    instead = "--config FILE" + ", or --mock" * (mock is not None)
+    return load_config(require_config(config, instead), load_driver)
 
 
 def _ask(config: Config, do: str, **values: Any) -> dict[str, Any]:

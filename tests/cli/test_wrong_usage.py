@@ -52,6 +52,11 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         (("camera", "at", "m", "--temperature", "9", "--to", "ros"), "--to needs --out"),
         (("fit", "a", "-o", "o", "--timezone", "UTC"), "--timezone needs --log"),
         (("predict", "--model", "m", "--log", "l", "--distance", "5"), "--distance does nothing"),
+        (("testfield", "check", "f.csv", "--paper", "A4"), "--paper does nothing with FIELD"),
+        (("testfield", "check", "--pixel-pitch", "0.001"), "--pixel-pitch needs --camera"),
+        (("testfield", "print", "-o", "f", "--dictionary", "D"), "--dictionary needs --charuco"),
+        (("testfield", "print", "-o", "f", "--chessboard", "9x6", "--light"), "--light does noth"),
+        (("testfield", "import", "b.pdf", "--diameter", "9"), "--diameter needs --rings"),
         (("reprocess", "a", "-o", "o", "--do", "study", "--free", "c"), "--free needs --do calib"),
         # the names are those of the help
         (("correct", "p", "--size", "9", "--model"), "error: option '--model' requires"),

@@ -23,7 +23,7 @@ from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
-    from thermocald.fleet.reprocess import Block, Outcome
+    from thermocald.fleet.reprocess import Outcome
 
 _Address = Annotated[
     str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, by its owner.")
@@ -149,16 +149,24 @@ ANALYSES = ("discover", "study")
 _SETS = 100_000
 
 
-def find_series_tasks(sources: list[Path], out: Path, analysis: str) -> list[tuple[Path, Path]]:
-    """Return each series that is not analysed yet, as (folder or address, its JSON file).
+def find_tasks(sources: list[Path], out: Path, do: str, free: str = "none") -> list[Any]:
+    """Return the blocks to calibrate, or each series to analyse as (place, its JSON file).
 
-    sources: folders and addresses. Raises DataError if there is no series, UsageError for an
-    unknown analysis.
+    Those that are done are left out. Raises DataError if there is no series, UsageError for an
+    unknown task, and for a server, which has no recordings to calibrate.
     """
-    from thermocald.fleet.reprocess import find_series
+    from thermocald.fleet.reprocess import find_blocks, find_series
+    from thermocald.series import free_names
 
-    if analysis not in ANALYSES:
-        raise UsageError(f"--do {analysis}: must be one of calibrate, {', '.join(ANALYSES)}")
+    if do == "calibrate":
+        if server := next(filter(is_server, sources), None):
+            raise UsageError(
+                f"{source_name(server)}: a server has no recordings to calibrate again; "
+                "--do discover and --do study read one"
+            )
+        return find_blocks(sources, out, free_names(free))
+    if do not in ANALYSES:
+        raise UsageError(f"--do {do}: must be one of calibrate, {', '.join(ANALYSES)}")
     tasks = [(place, out / f"{name}.json") for name, place in sorted(find_series(sources).items())]
     return [task for task in tasks if not task[1].exists()]
 
@@ -205,8 +213,7 @@ def reprocess(
         if given != usual and do != of:
             raise UsageError(f"{name} needs --do {of}")
     blocks, what = do == "calibrate", "blocks" if do == "calibrate" else "series"
-    sources = [Path(archive) for archive in archives]
-    tasks = _find_blocks(sources, out, free) if blocks else find_series_tasks(sources, out, do)
+    tasks = find_tasks([Path(archive) for archive in archives], out, do, free)
     with progress(len(tasks), what) as advance:
         outcomes = []
         work = calibrate_block if blocks else partial(analyse, do, sets)
@@ -214,41 +221,24 @@ def reprocess(
             outcomes.append(outcome)
             advance(1)
     count, failed = len(outcomes), [o for o in outcomes if o.error]
-    document: dict[str, Any] = {what: count}
-    summary = f"{count - len(failed)} of {count} series analysed"
     if blocks:
         epochs, calibrated = sum(o.epochs for o in outcomes), sum(o.calibrated for o in outcomes)
-        document |= {"epochs": epochs, "calibrated": calibrated}
+        document = {"blocks": count, "epochs": epochs, "calibrated": calibrated}
+        places = [{"recording": o.task.recording, "first": o.task.first} for o in failed]
         done = counted(count - len(failed), "block")
         summary = f"{calibrated} of {epochs} epochs calibrated in {done}"
-    errors = [{**_place(o.task), "error": o.error} for o in failed]
+    else:
+        document = {"series": count}
+        places = [{"source": source_name(o.task[0])} for o in failed]
+        summary = f"{count - len(failed)} of {count} series analysed"
+    errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
     write_json({**document, "failed": errors}, json)
     if json != "-":
         say(f"{out}: {summary}")
-    if failed and failed[0].not_written:
-        raise OutputError(failed[0].error, failed[0].not_written)
-    if failed:
-        where = (
-            errors[0].get("source")
-            or f"{errors[0]['recording']}, epoch {errors[0]['first'] + 1} on"
-        )
-        raise DataError(f"{len(failed)} of {count} {what} failed; {where}: {failed[0].error}")
-
-
-def _find_blocks(sources: list[Path], out: Path, free: str) -> list[Block]:
-    from thermocald.fleet.reprocess import find_blocks
-    from thermocald.series import free_names
-
-    if server := next(filter(is_server, sources), None):
-        raise UsageError(
-            f"{source_name(server)}: a server has no recordings to calibrate again; --do discover "
-            "and --do study read one"
-        )
-    return find_blocks(sources, out, free_names(free))
-
-
-def _place(task: Any) -> dict[str, Any]:
-    """Return where a block or a series is, as the document names it."""
-    if isinstance(task, tuple):
-        return {"source": source_name(task[0])}
-    return {"recording": task.recording, "first": task.first}
+    if not failed:
+        return
+    first = failed[0]
+    if first.not_written:
+        raise OutputError(first.error, first.not_written)
+    where = places[0].get("source") or f"{first.task.recording}, epoch {first.task.first + 1} on"
+    raise DataError(f"{len(failed)} of {count} {what} failed; {where}: {first.error}")

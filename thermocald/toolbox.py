@@ -6,6 +6,7 @@ Each does what a command does; units and errors are those of `thermocald.api`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -91,9 +92,9 @@ def import_photographs(
     if testfield is None and out is not None:
         raise UsageError("testfield is missing: without it no recording is written")
     require_within(pixel_pitch=(pixel_pitch, 1e-5, 1), principal_distance=(principal_distance, 0.1))
-    tell = say or (lambda _: None)
+    tell, found = say or (lambda _: None), read_photographs(paths_of(photographs), times)
     recording, notes = read_series(
-        read_photographs(paths_of(photographs), times),
+        found,
         device_clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone"),
         source_of(log), _log_options(log_options or {"timezone": timezone}),
         testfield=None if testfield is None else read_testfield(testfield), series=series,
@@ -103,7 +104,7 @@ def import_photographs(
     for note in notes:
         tell(note)
     if out is None:
-        return Series(recording)
+        return Series(replace(recording, path=found[0].path.parent))  # its name in messages
     write_photographs(source_of(out), recording)
     if say is not None:  # whether the camera's data are plausible
         for doubt in doubt_lines(calibration_doubts(read_recording(source_of(out)))):

@@ -101,6 +101,7 @@ def test_photographs_become_a_series(inside, tmp_path):
     there = tc.import_photographs("photos", **told, out=tmp_path / "P1")
 
     assert len(here) == len(there) == 6
+    assert here.source == "photos"  # messages named it `.`
     np.testing.assert_allclose(here.temperature, there.temperature)
     np.testing.assert_array_equal(here.time, there.time)
     assert (tmp_path / "P1" / "frames").is_dir()

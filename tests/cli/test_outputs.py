@@ -14,7 +14,7 @@ import socket
 import stat
 import subprocess
 import sys
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from string import Formatter
@@ -321,47 +321,31 @@ def test_what_is_not_a_file_is_never_replaced(world, tmp_path, name, kind):
     assert not [p for p in tmp_path.rglob("*") if "partial" in p.name]
 
 
-@pytest.mark.parametrize(
-    "kind", ["hard link", "mode", "planted link", "loop", "socket", "long name", "descriptor"]
-)
-def test_the_place_of_an_output_in_further_shapes(tmp_path, kind):
-    out, other = tmp_path / "out", tmp_path / "other"
-    if kind == "hard link":
-        other.write_text("other")
-        os.link(other, out)
-    elif kind == "mode":
-        out.write_text("before")
-        out.chmod(0o600)
-    elif kind == "planted link":  # somebody else's, under the name that we write to first
-        other.write_text("other")
-        (tmp_path / ".out.partial").symlink_to(other)
-    elif kind == "long name":
-        out = tmp_path / ("é" * 120)
-    if kind in ("loop", "socket"):
-        if kind == "loop":
-            out.symlink_to(out)
-        else:
-            server = socket.socket(socket.AF_UNIX)
-            server.bind(str(out))
-            server.close()
+def test_the_place_of_an_output_in_further_shapes(tmp_path):
+    other = tmp_path / "other"
+    other.write_text("other")
+    os.link(other, tmp_path / "hard")
+    (tmp_path / ".planted.partial").symlink_to(other)  # under the name that we write to first
+    (tmp_path / "mode").touch(0o600)
+    for name in ("hard", "planted", "mode", "é" * 120):
+        out = tmp_path / name
+        write_text(out, "new")
+        assert (out.read_text(), stat.S_ISREG(out.lstat().st_mode)) == ("new", True)
+    assert other.read_text() == "other"
+    assert stat.S_IMODE((tmp_path / "mode").stat().st_mode) == 0o600
+    (tmp_path / "loop").symlink_to("loop")
+    with closing(socket.socket(socket.AF_UNIX)) as server:
+        server.bind(str(tmp_path / "socket"))
+    for out in (tmp_path / "loop", tmp_path / "socket"):
+        before = out.lstat().st_ino
         with pytest.raises(OutputError, match="cannot be written"):
             write_text(out, "new")
-        assert out.is_symlink() or stat.S_ISSOCK(out.lstat().st_mode)
-        return
-    if kind == "descriptor":  # `>(command)` of a shell
-        reading, writing = os.pipe()
-        write_text(Path(f"/proc/self/fd/{writing}"), "new")
-        os.close(writing)
-        assert os.read(reading, 10) == b"new"
-        os.close(reading)
-        return
-    write_text(out, "new")
-    assert out.read_text() == "new"
-    assert stat.S_ISREG(out.lstat().st_mode)
-    if kind in ("hard link", "planted link"):
-        assert other.read_text() == "other"
-    if kind == "mode":
-        assert stat.S_IMODE(out.stat().st_mode) == 0o600
+        assert out.lstat().st_ino == before
+    reading, writing = os.pipe()  # `>(command)` of a shell
+    write_text(Path(f"/proc/self/fd/{writing}"), "new")
+    os.close(writing)
+    assert os.read(reading, 10) == b"new"
+    os.close(reading)
 
 
 def test_a_backup_does_not_replace_a_device(world, tmp_path):

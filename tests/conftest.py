@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 LONGEST = (
     # of the slow suite, by `make test-slow` with --durations; one that waits beside two that work
     "golden/test_golden", "daemon/test_endurance", "daemon/test_changes", "blind/test_score",
-    "main_paths/test_live", "docs/test_commands", "test_properties", "cli/test_first_hour",
+    "main_paths/test_live", "docs/test_commands", "test_properties",
     "discovery/test_movement", "discovery/test_years", "cli/test_discover",
     "daemon/test_page_attacks", "daemon/test_faults", "fleet/test_dask",
     "output/test_pages", "store/test_bounds", "photogrammetry/test_ring_code", "docs/test_site",

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from thermocald.api import catalogue as catalogue
     from thermocald.api import discover as discover
     from thermocald.api import fit as fit
-    from thermocald.api import import_photographs as import_photographs
     from thermocald.api import plan as plan
     from thermocald.api import read_testfield as read_testfield
     from thermocald.api import reference_study as reference_study
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from thermocald.toolbox import correct as correct
     from thermocald.toolbox import fit_calibrations as fit_calibrations
     from thermocald.toolbox import follow_scene as follow_scene
+    from thermocald.toolbox import import_photographs as import_photographs
     from thermocald.toolbox import measure as measure
     from thermocald.toolbox import predict as predict
     from thermocald.toolbox import survey_testfield as survey_testfield
@@ -60,10 +60,7 @@ _PLACES = {
     "analysis.series.epochs": "Epochs",
     "analysis.thermal.modelled_camera": "Along",
     "analysis.thermal.thermal_camera": "LiveCamera ThermalCamera load_camera",
-    "api": (
-        "calibrate catalogue discover fit import_photographs plan read_testfield reference_study "
-        "simulate study"
-    ),
+    "api": ("calibrate catalogue discover fit plan read_testfield reference_study simulate study"),
     "photogrammetry.camera.camera_model": "ExteriorOrientation",
     "photogrammetry.epoch.measuring": "Line Plane Profile",
     "photogrammetry.field.testfield": "TestField",
@@ -71,7 +68,7 @@ _PLACES = {
     "series": "Series open open_all",
     "toolbox": (
         "check_testfield compare_cameras convert_camera correct fit_calibrations follow_scene "
-        "measure predict survey_testfield"
+        "import_photographs measure predict survey_testfield"
     ),
 }
 _MODULES = {name: module for module, names in _PLACES.items() for name in names.split()}

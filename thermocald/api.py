@@ -47,51 +47,6 @@ Model = ThermalCamera | ThermalModel | Path | str
 Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path | str
 
 
-def import_photographs(
-    photographs: Paths,
-    *,
-    log: Path | str,
-    testfield: Field,
-    timezone: str | None = None,
-    pixel_pitch: float | None = None,
-    camera: Path | str | None = None,
-    series: str = "M1",
-    times: str = "exif",
-    out: Path | str | None = None,
-) -> Series:
-    """Make a series from photographs and a logger's temperatures (CSV in any dialect).
-
-    timezone: for times without one (`Europe/Berlin`, `+02:00`); such times are refused if it is not
-    given. pixel_pitch (mm) or camera (a camera file): needed if EXIF does not give the pixel pitch.
-    times: where a photograph's time is read, `exif`, `name` (file name) or `file` (file date). out:
-    a new folder for the recording; if not given, the photographs are read in place. Raises
-    DataError if times or columns cannot be understood, UsageError if a choice is needed.
-
-    >>> photos = tc.import_photographs("photos", log="logger.csv", timezone="Europe/Berlin",
-    ...                                testfield="M1/testfield.csv", pixel_pitch=0.00112)
-    >>> len(photos)
-    6
-    """
-    from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.options import log_options
-    from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
-
-    recording, _ = read_series(
-        read_photographs(_paths(photographs), times),
-        device_clock(timezone, ambiguous="refuse"),
-        source_of(log),
-        log_options(timezone=timezone),
-        testfield=read_testfield(testfield),
-        series=series,
-        camera=None if camera is None else source_of(camera),
-        pitch=pixel_pitch,
-    )
-    if out is None:
-        return Series(recording)
-    write_photographs(source_of(out), recording)
-    return open_series(out)
-
-
 def read_testfield(source: Field) -> TestField:
     """Read a testfield.csv: the targets' names, coordinates and standard deviations, mm.
 
@@ -136,8 +91,8 @@ def calibrate(
     from thermocald.photogrammetry.camera_files import read_camera
     from thermocald.results import Calibration
 
-    require_within(pixel_pitch=(pixel_pitch, 1e-6))
-    paths = images_of(_paths(images))
+    require_within(pixel_pitch=(pixel_pitch, 1e-5, 1))
+    paths = images_of(paths_of(images))
     if camera is not None:
         file = read_camera(source_of(camera), pixel_pitch)
     else:
@@ -470,7 +425,7 @@ def _study_settings(**given: Any) -> StudySettings:
         thermometer_sd=(s.thermometer_sd, 0.0), jobs=(s.jobs, 1, 256),
     )  # fmt: skip
     if s.window % 2 == 0:
-        raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")
+        raise UsageError(f"--window is {s.window}; it must be odd, so that it has a centre")
     return s
 
 
@@ -485,7 +440,8 @@ def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[
     ]
 
 
-def _paths(given: Paths) -> list[Path]:
+def paths_of(given: Paths) -> list[Path]:
+    """Return the paths of files and folders, with `~` expanded."""
     return [source_of(p) for p in ((given,) if isinstance(given, str | Path) else given)]
 
 

@@ -19,9 +19,14 @@ from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
+from thermocald.figures import draw_figure
 from thermocald.names import tell_apart
 from thermocald.numbers import percent, plain, typeset_powers, with_sd
-from thermocald.output.study.report import study_document, study_lines
+from thermocald.output import calibration as calibration_report
+from thermocald.output import discovery as discovery_report
+from thermocald.output.study import report as study_report
+from thermocald.output.study.figures import deviation_figure
+from thermocald.photogrammetry.camera_files import write_camera
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
 from thermocald.store.logger.photographs import known_photograph
@@ -49,32 +54,25 @@ class Study(Result, studies.Study):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald study --json` writes."""
-        document = study_document(self)
+        document = study_report.study_document(self)
         if self.reference:
             document["reference"] = jsonable(self.reference)
         return document
 
     def lines(self) -> list[str]:
         """Return what `thermocald study` prints."""
-        return study_lines(self, self.reference)
+        return study_report.study_lines(self, self.reference)
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text."""
-        from thermocald.output.study.report import render_study
-
-        return render_study(self, title or self.heading)
+        return study_report.render_study(self, title or self.heading)
 
     def save_figures(self, folder: Path | str) -> list[Path]:
         """Write every figure as SVG and PNG; return the files."""
-        from thermocald.output.study.report import save_figures
-
-        return save_figures(self, Path(folder))
+        return study_report.save_figures(self, Path(folder))
 
     def plot(self) -> Figure:
         """Draw the changes of the first camera's interior orientation."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.study.figures import deviation_figure
-
         return draw_figure(deviation_figure(self.cameras[0]))
 
 
@@ -92,20 +90,54 @@ class Discovery(discoveries.Discovery, Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald discover` prints."""
-        return discovery_lines(self)
+        first, last = self.stages[0], self.stages[-1]
+        lines = [f"verdict: {self.headline}"]
+        if self.verdict == "adequate":
+            lines.append(say_adequate(self.examination))
+        for effect in self.effects:
+            lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
+            for name, e in effect.estimates.items():
+                if isinstance(e["value"], float):
+                    sd = math.nan if e["sd"] is None else e["sd"]
+                    lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
+            evidence = effect.evidence
+            if "false_alarm_probability" in evidence:
+                drawn = evidence["surrogates"]
+                lines.append(
+                    f"    probability of a false name {evidence['false_alarm_probability']:.3f} "
+                    f"(gain {drawn['gain']:.0f}; the largest of {drawn['count']} surrogates "
+                    f"{drawn['gains_of_surrogates'][-1]:.0f})"
+                )
+            if proposal := evidence.get("proposal"):
+                lines.append(
+                    f"    constants of the first recording explain "
+                    f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of the second; "
+                    f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
+                )
+            lines += [
+                f"    not excluded: {a['effect']}; {a['experiment']}"
+                for a in effect.alternatives
+                if not a.get("resembles")
+            ]
+        lines += [*mount_lines(self.examination), *field_lines(self.examination)]
+        sources = [e.source.name for e in self.examination.fitter.series]
+        names = tell_apart([Path(source).name or source for source in sources], sources)
+        gaps = zip(first.gaps, last.gaps, strict=True)
+        for name, (before, after) in zip(names, gaps, strict=True):
+            lines.append(
+                f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
+                f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
+                f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
+            )
+        return [*lines, *doubt_lines(self.doubts)]
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text; title: by default the series' name."""
-        from thermocald.output.discovery import report_html
-
-        return report_html(self, title or self.name)
+        return discovery_report.report_html(self, title or self.name)
 
     def plot(self) -> Figure:
         """Draw the gap before and after each effect and the noise, px."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.discovery import gap_figure
-
-        return draw_figure(gap_figure(self))
+        return draw_figure(discovery_report.gap_figure(self))
 
     @cached_property
     def model(self) -> ThermalModel:
@@ -205,8 +237,6 @@ class Calibration(Photographs, Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
-        from thermocald.output.calibration import interior_table
-
         document = self.as_dict()
         lines: list[str] = []
         if document["status"] == "ok":
@@ -216,7 +246,7 @@ class Calibration(Photographs, Result):
                 f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
                 + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
             )
-            table = interior_table(self, self.file.sensor, str)
+            table = calibration_report.interior_table(self, self.file.sensor, str)
             rows = [("", *table.headings[1:]), *table.rows]
             width = [max(len(row[k]) for row in rows) for k in range(3)]
             lines += [
@@ -240,25 +270,18 @@ class Calibration(Photographs, Result):
 
     def page(self, title: str = "") -> str:
         """Return residuals and coverage as HTML text; title: by default the camera's name."""
-        from thermocald.output.calibration import render_calibration
-
         name = title or self.file.name
-        return render_calibration(self, self.file.sensor, name, self._notes)
+        return calibration_report.render_calibration(self, self.file.sensor, name, self._notes)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.calibration import residual_figure
-
-        return draw_figure(residual_figure(self, self.file.sensor))
+        return draw_figure(calibration_report.residual_figure(self, self.file.sensor))
 
     def save(self, path: Path | str) -> Path:
         """Write the camera in this program's format: `.json` with covariance, `.yaml` without.
 
         Raises DataError if nothing was estimated.
         """
-        from thermocald.photogrammetry.camera_files import write_camera
-
         if self.interior is None or not self.estimated:
             why = self.reason
             raise DataError(f"{path}: not written, the camera was not calibrated: {why}")
@@ -277,56 +300,8 @@ class FieldCheck(checks.FieldCheck, Result):
 
     def page(self, title: str = "") -> str:
         """Return the report as HTML text."""
-        from thermocald.output.calibration import render_field_check
-
-        return render_field_check(self, title)
+        return calibration_report.render_field_check(self, title)
 
     def plot(self) -> Figure:
         """Draw the visible targets in the image, px."""
-        from thermocald.figures import draw_figure
-        from thermocald.output.calibration import seen_figure
-
-        return draw_figure(seen_figure(self))
-
-
-def discovery_lines(found: Discovery) -> list[str]:
-    """Return the lines that `thermocald discover` prints."""
-    first, last = found.stages[0], found.stages[-1]
-    lines = [f"verdict: {found.headline}"]
-    if found.verdict == "adequate":
-        lines.append(say_adequate(found.examination))
-    for effect in found.effects:
-        lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
-        for name, e in effect.estimates.items():
-            if isinstance(e["value"], float):
-                sd = math.nan if e["sd"] is None else e["sd"]
-                lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
-        if "false_alarm_probability" in effect.evidence:
-            surrogates = effect.evidence["surrogates"]
-            lines.append(
-                f"    probability of a false name {effect.evidence['false_alarm_probability']:.3f} "
-                f"(gain {surrogates['gain']:.0f}; the largest of {surrogates['count']} surrogates "
-                f"{surrogates['gains_of_surrogates'][-1]:.0f})"
-            )
-        if proposal := effect.evidence.get("proposal"):
-            lines.append(
-                f"    constants of the first recording explain "
-                f"{percent(proposal['closed_on_verify_by_fit'])} of the misfit of the second; "
-                f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
-            )
-        lines += [
-            f"    not excluded: {a['effect']}; {a['experiment']}"
-            for a in effect.alternatives
-            if not a.get("resembles")
-        ]
-    lines += [*mount_lines(found.examination), *field_lines(found.examination)]
-    sources = [e.source.name for e in found.examination.fitter.series]
-    names = tell_apart([Path(source).name or source for source in sources], sources)
-    gaps = zip(first.gaps, last.gaps, strict=True)
-    for name, (before, after) in zip(names, gaps, strict=True):
-        lines.append(
-            f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
-            f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
-            f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
-        )
-    return [*lines, *doubt_lines(found.doubts)]
+        return draw_figure(calibration_report.seen_figure(self))

@@ -186,6 +186,8 @@ class Series:
             check_exterior(exterior)
         elif isinstance(self._measured, Recording):
             raise UsageError(f"exterior 'stored': {self.source} is a recording, not a store")
+        elif free_names(free) != DEFAULT_FREE:
+            raise UsageError("--free: stored epochs are not adjusted again; give an --exterior")
         require_within(jobs=(jobs, 1, 256))
         settings = AdjustmentSettings(free=free_names(free))
         if store is None:
@@ -238,14 +240,15 @@ class Series:
         """Return the series in the form that a study reads.
 
         label: series with the same label are one camera; by default the camera's name, for a
-        store's series with its start condition. A store's series uses the stored `free`, and
-        `exterior="per_epoch"` returns its epochs as they are stored.
+        store's series with its start condition. free: by default, for a store's series, as stored;
+        then `exterior="per_epoch"` returns its epochs as they are stored.
         """
         usual = self.camera
         if not isinstance(self._measured, Recording):
             usual += f"-{self._measured.start}" if self._measured.start else ""
-            free = self._measured.settings.get("free", DEFAULT_FREE)
-            exterior = "stored" if exterior == "per_epoch" else exterior
+            if tuple(free) == DEFAULT_FREE:
+                free = self._measured.settings.get("free", DEFAULT_FREE)
+                exterior = "stored" if exterior == "per_epoch" else exterior
         settings = AdjustmentSettings(free=tuple(free))
         with self._opened() as source:
             source.head.require_calibrated(source.title)
@@ -345,7 +348,7 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
     `none` frees no parameter. Raises UsageError for an unknown name.
     """
     names = [n.strip() for n in given.split(",")] if isinstance(given, str) else list(given)
-    if names in (["none"], [""]):
+    if names == ["none"]:
         return ()
     for name in names:
         if name not in IOP_NAMES:

@@ -1,4 +1,4 @@
-"""Further functions of `import thermocald`: camera files, predictions, corrections, test fields.
+"""Further functions of `import thermocald`: photographs, camera files, predictions, test fields.
 
 Each does what a command does; units and errors are those of `thermocald.api`.
 """
@@ -6,18 +6,23 @@ Each does what a command does; units and errors are those of `thermocald.api`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.camera.camera import Camera, CameraDifference
 from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
-from thermocald.api import Field, read_testfield
+from thermocald.api import Field, Paths, paths_of, read_testfield
 from thermocald.errors import DataError, UsageError
+from thermocald.names import checked
 from thermocald.photogrammetry import camera_files
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, RASPBERRY_PI_V2
+from thermocald.photogrammetry.field.testfield import Distance
 from thermocald.series import (
     COLDEST_C,
     Progress,
@@ -27,11 +32,11 @@ from thermocald.series import (
     require_within,
     source_of,
 )
+from thermocald.series import open as open_series
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.options import LogOptions, log_options
 
 if TYPE_CHECKING:
-    from thermocald.analysis.camera.camera import CameraDifference
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
     from thermocald.analysis.thermal.scene import SceneCourse
@@ -42,6 +47,69 @@ if TYPE_CHECKING:
 
 Model = ThermalCamera | Path | str
 LogRead = LogOptions | Mapping[str, Any] | None
+
+
+def import_photographs(
+    photographs: Paths,
+    *,
+    log: Path | str,
+    testfield: Field | None = None,
+    timezone: str | None = None,
+    ambiguous: str = "refuse",
+    camera_timezone: str | None = None,
+    camera_clock: str = "0",
+    log_options: LogRead = None,
+    pixel_pitch: float | None = None,
+    principal_distance: float | None = None,
+    camera: Path | str | None = None,
+    series: str = "M1",
+    times: str = "exif",
+    out: Path | str | None = None,
+    say: Say = None,
+) -> Series:
+    """Make a series from photographs and a logger's temperatures (CSV in any dialect).
+
+    testfield: without one, the series only shows how the files are interpreted. timezone: for times
+    without one (`Europe/Berlin`, `+02:00`); such times are refused if it is not given; ambiguous:
+    which of the two hours in autumn is meant. camera_timezone, camera_clock: the camera's own zone
+    and the advance of its clock (`+00:03:12`). pixel_pitch, principal_distance (mm) or camera (a
+    camera file): needed if EXIF does not give them. times: where a photograph's time is read,
+    `exif`, `name` (file name) or `file` (file date). out: a new folder for the recording; if not
+    given, the photographs are read in place. say: called with a line for each thing that was
+    recognised and, with out, each that a calibration of some photographs shows to be doubtful.
+    Raises DataError if times or columns cannot be understood, UsageError if a choice is needed.
+
+    >>> photos = tc.import_photographs("photos", log="logger.csv", timezone="Europe/Berlin",
+    ...                                testfield="M1/testfield.csv", pixel_pitch=0.00112)
+    >>> len(photos)
+    6
+    """
+    from thermocald.daemon.soundness import calibration_doubts
+    from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
+    from thermocald.store.recording.reader import read_recording
+    from thermocald.store.recording.sense import doubt_lines
+
+    if testfield is None and out is not None:
+        raise UsageError("testfield is missing: without it no recording is written")
+    require_within(pixel_pitch=(pixel_pitch, 1e-5, 1), principal_distance=(principal_distance, 0.1))
+    tell, found = say or (lambda _: None), read_photographs(paths_of(photographs), times)
+    recording, notes = read_series(
+        found,
+        device_clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone"),
+        source_of(log), _log_options(log_options or {"timezone": timezone}),
+        testfield=None if testfield is None else read_testfield(testfield), series=series,
+        camera=None if camera is None else source_of(camera), pitch=pixel_pitch,
+        distance=principal_distance,
+    )  # fmt: skip
+    for note in notes:
+        tell(note)
+    if out is None:
+        return Series(replace(recording, path=found[0].path.parent))  # its name in messages
+    write_photographs(source_of(out), recording)
+    if say is not None:  # whether the camera's data are plausible
+        for doubt in doubt_lines(calibration_doubts(read_recording(source_of(out)))):
+            say(doubt)
+    return open_series(out)
 
 
 def convert_camera(
@@ -78,8 +146,6 @@ def compare_cameras(
     >>> found.rms_px > 0, found.has_sd
     (True, True)
     """
-    from thermocald.analysis.camera.camera import CameraDifference
-
     a, b = (camera_files.read(source_of(p), pixel_pitch=pixel_pitch) for p in (first, second))
     names = str(first), str(second)
     return CameraDifference(names, a.model, b.model, (a.covariance, b.covariance))
@@ -332,7 +398,7 @@ def fit_calibrations(
 
 
 def survey_testfield(
-    photographs: Sequence[Path | str],
+    photographs: Paths,
     *,
     scale: tuple[str, str, float] | None = None,
     scale_sd: float = 0.1,
@@ -360,13 +426,12 @@ def survey_testfield(
     thermocald.errors.UsageError: the scale is missing: --scale A B MM, or --distances FILE
     """
     from thermocald.analysis.camera.photographs import images_of
-    from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-    from thermocald.photogrammetry.field.testfield import Distance
     from thermocald.photogrammetry.survey import survey
     from thermocald.photogrammetry.targets.image_file import decode_grey
     from thermocald.store.logger.photographs import find_copies
     from thermocald.store.recording.testfield_file import read_distances, write_testfield
 
+    require_within(pixel_pitch=(pixel_pitch, 1e-5, 1))
     measured = [] if scale is None else [Distance(*scale, scale_sd)]
     if distances is not None:
         measured += read_distances(source_of(distances))
@@ -377,7 +442,7 @@ def survey_testfield(
             raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
     if hold_camera and camera is None:
         raise UsageError("--hold-camera needs --camera")
-    paths = images_of([source_of(p) for p in photographs])
+    paths = images_of(paths_of(photographs))
     tell = say or (lambda _: None)
     copies = find_copies(paths)
     for copy, first in copies.items():
@@ -430,10 +495,12 @@ def check_testfield(
     True
     """
     from thermocald.analysis.field import assess_field
-    from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
     from thermocald.results import FieldCheck
 
     require_within(sigma_px=(sigma_px, 1e-4))
+    for name, value in (("place", place), ("look_at", look_at), ("roll", roll)):
+        if value is not None and not np.isfinite(value).all():
+            raise UsageError(f"{name} is {value}; it must be finite")
     if camera is None:
         model = RASPBERRY_PI_V2
     elif isinstance(camera, Camera):
@@ -449,4 +516,12 @@ def _thermal(model: Model) -> ThermalCamera:
 
 
 def _log_options(given: LogRead) -> LogOptions:
-    return given if isinstance(given, LogOptions) else log_options(**(given or {}))
+    if isinstance(given, LogOptions):
+        return given
+    known, options = signature(log_options).parameters, dict(given or {})
+    for name, value in options.items():
+        if name not in known:
+            raise UsageError(f"log_options: there is no {name!r}; there are: {', '.join(known)}")
+        if name in ("name", "temperature_column", "time_column") and isinstance(value, str):
+            options[name] = [value]
+    return checked(log_options)(**options)

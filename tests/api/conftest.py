@@ -18,7 +18,8 @@ def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("world")
     for k in (1, 2):
         tc.simulate("rpi-v2.1-heating", seed=k, series=f"M{k}", out=folder / f"M{k}")
-    finish("replay", "M1", "--store", "thermocald.db", folder=folder)
+    tc.simulate("rpi-v2.1-heating", seed=3, epochs=24, out=folder / "short")
+    finish("replay", "short", "--store", "thermocald.db", folder=folder)
     M1 = tc.open(folder / "M1")
     camera = tc.fit(M1, tc.open(folder / "M2"))
     camera.save(folder / "camera.yaml")
@@ -54,6 +55,12 @@ def M1(world):
 @pytest.fixture(scope="session")
 def M2(world):
     return tc.open(world / "M2")
+
+
+@pytest.fixture(scope="session")
+def short(world):
+    """The series of 24 epochs that thermocald.db holds too."""
+    return tc.open(world / "short")
 
 
 @pytest.fixture(scope="session")

@@ -77,16 +77,16 @@ def test_every_public_function_has_an_example():
     assert functions <= names
 
 
-def test_a_store_and_its_recording_are_the_same_series(inside, M1):
+def test_a_store_and_its_recording_are_the_same_series(inside, short):
     kept = tc.open("thermocald.db")
     (other,) = tc.open_all("thermocald.db")
 
-    assert (kept.camera, kept.name, len(kept)) == (M1.camera, M1.name, len(M1))
-    np.testing.assert_array_equal(kept.time, M1.time)
-    assert M1.time.dtype == np.dtype("datetime64[us]")
-    np.testing.assert_allclose(kept.temperature, M1.temperature)
+    assert (kept.camera, kept.name, len(kept)) == (short.camera, short.name, len(short))
+    np.testing.assert_array_equal(kept.time, short.time)
+    assert short.time.dtype == np.dtype("datetime64[us]")
+    np.testing.assert_allclose(kept.temperature, short.temperature)
     assert repr(other) == repr(kept)
-    a, b = kept.calibrate(exterior="series"), M1.calibrate(exterior="series")
+    a, b = kept.calibrate(exterior="series"), short.calibrate(exterior="series")
     np.testing.assert_allclose(a.values, b.values, rtol=1e-6)
     with pytest.raises(StoreError, match=r"camera/series in this store: rpi-v2\.1/M1"):
         tc.open("thermocald.db", "M7")
@@ -101,6 +101,7 @@ def test_photographs_become_a_series(inside, tmp_path):
     there = tc.import_photographs("photos", **told, out=tmp_path / "P1")
 
     assert len(here) == len(there) == 6
+    assert here.source == "photos"  # messages named it `.`
     np.testing.assert_allclose(here.temperature, there.temperature)
     np.testing.assert_array_equal(here.time, there.time)
     assert (tmp_path / "P1" / "frames").is_dir()
@@ -118,11 +119,20 @@ def test_epochs_are_columns_with_covariance(epochs):
         _ = epochs.focal
 
 
-def test_epochs_as_csv_are_the_export(epochs, world, tmp_path):
+def test_epochs_as_csv_are_the_export_and_print_what_replay_does(short, world, tmp_path):
+    epochs = short.calibrate()
     epochs.to_csv(tmp_path / "ours.csv")
-    call("export", "M1", "-o", tmp_path / "theirs.csv", folder=world)
-
+    finish("export", "short", "-o", tmp_path / "theirs.csv", folder=world)
     assert (tmp_path / "ours.csv").read_text() == (tmp_path / "theirs.csv").read_text()
+
+    said = finish("replay", "short", "--json", tmp_path / "short.json", folder=world)
+    # its errors are on standard error, which an empty output would not show
+    document = json.loads((tmp_path / "short.json").read_text())
+    assert said.stdout.strip() == str(epochs).strip()
+    assert document.pop("doubts") == short.doubts(epochs)
+    assert {k: v for k, v in document.items() if k not in ("recording", "store")} == json.loads(
+        json.dumps(epochs.as_dict())
+    )
 
 
 def test_bands_of_drawings_hold_95_percent(epochs, camera):
@@ -178,7 +188,7 @@ def test_epochs_as_a_dataset_written_and_read(epochs, tmp_path):
 
 RESULTS = {
     "Epochs": lambda epochs, camera, M1, M2: epochs,
-    "Study": lambda epochs, camera, M1, M2: tc.study(M1, sets=200, f_number=2.0),
+    "Study": lambda *_: tc.study(tc.open("short"), sets=200, f_number=2.0),
     "ThermalCamera": lambda epochs, camera, M1, M2: camera,
     "Camera": lambda epochs, camera, M1, M2: camera.at(35.0),
     "CameraDifference": lambda *_: tc.compare_cameras("cold.json", "warm.json"),
@@ -214,18 +224,6 @@ def test_one_result_prints_documents_draws_and_reports(
         assert result.verdict == "effects_found"
         result.save(tmp_path / "found.yaml")
         assert tc.load_camera(tmp_path / "found.yaml").model.effects
-
-
-def test_a_result_is_what_the_command_says(epochs, world, tmp_path):
-    said = finish("replay", "M1", "--json", tmp_path / "M1.json", folder=world)
-    # its errors are on standard error, which an empty output would not show
-    document = json.loads((tmp_path / "M1.json").read_text())
-
-    assert said.stdout.strip() == str(epochs).strip()
-    assert document.pop("doubts") == tc.open(world / "M1").doubts(epochs)
-    assert {k: v for k, v in document.items() if k not in ("recording", "store")} == json.loads(
-        json.dumps(epochs.as_dict())
-    )
 
 
 def test_a_camera_at_a_temperature(camera, tmp_path):
@@ -310,6 +308,10 @@ def test_a_model_and_a_programme_are_simulated(inside, tmp_path):
     np.testing.assert_allclose(series.truth[0], series.simulation.truth.iop[0])
 
 
+def imported(**more):
+    return tc.import_photographs("photos", log="logger.csv", **more)
+
+
 OUT_OF_BOUNDS = {
     "must be one of per_epoch": lambda M1, field: M1.calibrate(exterior="still"),
     "there is no such file or folder": lambda M1, field: tc.import_photographs(
@@ -348,6 +350,17 @@ OUT_OF_BOUNDS = {
     "at which temperature": lambda M1, field: tc.fit_calibrations({"cold.json": None}),
     "give one of": lambda M1, field: tc.predict("camera.yaml", 35.0, log="M1"),
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
+    "roll is nan": lambda M1, field: tc.check_testfield(field, roll=np.nan),
+    "place is .nan, 0": lambda M1, field: tc.check_testfield(field, place=(np.nan, 0, 0)),
+    "pixel_pitch is -1": lambda M1, field: tc.survey_testfield(["photos"], pixel_pitch=-1.0),
+    "principal_distance is 0": lambda M1, field: imported(principal_distance=0.0),
+    "pixel_pitch is -0.01": lambda M1, field: imported(pixel_pitch=-0.01),
+    "testfield is missing": lambda M1, field: imported(out="new"),
+    "there is no 'timezon'": lambda M1, field: imported(log_options={"timezon": "UTC"}),
+    "there is no column 'T 1'": lambda M1, field: imported(
+        timezone="UTC", log_options={"timezone": "UTC", "temperature_column": "T 1"}
+    ),
+    "unit is 3; it must be text": lambda M1, field: imported(log_options={"unit": 3}),
     "series is 'M1'; it must be a Series .from open.": lambda M1, field: tc.fit("M1"),
     "verify is <Series": lambda M1, field: tc.discover(M1, verify=M1),
     "channels belong to a temperature": lambda M1, field: tc.predict(
@@ -480,20 +493,20 @@ def test_one_image_point_is_an_array_of_one(camera):
         np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
 
 
-def test_a_copy_is_no_second_measurement(M1, M2, inside, tmp_path):
+def test_a_copy_is_no_second_measurement(short, M2, inside, tmp_path):
     """Neither a copied folder nor the store of the same recording, nor one under another name."""
-    shutil.copytree("M1", tmp_path / "again")
-    renamed = tc.simulate("rpi-v2.1-heating", seed=1, series="M3", out=tmp_path / "M3")
+    shutil.copytree("short", tmp_path / "again")
+    renamed = tc.simulate("rpi-v2.1-heating", seed=3, epochs=24, series="M3", out=tmp_path / "M3")
     for copy in (tc.open(tmp_path / "again"), tc.open("thermocald.db")):
         with pytest.raises(DataError, match="holds the same observations as"):
-            tc.fit(M1, copy)
-    with pytest.raises(DataError, match=r"M3 holds the same observations as .*M1"):
-        tc.discover(M1, verify=[M2, renamed])
-    for others in ([M2, M1], [M2, renamed, tc.open(M2.source)]):
+            tc.fit(short, copy)
+    with pytest.raises(DataError, match=r"M3 holds the same observations as .*short"):
+        tc.discover(short, verify=[M2, renamed])
+    for others in ([M2, short], [M2, renamed, tc.open(M2.source)]):
         with pytest.raises(UsageError, match="give each series once"):
-            tc.discover(M1, verify=others)
+            tc.discover(short, verify=others)
     with pytest.raises(DataError, match="has the same epochs as"):
-        tc.study(M1, tc.open("thermocald.db"))
+        tc.study(short, tc.open("thermocald.db"))
 
 
 def test_a_recording_that_is_gone_is_named(inside, tmp_path):

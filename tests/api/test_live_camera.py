@@ -137,19 +137,6 @@ def test_frames_as_the_steady_camera_had_seen_them():
     assert 10 <= renewed <= 29
 
 
-def test_maps_are_kept_while_no_point_moves():
-    live = tc.ThermalCamera(thermal_model()).live((820, 616))
-    frame = np.zeros((616, 820), np.uint8)
-    live.update(0.0, 30.0)
-    live.correct(frame)
-    before = live.maps()
-    live.update(1.0, 30.001)
-    assert live.maps() is before
-    live.update(2.0, 34.0)
-    live.correct(frame)
-    assert live.maps() is not before
-
-
 def test_another_thermometer_outside_its_range_widens_too(camera):
     """By the whole drift that follows it; far outside it is refused, at, along and live."""
     rate = 2e-4  # mm/K

@@ -72,9 +72,3 @@ def test_a_backup_is_never_written_over(store_path, tmp_path):
     assert call("backup", store_path, tmp_path / "there.db").returncode == 1
     assert (tmp_path / "there.db").read_text() == "mine"
     assert call("backup", store_path, tmp_path / "away/there.db").returncode == 2
-
-
-def test_a_sound_store_with_gaps_is_sound(store_path):
-    done = document("check", store_path)
-    assert (done["damaged"], done["epochs"]) == ([], 3)
-    assert done["gaps"] == [{"camera": "rpi", "series": "M1", "first": 3, "last": 4}]

@@ -147,12 +147,12 @@ def coarse(monkeypatch):
 
 
 def test_the_image_s_standard_deviations_are_those_of_drawn_cameras(coarse):
-    """RMS and largest difference of 120 drawn pairs, also after the rotation, scatter as stated."""
+    """RMS and largest difference of 60 drawn pairs, also after the rotation, scatter as stated."""
     rng = np.random.default_rng(3)
     warm, C, D = interior(45.0), covariance(1), covariance(2)
     names = ("rms_px", "rms_turned_px", "largest_px", "largest_turned_px")
     found, stated = [], []
-    for _ in range(120):
+    for _ in range(60):
         cameras = [
             CameraModel(SENSOR, InteriorOrientation.from_array(
                 i.as_array() + rng.multivariate_normal(np.zeros(10), V)))
@@ -162,7 +162,7 @@ def test_the_image_s_standard_deviations_are_those_of_drawn_cameras(coarse):
         found.append([difference[name] for name in names])
         stated.append([difference[f"sd_{name}"] for name in names])
     ratio = np.std(found, axis=0) / np.median(stated, axis=0)
-    assert ratio[:2] == pytest.approx(1.0, abs=0.15)  # ± 0.065 by chance
+    assert ratio[:2] == pytest.approx(1.0, abs=0.15)  # ± 0.09 by chance
     # the largest of many values exceeds one chosen beforehand, and scatters less
     assert np.all((ratio[2:] > 0.6) & (ratio[2:] < 1.15))
 
@@ -261,7 +261,7 @@ def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):
 
 
 def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen(coarse):
-    """200 drawn calibrations at 20, 32, 50 °C, with temperature errors of 0.1 K (sd)."""
+    """100 drawn calibrations at 20, 32, 50 °C, with temperature errors of 0.1 K (sd)."""
     rng = np.random.default_rng(8)
     errors, alarms = [], 0
 
@@ -273,15 +273,15 @@ def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen(coarse):
             given.append(Calibration(None, Camera(SENSOR, shown, found.as_array(), C)))
         return fit_calibrations(given)
 
-    for _ in range(200):
+    for _ in range(100):
         fit = calibrations()
         alarms += fit.model.misses_an_effect
         errors.append([
             (fit.model.rates[n] - RATES[n]) / fit.model.sds[f"rates.{n}"] for n in RATED
         ])  # fmt: skip
     spread = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert ((spread > 0.85) & (spread < 1.15)).all(), spread  # ± 3 sd of 200 draws
-    assert alarms <= 2
+    assert ((spread > 0.85) & (spread < 1.15)).all(), spread  # ± 2 sd of 100 draws
+    assert alarms <= 1
     drift = np.zeros(10)
     drift[IOP_NAMES.index("A1")] = 2e-5
     assert calibrations(drift).model.misses_an_effect

@@ -141,6 +141,7 @@ def test_frames_are_measured_first(tmp_path):
     assert json.loads(result.stdout)["gap"]["fit"]["before"]["rms_px"] < 1.0
 
 
+@pytest.mark.slow
 def test_an_unexplained_misfit_is_bridged_in_the_model(tmp_path):
     series, _ = generate(Case(("outside",), 0.3, 34, epochs=60, with_m2=False))
     write(series[0], tmp_path / "M1")

@@ -68,12 +68,11 @@ for line in os.fsdecode(sys.stdin.buffer.read()).split("\n"):
     print(f"== {status} {line!a}", file=sys.stderr, flush=True)
 """
 NO_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-SLOW = pytest.mark.slow
 CASES = [
     pytest.param({"PYTHONIOENCODING": "ascii"}, b"M\xe9 ", id="ascii, names in Latin-1"),
-    pytest.param({**NO_UTF8, "LANG": "C"}, "Größe·".encode() + b"\xc3", marks=SLOW, id="C locale"),
-    pytest.param({"PYTHONIOENCODING": "utf-16"}, b"\xff\xfe", marks=SLOW, id="utf-16"),
-    pytest.param({"PYTHONIOENCODING": "cp437:strict"}, "a\tb'温".encode(), marks=SLOW, id="cp437"),
+    pytest.param({**NO_UTF8, "LANG": "C"}, "Größe·".encode() + b"\xc3", id="C locale"),
+    pytest.param({"PYTHONIOENCODING": "utf-16"}, b"\xff\xfe", id="utf-16"),
+    pytest.param({"PYTHONIOENCODING": "cp437:strict"}, "a\tb'温".encode(), id="cp437"),
 ]
 
 

@@ -76,10 +76,13 @@ def test_the_line_of_a_session_stays_one_line(monkeypatch):
 def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path):
     places = (tmp_path / "config.yaml", tmp_path / "etc.yaml")
     monkeypatch.setattr(common, "CONFIG_PLACES", places)
-    for command, given in (("status", ".* --store FILE"), ("run", "one of --config FILE, --mock")):
+    for command, given in (
+        ("status", ".* --store FILE"), ("run", "one of --config FILE, --mock"),
+        ("session status", "--config FILE$"), ("session start", "--config FILE, or --mock$"),
+    ):  # fmt: skip
         neither = rf"neither \./config\.yaml nor /etc/thermocald/config\.yaml; give {given}"
         with pytest.raises(UsageError, match=neither):
-            run(command)
+            run(*command.split())
     for place, store in ((places[1], "there.db"), (places[0], "here.db")):
         place.write_text(f"store: {{path: {store}}}\nthermometers: [{{name: h, driver: mock}}]\n")
         with pytest.raises(ThermocaldError, match=f"no daemon runs for .*/{store}"):

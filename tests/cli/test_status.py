@@ -5,11 +5,8 @@ from __future__ import annotations
 import io
 import os
 import pty
-import subprocess
 import sys
 import termios
-import threading
-import time
 
 import pytest
 
@@ -93,16 +90,18 @@ def test_q_leaves_top_and_the_terminal_is_as_before(terminal, monkeypatch):
     master, slave = terminal
     before = termios.tcgetattr(slave)
     asked = []
-    monkeypatch.setattr(run, "read_status", lambda *_: asked.append(1) or document())
+
+    def read(*_):
+        if not asked:  # the terminal is set up: what was typed before is lost
+            os.write(master, b"xq")
+        asked.append(1)
+        return document()
+
+    monkeypatch.setattr(run, "read_status", read)
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stdout", io.StringIO())
-    typed = threading.Timer(0.3, os.write, (master, b"xq"))
-    typed.start()
-    start = time.monotonic()
     run.top(interval=30.0)
-    typed.join()
-    assert time.monotonic() - start < 10
     assert len(asked) == 2  # the first picture, and one more after x
     assert termios.tcgetattr(slave) == before
     assert "pi-under-the-bridge" in sys.stdout.getvalue()
@@ -124,14 +123,3 @@ def test_top_in_a_pipe_writes_lines_until_it_ends(monkeypatch, capsys):
     said = capsys.readouterr().out
     assert said.count("thermocald 0.1.0, pid 30190") == 2
     assert "\x1b" not in said
-
-
-@pytest.mark.parametrize("words", ["session start --help", "status --store absent.db"])
-def test_a_command_that_calculates_nothing_starts_without_numpy(words, tmp_path):
-    program = (
-        f"import sys; from thermocald.cli import main; sys.argv[1:] = {words.split()}\n"
-        "try: main()\nfinally: print('numpy' in sys.modules)"
-    )
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.stdout.endswith("False\n"), done.stdout + done.stderr

@@ -16,6 +16,7 @@ import yaml
 from tests.commands import answer as run
 from tests.commands import succeed
 from tests.pictures import MODEL, TAKEN, save_photograph
+from tests.recordings import read_rows, write_rows, write_table
 from thermocald.errors import ThermocaldError
 from thermocald.physics.device import CameraDevice, Programme
 from thermocald.physics.heat import Course
@@ -53,13 +54,11 @@ def other_sensor(source, out, width, height, pitch, image_point):
     """The recording as a camera of another sensor would have made it."""
     size = {"width": width, "height": height, "pixel_pitch": pitch}
     with_head(source, out, lambda head: head["camera"].update(size))
-    begin, *rows = (source / "observations.csv").read_text().splitlines()
-    changed = [begin]
+    rows, names = read_rows(source / "observations.csv"), ("x", "y", "sx", "sy")
     for row in rows:
-        epoch, target, *numbers = row.split(",")
-        numbers = image_point(*(float(n) for n in numbers))
-        changed.append(",".join([epoch, target, *(f"{n:.5f}" for n in numbers)]))
-    (out / "observations.csv").write_text("\n".join(changed) + "\n")
+        numbers = image_point(*(float(row[name]) for name in names))
+        row |= {name: f"{n:.5f}" for name, n in zip(names, numbers, strict=True)}
+    write_rows(out / "observations.csv", rows)
 
 
 def with_columns(source, out, order):
@@ -253,13 +252,11 @@ def test_what_is_no_series_of_one_camera_is_not_fitted_together(folder, tmp_path
 
 def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
     """Its column is used wherever it is, unless another is named."""
-    rows = (folder / "M1" / "epochs.csv").read_text().splitlines()
-    cells = [row.split(",") for row in rows]
-    own, board = cells[0].index("temperature"), cells[0].index("board_temperature")
-    swapped = ["time,board_temperature,temperature"]
-    swapped += [f"{c[2]},{c[board]},{c[own]}" for c in cells[1:]]
-    (tmp_path / "log.csv").write_text("\n".join(swapped) + "\n")
-    (tmp_path / "p.csv").write_text(f"time,x,y\n{cells[40][2]},500,400\n")
+    rows = read_rows(folder / "M1" / "epochs.csv")
+    columns = ("temperature_time", "board_temperature", "temperature")
+    swapped = [[row[name] for name in columns] for row in rows]
+    write_table(tmp_path / "log.csv", ("time", *columns[1:]), swapped)
+    (tmp_path / "p.csv").write_text(f"time,x,y\n{swapped[39][0]},500,400\n")
 
     def moved(*log):
         run("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--out",
@@ -275,12 +272,10 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
 def test_what_is_outside_is_said(folder, tmp_path):
     """Far outside by name, and a recording in fahrenheit, with which the model is tested."""
     shutil.copytree(folder / "M2", tmp_path / "warm")
-    path = tmp_path / "warm" / "epochs.csv"
-    head, *rows = (row.split(",") for row in path.read_text().splitlines())
-    place = head.index("temperature")
+    rows = read_rows(tmp_path / "warm" / "epochs.csv")
     for row in rows:
-        row[place] = f"{1.8 * float(row[place]) + 32:.3f}"
-    path.write_text("\n".join(map(",".join, (head, *rows))) + "\n")
+        row["temperature"] = f"{1.8 * float(row['temperature']) + 32:.3f}"
+    write_rows(tmp_path / "warm" / "epochs.csv", rows)
     for given, words in (
         (("--temperature", -40, "--extrapolate"), "standard deviations are widened"),
         (("--test", tmp_path / "warm"), "if it is in fahrenheit, convert it"),

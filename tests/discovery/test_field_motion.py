@@ -14,7 +14,7 @@ from tests.blind.outcome import excess_closed
 from thermocald.discovery.result import discover_series
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.results import discovery_lines
+from thermocald.results import Discovery
 from thermocald.thermal.reduce import reduce_together
 
 
@@ -105,6 +105,6 @@ def test_a_knock_that_may_be_a_slip_is_listed_as_both():
     assert found.headline == "adequate: slip or a knock of the mount"
     (knock,) = found.as_dict()["mount"]["knocks"]
     assert knock["not_excluded"] == ["slip"]
-    said = "\n".join(discovery_lines(found))
+    said = "\n".join(Discovery(**vars(found)).lines())
     assert "a knock of the mount or a slip inside the camera" in said
     assert "is missing" not in said

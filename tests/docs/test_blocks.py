@@ -56,7 +56,7 @@ def test_no_code_hides_in_indented_blocks(page):
 
 def thermocald_commands() -> list[tuple[str, str]]:
     found = []
-    for block in all_blocks("bash"):
+    for block in all_blocks("bash") + all_blocks("text"):
         for line in block.commands():
             parts = re.split(r"\s*(?:&&|\||;\s)\s*", line)
             found += [(identity(block), p) for p in parts if p.startswith("thermocald ")]

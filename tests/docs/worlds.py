@@ -16,7 +16,7 @@ import thermocald as tc
 from tests.commands import succeed as run
 from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
-from tests.photogrammetry.printed_sheets import Sheet, photograph, put_up
+from tests.photogrammetry.printed_sheets import photograph, put_up
 from tests.pictures import TAKEN, save_photograph, write_markers
 from thermocald.output.testfield.sheets import TRIM, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
@@ -101,21 +101,20 @@ def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
     (folder / "config.yaml").write_text(yaml.safe_dump(document))
 
 
-def put_photographs(folder: Path, into: str = "photos") -> tuple[list[Sheet], np.ndarray]:
-    """Eight photographs of the corner that was printed into `field/`; its sheets and middle."""
+def put_photographs(folder: Path) -> None:
+    """Eight photographs of the corner that was printed into `field/`."""
     page = paper_size("A3", landscape=True)
     sheets = put_up(folder / "field" / "testfield.pdf", page, TRIM)
     middle = read_testfield(folder / "field" / "testfield.csv").points.mean(axis=0)
     camera = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
-    (folder / into).mkdir(exist_ok=True)
+    (folder / "photos").mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
     for i in range(8):  # stations that see all three sheets, every second one turned by 90°
         direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
         where = middle + 680.0 * direction / np.linalg.norm(direction)
         station = network_cases.looking_at(where, middle, (i % 4) * np.pi / 2)
         frame = photograph(sheets, camera, station, seed=i, finer=2)
-        cv2.imwrite(str(folder / into / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
-    return sheets, middle
+        cv2.imwrite(str(folder / "photos" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
 
 
 def photographs_with_times(shelf: Path, folder: Path) -> None:

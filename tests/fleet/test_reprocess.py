@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from tests.fleet.deadly import die
-from thermocald.cli.server import find_series_tasks
+from thermocald.cli.server import find_tasks
 from thermocald.errors import DataError, UsageError
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
@@ -94,9 +94,9 @@ def test_bad_usage_is_said(archive, tmp_path):
     with pytest.raises(UsageError, match="give `local` or"):
         list(run_tasks(calibrate_block, [], "fast"))
     with pytest.raises(UsageError, match="must be one of calibrate, discover, study"):
-        find_series_tasks([archive], tmp_path, "dream")
+        find_tasks([archive], tmp_path, "dream")
     with pytest.raises(DataError, match="no recording or series is there"):
-        find_series_tasks([tmp_path], tmp_path, "study")
+        find_tasks([tmp_path], tmp_path, "study")
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
 from tests.fleet.conftest import address, count, execute, new_cluster
-from thermocald.cli.server import find_series_tasks
+from thermocald.cli.server import find_tasks
 from thermocald.errors import (
     RecordingError,
     ServerError,
@@ -60,7 +60,7 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
         grant(address(server), evil, writes=True)
     assert count(server, "epoch") == 1
     if "/" not in evil:
-        (task,) = find_series_tasks([base], tmp_path / "out", "discover")
+        (task,) = find_tasks([base], tmp_path / "out", "discover")
         assert task[1].parent == tmp_path / "out"
 
 

@@ -112,7 +112,7 @@ CASES = (
 )  # fmt: skip
 
 EXCUSED = {
-    "demo": "simulate, replay and discover on a clock of its own: tests/cli/test_first_hour.py",
+    "demo": "simulate, replay and discover on a clock of its own: tests/cli/test_commands.py",
     "devices": "what is plugged in: tests/cli/test_devices.py",
     "doctor": "the machine: tests/packaging",
     "run": "a daemon: tests/daemon; what it writes is `replay`'s",

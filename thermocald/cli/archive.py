@@ -7,32 +7,23 @@ from typing import Any
 
 import typer
 
+import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert
-from thermocald.cli.common import (
-    JsonOption,
-    PhotosArgument,
-    PixelPitchOption,
-    StoreArgument,
-    StoreConfigOption,
-    TimezoneOption,
-    progress,
-    say,
-    show,
-    takes_log_options,
-    write_json,
-)
+from thermocald.cli.common import progress, say, show, write_json
 from thermocald.errors import RecordingError, UsageError
+from thermocald.result import document_of
 
 
-@takes_log_options
+@opt.takes_log_options
 def import_(
-    photos: PhotosArgument,
+    photos: opt.Photos,
     log: Path = typer.Option(..., help="The logger's file, any dialect of CSV."),
     testfield: Path | None = typer.Option(None, help="The surveyed test field, testfield.csv."),
     out: Path | None = typer.Option(
         None, "--out", "-o", help="The recording to write (a new folder)."
     ),
-    pixel_pitch: PixelPitchOption = None,
+    pixel_pitch: opt.PixelPitch = None,
     camera: Path | None = typer.Option(None, help="A camera file of any format."),
     series: str = typer.Option("M1", help="Name of this series."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Show only what would be written."),
@@ -45,10 +36,10 @@ def import_(
     principal_distance: float | None = expert(
         None, help="Principal distance, mm; default: the focal length in EXIF.", min=0.1
     ),
-    timezone: TimezoneOption = None,
+    timezone: opt.Timezone = None,
     ambiguous: str = "order",
     log_options: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Make a recording from photographs with EXIF times and a logger's file.
 
@@ -58,58 +49,42 @@ def import_(
     Example: thermocald import photos/ --log logger.csv --timezone Europe/Berlin --testfield
     surveyed.csv --out M1
     """
-    from thermocald.daemon.soundness import calibration_doubts
-    from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
-    from thermocald.store.recording.reader import read_recording
-    from thermocald.store.recording.sense import doubt_lines
-    from thermocald.store.recording.testfield_file import read_testfield
+    import numpy as np
 
-    field = None if testfield is None else read_testfield(testfield)
-    if not dry_run and (field is None or out is None):
+    if not dry_run and (testfield is None or out is None):
         missing = "--testfield" if testfield is None else "--out"
         raise UsageError(
             f"{missing} is missing: give it, or --dry-run to see how the files are interpreted"
         )
-    recording, notes = read_series(
-        read_photographs(photos, times),
-        device_clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone"),
-        log, log_options, testfield=None if dry_run else field, series=series,
-        camera=camera, pitch=pixel_pitch, distance=principal_distance,
-    )  # fmt: skip
-    for line in notes:
+    field = None if testfield is None else tc.read_testfield(testfield)
+    notes: list[str] = []
+
+    def note(line: str) -> None:
+        notes.append(line)
         say(line)
-    if not dry_run and out is not None:
-        write_photographs(out, recording)
-        # a calibration of some photographs shows whether the camera data from EXIF are plausible
-        doubts = doubt_lines(calibration_doubts(read_recording(out)))
-        for line in doubts:
-            say(line)
-        notes += doubts
-    columns, spec = recording.columns, recording.head.camera
-    at_frame = columns.at_frame(next(iter(columns.temperatures)))
+
+    found = tc.import_photographs(
+        photos, log=log, testfield=None if dry_run else field, timezone=timezone,
+        ambiguous=ambiguous, camera_timezone=camera_timezone, camera_clock=camera_clock,
+        log_options=log_options, pixel_pitch=pixel_pitch, principal_distance=principal_distance,
+        camera=camera, series=series, times=times, out=None if dry_run else out, say=note,
+    )  # fmt: skip
+    spec = found.head.camera
     document = {
-        "format": "thermocald-import/1",
-        "recording": None if dry_run else out,
-        "epochs": len(columns),
-        "with_temperature": int((at_frame == at_frame).sum()),
-        "first": float(columns.frame_time[0]),
-        "last": float(columns.frame_time[-1]),
-        "channels": list(columns.temperatures),
-        "camera": {
-            "width": spec.sensor.width, "height": spec.sensor.height,
-            "pixel_pitch": spec.sensor.pixel_pitch, "principal_distance": spec.principal_distance,
-        },
-        "notes": notes,
+        "format": "thermocald-import/1", "recording": None if dry_run else out,
+        "epochs": len(found), "with_temperature": int(np.isfinite(found.temperature).sum()),
+        "first": float(found.frame_time[0]), "last": float(found.frame_time[-1]),
+        "channels": list(found.temperatures), "notes": notes,
+        "camera": {**document_of(spec.sensor), "principal_distance": spec.principal_distance},
     }  # fmt: skip
-    summary = f"{out}: {len(columns)} epochs; next: thermocald replay {out}"
+    summary = f"{out}: {len(found)} epochs; next: thermocald replay {out}"
     show(document, json, "nothing was written (--dry-run)" if dry_run else summary)
 
 
 def archive(
-    store: StoreArgument = None,
+    store: opt.Store = None,
     folder: Path = typer.Option(Path(), "--to", help="Folder for the recordings."),
-    config: StoreConfigOption = None,
+    config: opt.StoreConfig = None,
     frames: Path | None = expert(None, help="Folder of the daemon's frames."),
     series: str | None = typer.Option(None, help="CAMERA/SERIES or SERIES; default: all."),
     skip_existing: bool = expert(False, "--skip-existing", help="Skip recordings that exist."),
@@ -119,7 +94,7 @@ def archive(
     retention: bool = expert(
         False, "--retention", help="Then delete frames by the limits of the configuration."
     ),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Write every series as a recording `<camera>-<series>`, a folder that `replay` reads.
 
@@ -153,9 +128,9 @@ def backup(
     to: str | None = typer.Argument(
         None, metavar="TO", help="A file that does not exist yet, or a folder: FOLDER/ is made."
     ),
-    config: StoreConfigOption = None,
+    config: opt.StoreConfig = None,
     keep: int = typer.Option(0, min=0, help="In a folder, keep only the newest N; 0 keeps all."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Copy a store, then verify every row of the copy.
 

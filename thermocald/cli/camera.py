@@ -9,22 +9,13 @@ from typing import Any
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import (
-    DEFAULT_FREE,
-    ExtrapolateOption,
-    FreeOption,
-    JsonOption,
-    LogOption,
-    ModelOption,
-    PhotosArgument,
-    PixelPitchOption,
-    TimezoneOption,
     progress,
     say,
     say_warning,
     show,
-    takes_log_options,
     two_numbers,
     warnings_said,
     write_json,
@@ -35,20 +26,20 @@ from thermocald.numbers import counted
 
 
 def calibrate(
-    images: PhotosArgument,
+    images: opt.Photos,
     testfield: Path = typer.Option(..., help="The test field, testfield.csv, in mm."),
     camera: Path | None = typer.Option(
         None,
         help="Camera file with initial values: width, height, pixel_pitch, principal_distance, "
         "interior; or a file of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON.",
     ),
-    pixel_pitch: PixelPitchOption = None,
+    pixel_pitch: opt.PixelPitch = None,
     camera_out: Path | None = typer.Option(
         None, help="Write the camera: .json with covariance (every --camera reads it), or .yaml."
     ),
     report: Path | None = typer.Option(None, help="Write residuals and coverage to an HTML file."),
-    free: FreeOption = DEFAULT_FREE,
-    json: JsonOption = None,
+    free: opt.Free = opt.DEFAULT_FREE,
+    json: opt.Json = None,
 ) -> None:
     """Calibrate a camera from photographs of a test field.
 
@@ -84,8 +75,8 @@ def convert(
     to: str = typer.Option(..., help=f"Format to write: {_FORMATS}."),
     out: Path = typer.Option(..., "--out", "-o", help="The file to write."),
     from_: str | None = expert(None, "--from", help="Format of FILE; default: by its content."),
-    pixel_pitch: PixelPitchOption = None,
-    json: JsonOption = None,
+    pixel_pitch: opt.PixelPitch = None,
+    json: opt.Json = None,
 ) -> None:
     """Convert a camera file to another format.
 
@@ -109,8 +100,8 @@ def at(
     frame: Path | None = typer.Option(
         None, help="With --to pyorc: the image in which to measure the control points."
     ),
-    extrapolate: ExtrapolateOption = False,
-    json: JsonOption = None,
+    extrapolate: opt.Extrapolate = False,
+    json: opt.Json = None,
 ) -> None:
     """Predict the camera at one temperature and write it in any supported format.
 
@@ -128,7 +119,6 @@ def at(
         thermal = thermal.for_images(*series_export.image_size(renew))
     with warnings_said():
         found = tc.predict(thermal, temperature, extrapolate=extrapolate)
-    say_warning(thermal)
     document, lines = found.as_dict(), found.lines()
     if out is not None:
         assert found.state is not None
@@ -142,17 +132,18 @@ def at(
             statement = renewed.write(out)
         document |= {"out": str(out), "out_format": to, "statement": statement}
         lines.append(f"{out} ({to}): {statement}")
+    say_warning(thermal)
     show(document, json, *lines)
 
 
 def diff(
     cold: Path = typer.Argument(..., help="A camera file of any format."),
     warm: Path = typer.Argument(..., help="A second camera file, of the same sensor."),
-    pixel_pitch: PixelPitchOption = None,
+    pixel_pitch: opt.PixelPitch = None,
     report: Path | None = typer.Option(
         None, help="Write a map of the differences in the image to an HTML file."
     ),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Compare two cameras: differences of parameters and of image points (WARM minus COLD).
 
@@ -169,9 +160,9 @@ def diff(
 group = subcommands(at=at, convert=convert, diff=diff)
 
 
-@takes_log_options
+@opt.takes_log_options
 def predict(
-    model: ModelOption,
+    model: opt.Model,
     temperature: float | None = typer.Option(None, help="Steady temperature of the camera, °C."),
     log: Path | None = typer.Option(None, help="Temperatures: a log file, a recording or a store."),
     test: Path | None = typer.Option(
@@ -182,9 +173,9 @@ def predict(
     channel: list[str] | None = expert(None, help="NAME=°C of a further thermometer; repeatable."),
     distance: float = expert(10.0, min=0.01, help="Distance to the object, m."),
     wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Tolerated error on the object, mm."),
-    extrapolate: ExtrapolateOption = False,
+    extrapolate: opt.Extrapolate = False,
     log_options: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Predict the interior orientation and its standard deviations.
 
@@ -215,10 +206,10 @@ def _channels(given: list[str]) -> dict[str, float]:
     return found
 
 
-@takes_log_options
+@opt.takes_log_options
 def correct(
-    model: ModelOption,
-    log: LogOption,
+    model: opt.Model,
+    log: opt.Log,
     points: Path = typer.Argument(
         ...,
         metavar="POINTS.csv",
@@ -234,11 +225,11 @@ def correct(
         help="Standard deviation of a reading, K; default: as estimated by the model's fit.",
     ),
     image_size: str | None = expert(None, "--size", help="WIDTHxHEIGHT of binned images, px."),
-    extrapolate: ExtrapolateOption = False,
-    timezone: TimezoneOption = None,
+    extrapolate: opt.Extrapolate = False,
+    timezone: opt.Timezone = None,
     ambiguous: str = "order",
     log_options: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Correct image points or images for the temperature at which they were taken.
 
@@ -271,10 +262,10 @@ def correct(
     done.require_all()
 
 
-@takes_log_options
+@opt.takes_log_options
 def measure(
-    model: ModelOption,
-    log: LogOption,
+    model: opt.Model,
+    log: opt.Log,
     points: Path = typer.Argument(
         ..., metavar="POINTS.csv", help="Columns time, name, x, y, sx, sy (px)."
     ),
@@ -285,11 +276,11 @@ def measure(
     seen: str = typer.Option(..., metavar="TIME", help="When the control points were observed."),
     plane: Path = typer.Option(..., help="Surface (YAML): level, plane, line or profile, with sd."),
     length_unit: str = typer.Option("mm", help="Unit of control points and surface: mm or m."),
-    extrapolate: ExtrapolateOption = False,
-    timezone: TimezoneOption = None,
+    extrapolate: opt.Extrapolate = False,
+    timezone: opt.Timezone = None,
     ambiguous: str = "order",
     log_options: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Measure the positions of image points on a water surface, a plane or a staff.
 

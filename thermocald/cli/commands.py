@@ -33,26 +33,36 @@ _OUTPUTS: dict[str, Output] = {
     "testfield print out": "folder",
 }  # fmt: skip
 _READING = (
-    "temperature_column name unit date_order time_column log_timezone log_clock encoding separator "
-    "decimal"
+    "timezone temperature_column name unit date_order time_column log_timezone log_clock ambiguous "
+    "encoding separator decimal"
 )
+_BOARD = {"charuco": "dictionary legacy", "aprilgrid": "spacing"}
 # by command and option: the options that do nothing without it
 _NEEDED = {
     "archive": {"config": "retention"},
-    "camera at": {"renew": "reference frame"},
+    "camera at": {"out": "to", "renew": "reference frame"},
     "discover": {"plan": "preset testfield programme strength seeds"},
     "fit": {"log": _READING},
     "predict": {"log": _READING, "programme": "camera wanted", "temperature": "channel"},
     "replay": {"model": "log times timezone recording_out"},
     "run": {"recording": "fast"},
     "session start": {"until_separated": "evidence dry_run max_temperature max_rate max_duty"},
+    "testfield check": {"camera": "pixel_pitch"},
+    "testfield import": {**_BOARD, "rings": "diameter"},
+    "testfield print": _BOARD,
 }
 # … and those that do nothing with it
 _IDLE = {
     "discover": {"plan": "verify model_out effect_out report jobs"},
     "fit": {"log": "jobs"},
+    "predict": {"log": "distance", "test": "distance"},
     "replay": {"model": "store exterior free jobs"},
     "study": {"reference": "exterior free"},
+    "testfield check": {"field": "paper flat landscape diameter"},
+    "testfield print": dict.fromkeys(
+        ("charuco", "chessboard", "aprilgrid"),
+        "flat diameter bits plain markers light first_code pitch",
+    ),
 }
 ADVANCED = "Advanced"
 """The help section of the options that only experts need."""
@@ -145,7 +155,10 @@ class Command(TyperCommand):
         if not ctx.params.get("dry_run"):
             _check_outputs(ctx)
         # an option that does nothing without another, or beside it
-        options = {p.name: max(p.opts, key=len) for p in self.params}
+        options = {
+            p.name: p.metavar if p.param_type_name == "argument" else max(p.opts, key=len)
+            for p in self.params
+        }
         given = {n for n in options if ctx.get_parameter_source(n).name == "COMMANDLINE"}
         for table, here in ((_NEEDED, False), (_IDLE, True)):
             for name, others in table.get(_words(ctx), {}).items():

@@ -14,8 +14,9 @@ import numpy as np
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert
-from thermocald.cli.common import JsonOption, SeedOption, progress, say, show, write_json
+from thermocald.cli.common import progress, say, show, write_json
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -31,11 +32,11 @@ def demo(
         Path("thermocald-demo"), "--out", "-o", help="Folder for store and recording."
     ),
     epochs: int = typer.Option(150, min=10, help="Number of epochs, of 10 s each."),
-    seed: SeedOption = 0,
+    seed: opt.Seed = 0,
     discovery: bool = typer.Option(
         True, "--discovery/--no-discovery", help="Finish with the discovery of a hidden effect."
     ),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Run the daemon on a rendered camera through 25 minutes of heating and cooling.
 
@@ -102,11 +103,11 @@ def simulate(
     effect: list[str] | None = expert(
         None, help="NAME[:PARAMETER=VALUE,…] or effect file (YAML): an effect to add; repeatable."
     ),
-    seed: SeedOption = 0,
+    seed: opt.Seed = 0,
     series: str = typer.Option("M1", help="Name of the series, for a preset."),
     model_out: Path | None = expert(None, help="Also write the simulated thermal model."),
     list_: bool = typer.Option(False, "--list", help="List the presets and effects."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Simulate a camera that warms up, and write a recording of it.
 

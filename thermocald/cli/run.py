@@ -20,16 +20,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert
-from thermocald.cli.common import (
-    ConfigOption,
-    JsonOption,
-    StoreConfigOption,
-    require_config,
-    say,
-    session_line,
-    show,
-)
+from thermocald.cli.common import require_config, say, session_line, show
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, duration, with_sd
@@ -41,7 +34,7 @@ StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's 
 
 
 def run(
-    config: ConfigOption = None,
+    config: opt.Config = None,
     mock: bool = typer.Option(
         False, "--mock", help="Use a rendered camera that warms up, and a mock thermometer."
     ),
@@ -114,7 +107,7 @@ def dashboard(
     port: int = expert(8437, min=1, max=65535, help="Port to listen on."),
     token_file: Path | None = expert(None, help="File with the access token."),
     name: list[str] | None = expert(None, help="Further host name of the page; repeatable."),
-    config: StoreConfigOption = None,
+    config: opt.StoreConfig = None,
 ) -> None:
     """Serve a daemon's web page from a separate process that only reads.
 
@@ -146,7 +139,7 @@ def dashboard(
     serve(store, live or find_state(store), host, port, token_file, names)
 
 
-def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOption = None) -> None:
+def status(config: opt.Config = None, store: StoreOption = None, json: opt.Json = None) -> None:
     """Report the state of the daemon: cameras, thermometers, store.
 
     The exit status is 1 if the daemon does not run or has not answered for 30 s, if its store
@@ -168,7 +161,7 @@ def status(config: ConfigOption = None, store: StoreOption = None, json: JsonOpt
 
 
 def top(
-    config: ConfigOption = None,
+    config: opt.Config = None,
     store: StoreOption = None,
     interval: float = typer.Option(1.0, min=0.2, help="Seconds between two updates."),
 ) -> None:
@@ -233,7 +226,7 @@ def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
     return running_status(store)
 
 
-def devices(json: JsonOption = None) -> None:
+def devices(json: opt.Json = None) -> None:
     """List the attached cameras, thermometers and outputs as stanzas of config.yaml.
 
     A device that cannot be identified for certain (on a serial port or I2C bus) is a comment.
@@ -251,7 +244,7 @@ def devices(json: JsonOption = None) -> None:
 
 def doctor(
     root: Path = expert(Path("/"), help="Root folder of the machine, such as a mounted card."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Report what this machine lacks: camera stack, groups, I2C, clock, power, disk.
 
@@ -276,7 +269,7 @@ def check(
     probe: bool = typer.Option(
         False, "--probe", help="Take a frame or a reading from every device of a configuration."
     ),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Read a recording, a configuration or a store completely; stop at the first error.
 

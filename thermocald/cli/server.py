@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -14,29 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import (
-    DEFAULT_FREE,
-    FreeOption,
-    JobsOption,
-    JsonOption,
-    StoreArgument,
-    StoreConfigOption,
-    log_to_stderr,
-    progress,
-    say,
-    show,
-    write_json,
-    write_parts,
-)
+from thermocald.cli.common import log_to_stderr, progress, say, show, write_json, write_parts
 from thermocald.config import load_config
 from thermocald.errors import DataError, OutputError, UsageError
+from thermocald.numbers import counted
 from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
     from thermocald.fleet.reprocess import Outcome
-
 
 _Address = Annotated[
     str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, by its owner.")
@@ -88,17 +75,17 @@ group = subcommands(init=init, grant=grant, dashboard=dashboard)
 
 
 def forward(
-    store: StoreArgument = None,
+    store: opt.Store = None,
     to: str | None = typer.Option(
         None, metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"
     ),
-    config: StoreConfigOption = None,
+    config: opt.StoreConfig = None,
     station: str | None = expert(None, help="Name of this station; default: the host's name."),
     once: bool = typer.Option(
         False, "--once", help="Send the waiting rows and exit; default: run until stopped."
     ),
     cursor: Path | None = expert(None, help="File that records which rows have been sent."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Send epochs, events, readings and chosen frames to a PostgreSQL server, each exactly once.
 
@@ -144,7 +131,7 @@ def fleet(
         ..., metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?station=…"
     ),
     report: Path | None = typer.Option(None, help="Write a page to an HTML file."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Show late or dead stations, sensors and clocks, unusual cameras, and calibrations due.
 
@@ -159,18 +146,27 @@ def fleet(
 
 
 ANALYSES = ("discover", "study")
+_SETS = 100_000
 
 
-def find_series_tasks(sources: list[Path], out: Path, analysis: str) -> list[tuple[Path, Path]]:
-    """Return each series that is not analysed yet, as (folder or address, its JSON file).
+def find_tasks(sources: list[Path], out: Path, do: str, free: str = "none") -> list[Any]:
+    """Return the blocks to calibrate, or each series to analyse as (place, its JSON file).
 
-    sources: folders and addresses. Raises DataError if there is no series, UsageError for an
-    unknown analysis.
+    Those that are done are left out. Raises DataError if there is no series, UsageError for an
+    unknown task, and for a server, which has no recordings to calibrate.
     """
-    from thermocald.fleet.reprocess import find_series
+    from thermocald.fleet.reprocess import find_blocks, find_series
+    from thermocald.series import free_names
 
-    if analysis not in ANALYSES:
-        raise UsageError(f"--do {analysis}: must be one of calibrate, {', '.join(ANALYSES)}")
+    if do == "calibrate":
+        if server := next(filter(is_server, sources), None):
+            raise UsageError(
+                f"{source_name(server)}: a server has no recordings to calibrate again; "
+                "--do discover and --do study read one"
+            )
+        return find_blocks(sources, out, free_names(free))
+    if do not in ANALYSES:
+        raise UsageError(f"--do {do}: must be one of calibrate, {', '.join(ANALYSES)}")
     tasks = [(place, out / f"{name}.json") for name, place in sorted(find_series(sources).items())]
     return [task for task in tasks if not task[1].exists()]
 
@@ -195,10 +191,10 @@ def reprocess(
     out: Path = typer.Option(..., "--out", "-o", help="Folder for the results."),
     do: str = typer.Option("calibrate", help="calibrate epochs, or discover or study series."),
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
-    jobs: JobsOption = 1,
-    free: FreeOption = DEFAULT_FREE,
-    sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's simulation."),
-    json: JsonOption = None,
+    jobs: opt.Jobs = 1,
+    free: opt.Free = opt.DEFAULT_FREE,
+    sets: int = expert(_SETS, min=100, max=10_000_000, help="Draws of a study's simulation."),
+    json: opt.Json = None,
 ) -> None:
     """Calibrate every epoch of every recording again, or analyse every series separately.
 
@@ -209,35 +205,28 @@ def reprocess(
 
     Example: thermocald reprocess archive --out again --jobs 2
     """
-    from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
-    from thermocald.series import free_names
+    from thermocald.fleet.reprocess import calibrate_block, run_tasks
 
-    sources = [Path(archive) for archive in archives]
-    tasks: Sequence[Any]
-    if do == "calibrate":
-        for source in sources:
-            if is_server(source):
-                raise UsageError(
-                    f"{source_name(source)}: a server has no recordings to calibrate again; "
-                    "--do discover and --do study read one"
-                )
-        tasks, what = find_blocks(sources, out, free_names(free)), "blocks"
-    else:
-        tasks, what = find_series_tasks(sources, out, do), "series"
-    work = calibrate_block if do == "calibrate" else partial(analyse, do, sets)
+    for name, given, usual, of in (
+        ("--free", free, opt.DEFAULT_FREE, "calibrate"), ("--sets", sets, _SETS, "study"),
+    ):  # fmt: skip
+        if given != usual and do != of:
+            raise UsageError(f"{name} needs --do {of}")
+    blocks, what = do == "calibrate", "blocks" if do == "calibrate" else "series"
+    tasks = find_tasks([Path(archive) for archive in archives], out, do, free)
     with progress(len(tasks), what) as advance:
         outcomes = []
+        work = calibrate_block if blocks else partial(analyse, do, sets)
         for outcome in run_tasks(work, tasks, engine, jobs):
             outcomes.append(outcome)
             advance(1)
     count, failed = len(outcomes), [o for o in outcomes if o.error]
-    document: dict[str, Any]
-    if do == "calibrate":
-        epochs = sum(o.epochs for o in outcomes)
-        calibrated = sum(o.calibrated for o in outcomes)
+    if blocks:
+        epochs, calibrated = sum(o.epochs for o in outcomes), sum(o.calibrated for o in outcomes)
         document = {"blocks": count, "epochs": epochs, "calibrated": calibrated}
         places = [{"recording": o.task.recording, "first": o.task.first} for o in failed]
-        summary = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
+        done = counted(count - len(failed), "block")
+        summary = f"{calibrated} of {epochs} epochs calibrated in {done}"
     else:
         document = {"series": count}
         places = [{"source": source_name(o.task[0])} for o in failed]

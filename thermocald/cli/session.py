@@ -8,15 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import (
-    ConfigOption,
-    JsonOption,
-    require_config,
-    say,
-    session_line,
-    show,
-)
+from thermocald.cli.common import require_config, say, session_line, show
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -35,7 +29,7 @@ def start(
     series: str = typer.Option("M1", help="Name of the series; an unfinished one is resumed."),
     condition: str = typer.Option("", "--start", help="Start condition, such as cold or warm."),
     epochs: int = typer.Option(150, min=1, help="Number of epochs."),
-    config: ConfigOption = None,
+    config: opt.Config = None,
     mock: bool = typer.Option(False, "--mock", help="Use a rendered camera, without hardware."),
     programme: Path | None = typer.Option(None, help="Programme of the heating output (YAML)."),
     output: Path = typer.Option(Path(), "--output", "-o", help="Folder for recording and report."),
@@ -96,7 +90,7 @@ def start(
     _finish(read, session, path, report)
 
 
-def status(config: ConfigOption = None, json: JsonOption = None) -> None:
+def status(config: opt.Config = None, json: opt.Json = None) -> None:
     """Show the sessions of a running daemon, in progress or last finished.
 
     Example: thermocald session status --config /etc/thermocald/config.yaml
@@ -106,7 +100,7 @@ def status(config: ConfigOption = None, json: JsonOption = None) -> None:
     show({"format": "thermocald-sessions/1", "sessions": sessions}, json, *lines)
 
 
-def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
+def stop(camera: CameraOption = None, config: opt.Config = None) -> None:
     """Stop a session of a running daemon early; the epochs taken so far stay in the store.
 
     Example: thermocald session stop --camera phone-1
@@ -119,7 +113,8 @@ def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
     say(f"{name}/{one['series']}: {one['taken']} of {one['epochs']} epochs, stopped")
 
 
-def _configuration(config: Path | None, mock: bool = False) -> Config:
+def _configuration(config: Path | None, mock: bool | None = None) -> Config:
+    """Read the configuration; mock: whether to use that of the rendered camera, None: never."""
     from thermocald.config import load_config
     from thermocald.hal import load_driver
 
@@ -129,7 +124,8 @@ def _configuration(config: Path | None, mock: bool = False) -> Config:
         if config is not None:
             raise UsageError("give --config or --mock, not both")
         return mock_config()
-    return load_config(require_config(config, "--config FILE, or --mock"), load_driver)
+    instead = "--config FILE" + ", or --mock" * (mock is not None)
+    return load_config(require_config(config, instead), load_driver)
 
 
 def _ask(config: Config, do: str, **values: Any) -> dict[str, Any]:

@@ -8,22 +8,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert
-from thermocald.cli.common import (
-    DEFAULT_FREE,
-    ExteriorOption,
-    FreeOption,
-    JobsOption,
-    JsonOption,
-    SeedOption,
-    TimezoneOption,
-    progress,
-    say,
-    show,
-    takes_log_options,
-    warnings_said,
-    write_parts,
-)
+from thermocald.cli.common import progress, say, show, warnings_said, write_parts
 from thermocald.errors import DataError, UsageError
 from thermocald.numbers import counted
 from thermocald.store.server.connection import is_server
@@ -37,9 +24,9 @@ def replay(
     store: Path | None = typer.Option(
         None, help="Store the epochs in this file; an interrupted replay is continued."
     ),
-    exterior: ExteriorOption = "auto",
-    free: FreeOption = DEFAULT_FREE,
-    jobs: JobsOption = 1,
+    exterior: opt.Exterior = "auto",
+    free: opt.Free = opt.DEFAULT_FREE,
+    jobs: opt.Jobs = 1,
     model: Path | None = typer.Option(
         None, help="Thermal model (YAML) of the camera, for photographs of a scene."
     ),
@@ -52,8 +39,8 @@ def replay(
         "--recording-out",
         help="With --model: folder for a recording of the static points, for `discover`.",
     ),
-    timezone: TimezoneOption = None,
-    json: JsonOption = None,
+    timezone: opt.Timezone = None,
+    json: opt.Json = None,
 ) -> None:
     """Calibrate every epoch of a recording and report the drift of the series.
 
@@ -103,7 +90,7 @@ def export(
         help="stored: a store's epochs as they were stored; auto, per_epoch, series, mount: adjust "
         "the series again. Default: stored for a store, auto for a recording.",
     ),
-    free: FreeOption = DEFAULT_FREE,
+    free: opt.Free = opt.DEFAULT_FREE,
     series: str | None = typer.Option(None, help="Series of a store: CAMERA/SERIES or SERIES."),
     units: str = typer.Option("", help="px, um, deg instead of mm and rad; columns name them."),
     time_: str = typer.Option("seconds", "--time", help="Times: seconds (since 1970, UTC) or iso."),
@@ -115,7 +102,7 @@ def export(
         help="Add all thermometers and everything else stored for an epoch: the settings that the "
         "camera reported (camera_…), light, blur, the online filter.",
     ),
-    jobs: JobsOption = 1,
+    jobs: opt.Jobs = 1,
 ) -> None:
     """Write one row per epoch: parameters, standard deviations, sigma0, status.
 
@@ -165,13 +152,13 @@ def study(
         help="Recordings (folders) and stores (files), also as LABEL=RECORDING_OR_STORE: series "
         "with the same label belong to one camera; default label: the camera's name.",
     ),
-    json: JsonOption = None,
+    json: opt.Json = None,
     report: Path | None = typer.Option(None, help="Write the report to an HTML file."),
     figures: Path | None = typer.Option(None, help="Write all figures here, as SVG and PNG."),
     window: int = expert(31, min=3, help="Number of epochs in the window of the F-test; odd."),
     alpha: float = expert(0.05, min=1e-6, max=0.5, help="Significance level of the F-test."),
     sets: int = expert(50_000, min=2, help="Number of draws of the Monte-Carlo simulation."),
-    seed: SeedOption = 0,
+    seed: opt.Seed = 0,
     distance: float = expert(10.0, min=0.01, help="Distance of the object plane, m."),
     grid: int = expert(3, "--grid", min=2, max=9, help="Image points per row and column."),
     focus: float = expert(1.0, min=0.01, help="Focus distance for the depth of field, m."),
@@ -182,9 +169,9 @@ def study(
     thermometer_sd: float | None = expert(
         None, min=0.0, help="Standard deviation of a reading, K; default: estimated."
     ),
-    exterior: ExteriorOption = "auto",
-    free: FreeOption = DEFAULT_FREE,
-    jobs: JobsOption = 1,
+    exterior: opt.Exterior = "auto",
+    free: opt.Free = opt.DEFAULT_FREE,
+    jobs: opt.Jobs = 1,
     reference: bool = expert(
         False, "--reference", help="Study the presets, and compare them with the reference study."
     ),
@@ -199,8 +186,6 @@ def study(
             if not inputs
             else "--reference studies the presets; give no recordings with it"
         )
-    if window % 2 == 0:
-        raise UsageError(f"--window is {window}; it must be odd, so that it has a centre")
     settings: dict[str, Any] = {
         "window": window, "alpha": alpha, "sets": sets, "seed": seed,
         "distance_mm": 1000 * distance, "grid": grid, "focus_mm": 1000 * focus,
@@ -247,11 +232,11 @@ def discover(
         None, help="M2: another series of this camera, to verify the effect; repeatable."
     ),
     model: Path | None = typer.Option(None, help="Model so far (YAML); default: the base model."),
-    json: JsonOption = None,
+    json: opt.Json = None,
     model_out: Path | None = typer.Option(None, help="Write the model with the effects found."),
     effect_out: Path | None = expert(None, help="Write the effects found to a file (YAML)."),
     report: Path | None = typer.Option(None, help="Write a report to an HTML file."),
-    jobs: JobsOption = 1,
+    jobs: opt.Jobs = 1,
     plan: bool = typer.Option(
         False, "--plan", help="Predict which effects a set-up would reveal, before any heating."
     ),
@@ -288,7 +273,7 @@ def discover(
     show(document, json, found)
 
 
-@takes_log_options
+@opt.takes_log_options
 def fit(
     inputs: list[str] = typer.Argument(
         ...,
@@ -321,11 +306,11 @@ def fit(
     temperature_sd: float = expert(
         0.1, min=0.0, help="Standard deviation of a calibration's temperature, K."
     ),
-    jobs: JobsOption = 1,
-    timezone: TimezoneOption = None,
+    jobs: opt.Jobs = 1,
+    timezone: opt.Timezone = None,
     ambiguous: str = "order",
     log_options: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Fit a thermal model to all series of a camera, in one adjustment over all image points.
 

@@ -9,16 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import thermocald as tc
+from thermocald.cli import options as opt
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import (
-    JsonOption,
-    PhotosArgument,
-    PixelPitchOption,
-    say,
-    show,
-    takes,
-    two_numbers,
-)
+from thermocald.cli.common import say, show, two_numbers
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -79,7 +72,7 @@ def _board(
     return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
 
 
-takes_board = takes("board", _board)
+takes_board = opt.takes("board", _board)
 
 
 @takes_board
@@ -99,7 +92,7 @@ def print_(
         False, "--force", help="Replace a test field printed earlier into this folder."
     ),
     board: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Draw a test field: a PDF, one SVG per sheet, and the testfield.csv with its coordinates.
 
@@ -147,7 +140,7 @@ def import_(
     ),
     force: bool = typer.Option(False, "--force", help="Replace an existing file."),
     board: Any = None,
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Make a testfield.csv for a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
 
@@ -197,7 +190,7 @@ def import_(
 
 
 def survey(
-    photos: PhotosArgument,
+    photos: opt.Photos,
     out: Path = typer.Option(..., "--out", "-o", help="The testfield.csv to write."),
     scale: tuple[str, str, float] | None = typer.Option(
         None, metavar="A B MM", help="Two targets and their measured distance, mm."
@@ -213,9 +206,9 @@ def survey(
     hold_camera: bool = expert(
         False, "--hold-camera", help="Hold the interior orientation of --camera fixed."
     ),
-    pixel_pitch: PixelPitchOption = None,
+    pixel_pitch: opt.PixelPitch = None,
     camera_out: Path | None = typer.Option(None, help="Write the estimated camera (JSON)."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Survey a test field from photographs: coordinates and their standard deviations.
 
@@ -241,7 +234,7 @@ def check(
     landscape: Landscape = None,
     diameter: Diameter = None,
     camera: CameraFile = None,
-    pixel_pitch: PixelPitchOption = None,
+    pixel_pitch: opt.PixelPitch = None,
     place: Point | None = typer.Option(
         None, "--from", metavar="X Y Z", help="Position of the camera, mm."
     ),
@@ -253,7 +246,7 @@ def check(
     roll: float = expert(0.0, help="Rotation of the camera about its optical axis, degrees."),
     sigma: float = expert(0.03, min=1e-4, help="Standard deviation of an image coordinate, px."),
     report: Path | None = typer.Option(None, help="Write a report to an HTML file."),
-    json: JsonOption = None,
+    json: opt.Json = None,
 ) -> None:
     """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
 

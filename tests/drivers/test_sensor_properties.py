@@ -1,7 +1,7 @@
 """Random outputs of devices: right, or rejected in one line.
 
 Strategies generate a chip's conversion and idle values, a firmware's formats and a user's
-corrections. Few examples here, thousands in the slow suite.
+corrections; the quick suite has the tables of `test_chip_outputs` instead.
 """
 
 from __future__ import annotations
@@ -21,15 +21,9 @@ from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.errors import BadReading, ConfigurationError
 from thermocald.hal import SystemClock, VirtualClock, driver_names, open_device
 
-FEW = {"max_examples": 40, "deadline": None, "derandomize": True,
-       "suppress_health_check": [HealthCheck.function_scoped_fixture]}  # fmt: skip
-MANY = {**FEW, "max_examples": 3000}
-
-
-FEWER, MORE = {**FEW, "max_examples": 8}, {**FEW, "max_examples": 200}  # for each driver
-AMOUNTS = pytest.mark.parametrize(
-    "amount", [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)]
-)
+MANY = {"max_examples": 3000, "deadline": None, "derandomize": True,
+        "suppress_health_check": [HealthCheck.function_scoped_fixture]}  # fmt: skip
+FEW, MORE = {**MANY, "max_examples": 5}, {**MANY, "max_examples": 200}  # for each driver
 
 
 def one_line(error):
@@ -78,18 +72,13 @@ def no_sensor(chip, k, how):
     assert line_read(text, unit=unit, scale=scale, offset=offset, chip=chip) is None, text
 
 
-@AMOUNTS
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [chips.names(), [None]], ids=["a chip", "any firmware"])
-def test_what_is_given_without_measuring_is_refused(amount, names):
-    settings(**amount)(given(st.sampled_from(names), st.integers(0, 10), CORRECTED)(no_sensor))()
+def test_what_is_given_without_measuring_is_refused(names):
+    settings(**MANY)(given(st.sampled_from(names), st.integers(0, 10), CORRECTED)(no_sensor))()
 
 
 # --- files of the kernel ------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("sys")
 
 
 def kernel_read(folder, name, text):
@@ -102,17 +91,17 @@ def kernel_read(folder, name, text):
             return None
 
 
-@AMOUNTS
-def test_any_content_of_sysfs_is_right_or_refused(amount, folder):
+@pytest.mark.slow
+def test_any_content_of_sysfs_is_right_or_refused(tmp_path):
     content = st.one_of(
         st.integers(-300_000, 3_000_000).map(str),
         st.text(alphabet="0123456789-+. eEx_\tNaif٢", max_size=9),
     )
 
-    @settings(**amount)
+    @settings(**MANY)
     @given(content, st.sampled_from(["lm75", "it87", "sht3x", "anychip", "k10temp"]))
     def check(text, name):
-        found = kernel_read(folder, name, text)
+        found = kernel_read(tmp_path, name, text)
         if found is not None:
             assert found == pytest.approx(float(text) / 1000.0)
             assert -55.0 <= found <= 125.0
@@ -188,7 +177,7 @@ ANYTHING = SCALARS | KEYED | st.lists(SCALARS | KEYED | st.lists(SCALARS, max_si
 
 
 @pytest.mark.parametrize(
-    "amount", [pytest.param(FEWER, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)]
+    "amount", [pytest.param(FEW, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(
     ("kind", "name"),

@@ -153,7 +153,8 @@ class AndroidCamera(AdbPhone, Camera):
         path, jpeg = self._new_photograph(set(before))
         tags = exif(jpeg)
         if (tags["width"], tags["height"]) != (self.options.width, self.options.height):
-            raise WrongDevice(
+            # after a good one, the app was set to another size: it may be set back
+            raise (BadReading if self._first else WrongDevice)(
                 f"{self.where}: the photograph has {tags['width']}×{tags['height']} px, not "
                 f"{self.options.width}×{self.options.height}; set the camera app to its full size"
             )

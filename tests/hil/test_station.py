@@ -242,6 +242,18 @@ def test_the_epochs_are_calibrated(series, report):
     )
 
 
+def test_the_daemon_keeps_far_within_its_units_memory(station, series, report):
+    """At its limit, the kernel would kill it in the middle of a series."""
+    group = "/sys/fs/cgroup/system.slice/thermocald.service/memory"
+    lines = f"grep -h '^anon \\|^oom_kill ' {group}.stat {group}.events"
+    limit, _, own, _, killed = station.machine.run(f"cat {group}.max; {lines}").stdout.split()
+    assert int(killed) == 0
+    assert int(own) < 0.5 * int(limit)
+    report(
+        f"daemon: {int(own) / 1e6:.0f} MB of the unit's {int(limit) / 1e6:.0f} MB after a series"
+    )
+
+
 def test_a_stalled_camera_comes_back(station, series):
     """The feeder is stopped since the end of the series: one warning, and one return."""
     before = river(station.status())["stored"]

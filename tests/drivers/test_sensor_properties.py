@@ -1,20 +1,17 @@
 """Random outputs of devices: right, or rejected in one line.
 
-Strategies generate a chip's conversion and idle values, a firmware's formats and a user's
-corrections; the quick suite has the tables of `test_chip_outputs` instead.
+What chips and firmware print without having measured is in the tables of `test_chip_outputs`.
 """
 
 from __future__ import annotations
 
 import time
-from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from thermocald_drivers import chips
 from thermocald_drivers.kernel import HwmonThermometer
-from thermocald_drivers.serial_line import UNITS, SerialThermometer
 
 from tests.drivers.fakes.pty_instrument import Instrument
 from tests.drivers.fakes.sysfs import Sysfs
@@ -29,53 +26,6 @@ FEW, MORE = {**MANY, "max_examples": 5}, {**MANY, "max_examples": 200}  # for ea
 def one_line(error):
     assert len(str(error).splitlines()) == 1
     assert "Traceback" not in str(error)
-
-
-# --- a firmware that prints, and a user who corrects -------------------------------------
-
-CORRECTED = st.tuples(
-    st.sampled_from(["C", "F", "K"]),
-    st.sampled_from([0, 1, 2, 3]),  # decimals
-    st.sampled_from([1.0, 0.98, 1.03]),
-    st.floats(-3.0, 3.0).map(lambda value: round(value, 2)),
-    st.sampled_from(["%", ","]),
-)
-
-
-def printed(celsius, unit, decimals, comma):
-    factor, zero = UNITS[unit]
-    text = f"{celsius / factor + zero:.{decimals}f}"
-    return text.replace(".", ",") if comma == "," else text
-
-
-def line_read(text, **options):
-    """Return the driver's °C of a line, without the tty; None if it is rejected."""
-    stanza = {"port": "none", "pattern": r"(?P<t>\S+)", "command": "?", **options}
-    device, answers = SerialThermometer(clock=VirtualClock(), **stanza), []
-    device.handle = SimpleNamespace(
-        in_waiting=0,
-        write=lambda _: answers.append(f"{text}\n".encode()),
-        read=lambda _: answers.pop() if answers else b"",
-    )
-    try:
-        return device.read().values["t"]
-    except BadReading as error:
-        one_line(error)
-        return None
-
-
-def no_sensor(chip, k, how):
-    unit, decimals, scale, offset, comma = how
-    idle = chips.idle_celsius(chip) if chip else chips.FIRMWARE_C
-    values = [c for c in idle if abs(c) > 0.05] or [0.0]
-    text = printed(values[k % len(values)], unit, max(decimals, 1), comma)
-    assert line_read(text, unit=unit, scale=scale, offset=offset, chip=chip) is None, text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("names", [chips.names(), [None]], ids=["a chip", "any firmware"])
-def test_what_is_given_without_measuring_is_refused(names):
-    settings(**MANY)(given(st.sampled_from(names), st.integers(0, 10), CORRECTED)(no_sensor))()
 
 
 # --- files of the kernel ------------------------------------------------------------------

@@ -102,7 +102,7 @@ class ExecAlert(AlertOutput):
         self._dropped = ""  # why the last alert was not delivered, else empty
 
     def warnings(self) -> list[str]:
-        return [self._dropped] if self._dropped else []
+        return [*super().warnings(), *([self._dropped] if self._dropped else [])]
 
     def open(self) -> None:
         if shutil.which(self.where) is None:

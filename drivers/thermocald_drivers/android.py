@@ -52,7 +52,7 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import support
-from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, list_devices
+from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, list_phones
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -122,10 +122,7 @@ class AndroidCamera(AdbPhone, Camera):
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """List the phones of the adb server in any state."""
-        return [
-            Found({"serial": serial, "width": 4032, "height": 3024}, f"{serial} {state}")
-            for serial, state in list_devices()
-        ]
+        return list_phones(width=4032, height=3024)
 
     def open(self) -> None:
         super().open()

@@ -12,7 +12,6 @@ from tests.drivers.test_contract import use
 from thermocald.errors import BadReading, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, open_device
 
-
 ERRORS = {"timeout": DeviceTimeout, "unplugged": DeviceGone, "truncated": BadReading,
           "wrong_size": BadReading, "stuck": None}  # fmt: skip
 

@@ -26,13 +26,17 @@ FEW, MORE = {**MANY, "max_examples": 5}, {**MANY, "max_examples": 200}  # for ea
 # --- files of the kernel ------------------------------------------------------------------
 
 
+def one_line(error):
+    assert len(str(error).splitlines()) == 1
+
+
 def kernel_read(folder, name, text):
     Sysfs(folder).hwmon(0, name, temp1_input=text)
     with HwmonThermometer(clock=VirtualClock(), chip=name, sysfs=str(folder)) as device:
         try:
             return device.read().values["temperature"]
         except BadReading as error:
-            assert len(str(error).splitlines()) == 1
+            one_line(error)
             return None
 
 

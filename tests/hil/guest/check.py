@@ -72,8 +72,7 @@ def feeder(width, height, pixel_format, fps=10.0):
     try:
         yield process
     finally:
-        os.kill(process.pid, signal.SIGCONT)
-        process.kill()
+        process.kill()  # which also ends one that is stopped
         process.join()
 
 

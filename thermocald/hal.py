@@ -62,7 +62,7 @@ _CLOSE_S = 1e-4
 _POSSIBLE_C = (-273.15, 3000.0)
 
 
-def _require_numbers(**given: Any) -> None:
+def _require_numbers(given: Mapping[str, Any]) -> None:
     """Raise BadReading if what a driver gave as a number is none, or is infinite."""
     for name, value in given.items():
         if not isinstance(value, Real) or not math.isfinite(value):
@@ -101,11 +101,9 @@ class Frame:
     def __post_init__(self) -> None:
         if self.image is None and self.encoded is None and self.observations is None:
             raise ValueError("a frame needs an image, encoded bytes, or observations")
-        _require_numbers(monotonic=self.monotonic, utc=self.utc, exposure=self.exposure or 0.0)
-        given: Mapping[str, Any] = self.settings  # what a driver gives may be anything
-        for name, value in given.items():
-            if not isinstance(value, Real):
-                raise BadReading(f"its driver gives {value!r:.60} as {name}")
+        times = {"monotonic": self.monotonic, "utc": self.utc, "exposure": self.exposure or 0.0}
+        _require_numbers(times)
+        _require_numbers(self.settings)
         if not isinstance(self.encoded, bytes | None):
             raise BadReading(f"its driver gives {type(self.encoded).__name__} as encoded bytes")
         data: bytes | memoryview | None = self.encoded
@@ -146,7 +144,7 @@ class Reading:
                 values[name] = float(value)
             else:
                 missing[name] = f"{name}: {value!r:.60} is not a temperature"
-        _require_numbers(monotonic=self.monotonic, utc=self.utc)
+        _require_numbers({"monotonic": self.monotonic, "utc": self.utc})
         if not values:
             raise BadReading("; ".join(missing.values()) or "its driver gives no channel")
         object.__setattr__(self, "values", values)

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MOST_WAITING = 100
+_ENOUGH = 20
+"""Results, after which a condition without any value is reported: a drift has none in the first."""
 _BACK = 0.8
 """A drift is back below this fraction of its threshold."""
 _DISK_BACK = 1.1
@@ -256,7 +258,17 @@ class AlertOutput(Output):
         self._out: set[tuple[str, str]] = set()  # (device, condition)
         self._in_a_row: dict[str, int] = {}  # {device: latest epochs without a result}
         self._last: dict[str, tuple[Any, Any]] = {}  # {device: (series, epoch)}
-        self._lost = self._unstored = 0
+        self._lost = self._unstored = self._results = 0
+        self._compared: set[str] = set()  # conditions of which a result had the value
+
+    def warnings(self) -> list[str]:
+        if self._results < _ENOUGH:
+            return []
+        return [
+            f"when: {condition.name}: no result so far has a value of it, so that it gives no alert"
+            for condition in self._conditions
+            if condition.name not in self._compared
+        ]
 
     def emit(self, result: Mapping[str, Any]) -> None:
         self.opened()
@@ -281,10 +293,13 @@ class AlertOutput(Output):
         self._unstored = self._unstored + 1 if result.get("stored") is False else 0
         lost = max(0, self._lost - before, self._unstored)
         changes = []
+        self._results += 1
         for condition in self._conditions:
             key = (device if condition.per_device else "", condition.name)
             found = condition.measure(result, failed, lost)
             value, low, high = found.value, found.low, found.high
+            if not math.isnan(value):
+                self._compared.add(condition.name)
             out, was_out = value < low or value > high, key in self._out
             if out == was_out or not (out or low + found.back <= value <= high - found.back):
                 continue

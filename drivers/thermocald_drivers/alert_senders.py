@@ -60,6 +60,7 @@ import urllib.request
 from contextlib import suppress
 from email.message import EmailMessage
 from email.utils import formatdate
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
@@ -102,7 +103,7 @@ class ExecAlert(AlertOutput):
         self._dropped = ""  # why the last alert was not delivered, else empty
 
     def warnings(self) -> list[str]:
-        return [self._dropped] if self._dropped else []
+        return [*super().warnings(), *([self._dropped] if self._dropped else [])]
 
     def open(self) -> None:
         if shutil.which(self.where) is None:
@@ -261,9 +262,12 @@ class MailAlert(AlertOutput):
         o = self.options
         password = secret("password_file", o.password_file)
         try:
-            with self._connect() as server:
+            context = ssl.create_default_context(cafile=o.ca)
+            tls = partial(smtplib.SMTP_SSL, context=context)
+            connect: Any = tls if o.security == "tls" else smtplib.SMTP
+            with connect(o.host, o.port, timeout=o.timeout_s) as server:
                 if o.security == "starttls":
-                    server.starttls(context=self._context())
+                    server.starttls(context=context)
                 if o.username and password is not None:
                     server.login(o.username, password)
                 if letter is not None:
@@ -280,12 +284,3 @@ class MailAlert(AlertOutput):
             raise DeviceGone(f"{self.where}: no answer, or it closed the connection") from None
         except (OSError, ValueError, smtplib.SMTPException) as error:
             raise DeviceGone(f"{self.where}: {support.reason(error)}") from None
-
-    def _connect(self) -> smtplib.SMTP:
-        o = self.options
-        if o.security == "tls":
-            return smtplib.SMTP_SSL(o.host, o.port, timeout=o.timeout_s, context=self._context())
-        return smtplib.SMTP(o.host, o.port, timeout=o.timeout_s)
-
-    def _context(self) -> ssl.SSLContext:
-        return ssl.create_default_context(cafile=self.options.ca)

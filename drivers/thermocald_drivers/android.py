@@ -52,7 +52,7 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import support
-from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, list_devices
+from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, list_phones
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -122,10 +122,7 @@ class AndroidCamera(AdbPhone, Camera):
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """List the phones of the adb server in any state."""
-        return [
-            Found({"serial": serial, "width": 4032, "height": 3024}, f"{serial} {state}")
-            for serial, state in list_devices()
-        ]
+        return list_phones(width=4032, height=3024)
 
     def open(self) -> None:
         super().open()
@@ -153,7 +150,8 @@ class AndroidCamera(AdbPhone, Camera):
         path, jpeg = self._new_photograph(set(before))
         tags = exif(jpeg)
         if (tags["width"], tags["height"]) != (self.options.width, self.options.height):
-            raise WrongDevice(
+            # after a good one, the app was set to another size: it may be set back
+            raise (BadReading if self._first else WrongDevice)(
                 f"{self.where}: the photograph has {tags['width']}×{tags['height']} px, not "
                 f"{self.options.width}×{self.options.height}; set the camera app to its full size"
             )

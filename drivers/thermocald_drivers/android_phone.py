@@ -84,14 +84,15 @@ class PhoneOptions(DriverOptions):
     timeout_s: support.Seconds
 
 
-def list_devices() -> list[tuple[str, str]]:
-    """Return (serial, state) of the phones on a running adb server; [] without one."""
+def list_phones(**options: int) -> list[Found]:
+    """List the phones on a running adb server with further options; [] without a server."""
     adbutils = support.library("adbutils", "android")
     try:
         require_server("127.0.0.1", 5037, 1.0, seen=False)
-        return _devices(adbutils.AdbClient(socket_timeout=1.0))
+        pairs = _devices(adbutils.AdbClient(socket_timeout=1.0))
     except (OSError, adbutils.AdbError):
         return []
+    return [Found({"serial": serial, **options}, f"{serial} {state}") for serial, state in pairs]
 
 
 def _devices(client: Any) -> list[tuple[str, str]]:
@@ -314,7 +315,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
         """List the phones of the adb server."""
-        return [Found({"serial": serial}, f"{serial} {state}") for serial, state in list_devices()]
+        return list_phones()
 
     def close(self) -> None:
         super().close()

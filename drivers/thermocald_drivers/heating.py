@@ -46,6 +46,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
+_MANY = 20  # results without a temperature, which are reported
+
+
 class HeatingOptions(DriverOptions):
     """The options of every output that heats."""
 
@@ -76,8 +79,14 @@ class HeatingOutput(Output):
     heating = False
     tripped = ""
     _known_at = 0.0
+    _unknown = 0  # results in a row without a temperature
     _started: float | None = None
     _reported = False
+
+    def warnings(self) -> list[str]:
+        if self._unknown < _MANY:
+            return []
+        return [f"{self.channel} is unknown in the last {self._unknown} results; it does not heat"]
 
     def begin(self) -> None:
         """Start the programme at the first opening; continue it, with the heating off, later."""
@@ -120,6 +129,7 @@ class HeatingOutput(Output):
         )
         if known := not math.isnan(temperature_c):
             self._known_at = elapsed_s
+        self._unknown = 0 if known else self._unknown + 1
         half = self.options.hysteresis_k / 2
         if self.tripped or hold_c is None:
             self.heating = False

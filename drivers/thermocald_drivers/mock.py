@@ -190,8 +190,8 @@ class MockCamera(MockDevice, Camera):
         self._last: NDArray[np.uint8] | None = None
 
     def open(self) -> None:
+        _ = self.scene  # first, since the time of the faults counts from the end of the opening
         super().open()
-        _ = self.scene
 
     def identity(self) -> Mapping[str, str]:
         return {**super().identity(), "testfield": self.options.testfield}

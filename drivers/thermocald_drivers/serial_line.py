@@ -43,6 +43,7 @@ Source: the instruments' manuals, named with each.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import termios
 import time
@@ -211,6 +212,8 @@ class SerialThermometer(support.CheckedThermometer):
         except OSError as error:
             if "exclusively lock" in str(error):
                 error = OSError(16, "another program holds the port")
+            elif error.errno:  # pyserial's text quotes the port and the error once more
+                error = OSError(error.errno, os.strerror(error.errno))
             hint = "check that it is plugged in and the user is in the group dialout"
             raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
         self.seen = self._owed = True

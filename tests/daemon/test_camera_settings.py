@@ -27,10 +27,11 @@ from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.store.series import EpochResult
 
 CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}
+PHONE = {"name": "phone", "driver": "android", "serial": "X", "width": 96, "height": 64}
 
 
-def plan_of(**changes):
-    document = {"cameras": [{**CAMERA, "series": "M1", **changes}]}
+def plan_of(camera, **changes):
+    document = {"cameras": [{**camera, "series": "M1", **changes}]}
     (plan,) = plan_cameras(parse_config(document, Path("/etc/config.yaml")), VirtualClock())
     return plan
 
@@ -42,7 +43,7 @@ def run(tmp_path):
     runtime = Runtime(guard, SteadyClock(VirtualClock()), LiveState(tmp_path))
     none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), VirtualClock())
     frames = SimpleNamespace(wanted=lambda *_: False, root=tmp_path)
-    yield SeriesRun(plan_of(), runtime, none, frames, [], dict)
+    yield SeriesRun(plan_of(CAMERA), runtime, none, frames, [], dict)
     guard.close()
 
 
@@ -143,8 +144,10 @@ def test_a_long_series_does_not_keep_its_next_epochs_waiting(run, tmp_path, monk
     assert [one.number for one in found if one is not None] == [1100]
 
 
-def test_a_sensor_of_another_size_than_the_driver_is_refused():
-    sensor = {"width_px": 64, "height_px": 48, "pixel_pitch_mm": 0.003}
-    assert plan_of(sensor=sensor).sensor.width == 64
-    with pytest.raises(ConfigurationError, match=r"sensor has 1920×1080 px.* have 64×48 px"):
-        plan_of(sensor={**sensor, "width_px": 1920, "height_px": 1080})
+@pytest.mark.parametrize("camera", [CAMERA, PHONE])
+def test_a_sensor_of_another_size_than_the_driver_is_refused(camera):
+    width, height = camera["width"], camera["height"]
+    sensor = {"width_px": width, "height_px": height, "pixel_pitch_mm": 0.003}
+    assert plan_of(camera, sensor=sensor).sensor.width == width
+    with pytest.raises(ConfigurationError, match=rf"1920×1080 px.* have {width}×{height} px"):
+        plan_of(camera, sensor={**sensor, "width_px": 1920, "height_px": 1080})

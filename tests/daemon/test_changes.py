@@ -19,13 +19,13 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.sources import StoredRecording
 
-EPOCHS, WHEN = 18, 13
+EPOCHS, WHEN = 14, 9
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory, forker):
-    """The store of one daemon with five cameras that see the same until epoch 13."""
+    """The store of one daemon with five cameras that see the same until epoch 9."""
     folder = tmp_path_factory.mktemp("changes")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, interval=10.0))
     field, sensor = taken.testfield, taken.camera.sensor

@@ -13,6 +13,7 @@ import yaml
 from PIL import Image
 
 from tests.commands import call
+from tests.daemon.conftest import fast_run, make_recording, replayed_camera
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.testfield_file import read_testfield
@@ -75,11 +76,62 @@ def test_predicted_epochs_through_a_restart_are_not_taken_for_calibrations(
     )
     assert last["status"] == "predicted"
     assert float(last["c"]) == pytest.approx(row["c"])
-    for command in (["study"], ["discover"], ["fit", "-o", "m.yaml"]):
+    for command in (["study"], ["fit", "-o", "m.yaml"]):
         done = call(*command, daemon.store)
         assert done.returncode == 1
         assert "nothing in it was calibrated" in " ".join(done.stderr.split())
         assert "Traceback" not in done.stderr
+
+
+DAY = 144  # epochs
+# a script that ends the process as a kill does, once it has stored an epoch
+KILLED_AFTER = """
+import os
+from thermocald.daemon.store_guard import StoreGuard
+append = StoreGuard.append
+def killed(guard, row):
+    append(guard, row)
+    if row.epoch.number == {}:
+        os._exit(137)
+    return True
+StoreGuard.append = killed
+"""
+
+
+def gauge_day(folder, recording, model, forker, kills):
+    """Return the columns that daemons store of a recorded day; kills: the last epoch of each."""
+    folder.mkdir()
+    camera = replayed_camera(recording, name="g", thermometers=["t"], thermal_model=str(model))
+    del camera["testfield"]
+    thermometer = {"name": "t", "driver": "replay", "recording": str(recording)}
+    document = {"cameras": [camera], "thermometers": [thermometer], "frames": {"keep": "none"}}
+    for last in (*kills, DAY):
+        run = KILLED_AFTER.format(last % DAY) + fast_run(json.dumps(document), 0)
+        assert forker.start(folder, script=run).wait(120.0) == (137 if last in kills else 0)
+        with Store.open(folder / "thermocald.db") as store:
+            names = ["epoch", "frame_time", "temperature", "status", "c", "sd_c"]
+            found = store.series_columns(store.find_series(), names)
+        camera["after"] = thermometer["after"] = float(found["frame_time"][-1])
+    return found
+
+
+def test_a_day_with_kills_is_predicted_as_a_day_without(tmp_path, forker, thermal_model):
+    """The lens follows the housing with a lag, which a killed daemon must not forget."""
+    document = yaml.safe_load(thermal_model.read_text())
+    lag = {"effect": "thermal_lag", "parameters": {"tau": {"value": 1800.0, "unit": "s"}}}
+    thermal_model.write_text(yaml.safe_dump({**document, "effects": [lag]}))
+    day = make_recording(
+        tmp_path / "day", DAY, per_side=2, interval=600.0,
+        temperature_of=lambda k: 25.0 + 8.0 * np.sin(2 * np.pi * k / DAY),
+    )  # fmt: skip
+    whole = gauge_day(tmp_path / "whole", day, thermal_model, forker, [])
+    killed = gauge_day(tmp_path / "killed", day, thermal_model, forker, [1, 60, 61])
+    assert (whole["status"] == "predicted").all()
+    for name in ("epoch", "frame_time", "temperature", "status"):
+        np.testing.assert_array_equal(killed[name], whole[name])
+    np.testing.assert_allclose(killed["c"], whole["c"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(killed["sd_c"], whole["sd_c"], rtol=1e-6)
+    assert np.ptp(whole["sd_c"]) > 0
 
 
 @pytest.mark.slow

@@ -73,6 +73,18 @@ def test_temperature_disk_and_epochs_without_result_or_lost(tmp_path):
     assert alerts({"lost": 1}, results)[2].text == words
 
 
+def test_a_condition_that_is_never_compared_is_a_warning(tmp_path):
+    """Of a channel that is spelt wrongly, or a folder that is not there, no alert ever came."""
+    when = [{"temperature": "housng", "above_c": 60}, {"temperature": "housing", "above_c": 60},
+            {"free_disk_gb": 1e-6, "path": str(tmp_path / "away")}, *WHEN]  # fmt: skip
+    device = output("exec", command=["true"], when=when)
+    for k in range(20):
+        assert device.warnings() == []
+        drift = {"drift_c_px": 0.1 if k >= 10 else math.nan}
+        device.changes(result(k, housing=20.0, **drift), "cam")
+    assert [text.split(": ")[1] for text in device.warnings()] == ["housng", "free_disk"]
+
+
 OUT, IN = result(1, drift_c_px=0.8), result(2, drift_c_px=0.1)
 
 

@@ -216,10 +216,13 @@ FOCUS_MOVED = FOCUS.replace("0.25", "0.31")
     [({"media_camera": FOCUS_MOVED}, {}, "focus_distance_dioptres was 0.25 and is 0.31"),
      ({}, {"zoom": 2.0}, "digital_zoom was 1.0 and is 2.0"),
      ({}, {"distance": 2.0}, "subject_distance_m was 1.5 and is 2.0"),
+     ({}, {"size": (48, 32)}, "the photograph has 48×32 px, not 96×64; set the camera app"),
      ({"media_camera": FOCUS + "android.control.afState (1): byte[1]\n [PASSIVE_SCAN ]\n"}, {},
       "autofocus is at work")],
 )  # fmt: skip
-def test_a_phone_that_focuses_gives_no_frame(server, phone, change, tags, why):
+def test_a_phone_that_is_changed_gives_no_frame_until_it_is_set_back(
+    server, phone, change, tags, why
+):
     phone.shoot = shoot(distance=1.5)
     with camera(server) as device:
         assert device.capture().settings["focus_distance_dioptres"] == 0.25
@@ -228,6 +231,8 @@ def test_a_phone_that_focuses_gives_no_frame(server, phone, change, tags, why):
         phone.shoot = shoot(**{"distance": 1.5, **tags})
         with pytest.raises(errors.BadReading, match=why):
             device.capture()
+        phone.media_camera, phone.shoot = FOCUS, shoot(distance=1.5)
+        device.capture()
 
 
 def test_what_a_phone_does_not_report_is_in_the_warnings(server, phone):

@@ -122,6 +122,16 @@ def test_opening_again_neither_restarts_the_programme_nor_resets_the_limit(pins,
         lamp.emit({"temperature": 20.0})
 
 
+def test_a_channel_that_no_result_has_is_a_warning(pins, clock):
+    """Regression: spelt wrongly, the lamp stayed off and nothing said so."""
+    with relay(clock, channel="housng", programme=[{"seconds": 5000, "hold_c": 45.0}]) as lamp:
+        for _ in range(20):
+            assert lamp.warnings() == []
+            lamp.emit({"housing": 20.0})
+        assert lamp.warnings() == ["housng is unknown in the last 20 results; it does not heat"]
+        assert not pins.pin(27).state
+
+
 def test_a_pin_in_use(pins, clock):
     with relay(clock), pytest.raises(DeviceDenied, match="in use"):
         relay(clock).open()

@@ -199,7 +199,8 @@ def test_one_channel_without_a_sensor_does_not_take_the_others_along(instrument)
 def test_no_such_port():
     options = {"port": "/dev/ttyNONE", "instrument": "papouch-tm"}
     device = open_device("thermometer", "serial", options, SystemClock())
-    with pytest.raises(errors.DeviceNotFound, match="dialout"):
+    where = "^papouch-tm on /dev/ttyNONE: No such file or directory; check .* dialout$"
+    with pytest.raises(errors.DeviceNotFound, match=where):
         device.open()
 
 

@@ -179,9 +179,9 @@ def station(tmp_path, store_path, head, field, make_epoch, make_result):
 
 @pytest.fixture(scope="session")
 def archive(tmp_path_factory):
-    """Two recordings of one camera, 80 epochs each."""
+    """Two recordings of one camera, 40 epochs each."""
     folder = tmp_path_factory.mktemp("archive")
     for name in ("M1", "M2"):
         whole = preset_simulation("rpi-v2.1-heating", 1, name)
-        replace(whole, programme=replace(whole.programme, epochs=80)).write(folder / name)
+        replace(whole, programme=replace(whole.programme, epochs=40)).write(folder / name)
     return folder

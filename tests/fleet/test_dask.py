@@ -19,7 +19,7 @@ RUN_BLOCKS = (
     "import sys; from pathlib import Path;"
     "from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks;"
     "from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE;"
-    "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
+    "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 5);"
     "print([o.error for o in run_tasks(calibrate_block, b, sys.argv[3]) if o.error])"
 )
 
@@ -35,7 +35,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
     """One of two is killed, then the other after every few blocks and replaced, as on machines
     that are lent.
     """
-    list(run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10)))
+    list(run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 5)))
     out = tmp_path / "many"
     command = [sys.executable, "-c", RUN_BLOCKS, archive, out, dask.address]
     client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

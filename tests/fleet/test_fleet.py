@@ -18,8 +18,8 @@ from thermocald.fleet.overview import fleet_lines, render_fleet
 from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.reader import ServerWriter
 
-# an epoch a minute for two days: temperatures of 16 K
-BASE = GeneratedCamera("", epochs=2880, interval=60.0)
+# an epoch in two minutes for two days: temperatures of 16 K
+BASE = GeneratedCamera("", epochs=1440, interval=120.0)
 RATES = [(3.0e-4 + 2e-5 * (i % 5 - 2), -4.0e-4 + 3e-5 * (i % 4 - 1.5), 2.0e-4 + 1e-5 * (i % 3))
          for i in range(10)]  # fmt: skip
 

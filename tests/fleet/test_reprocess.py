@@ -24,7 +24,7 @@ def files(out, pattern="*.parquet"):
     return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob(pattern))}
 
 
-def blocks_of(archive, out, size=40):
+def blocks_of(archive, out, size=20):
     return find_blocks([archive], out, tuple(DEFAULT_FREE), size)
 
 
@@ -41,10 +41,10 @@ def test_processes_give_the_bits_of_one_and_what_fails_costs_itself(archive, cal
     gone = replace(blocks[1], recording=tmp_path / "gone", target=tmp_path / "gone.parquet")
     done = list(run_tasks(calibrate_block, [*blocks[:2], gone, *blocks[2:]], jobs=2))
     assert sorted(bool(o.error) for o in done) == [False, False, False, False, True]
-    assert sum(o.calibrated for o in done) == 160
+    assert sum(o.calibrated for o in done) == 80
     assert files(calibrated) == files(tmp_path)
     table = parquet.read_table(calibrated)
-    assert table.num_rows == 160
+    assert table.num_rows == 80
     assert table.column("sd_x0").null_count == 0
 
 
@@ -55,16 +55,16 @@ def test_an_interrupted_run_goes_on(archive, tmp_path):
 
 
 def test_a_block_knows_the_frame_before_it(archive, tmp_path):
-    """Epoch 41, the first of a block, has the image points of epoch 40 again."""
+    """Epoch 21, the first of a block, has the image points of epoch 20 again."""
     shutil.copytree(archive / "M1", tmp_path / "M1")
     path = tmp_path / "M1" / "observations.csv"
     lines = path.read_text().splitlines(keepends=True)
-    again = [line.replace("40,", "41,", 1) for line in lines if line.startswith("40,")]
-    path.write_text("".join([line for line in lines if line[:3] != "41,"] + again))
+    again = [line.replace("20,", "21,", 1) for line in lines if line.startswith("20,")]
+    path.write_text("".join([line for line in lines if line[:3] != "21,"] + again))
     list(run_tasks(calibrate_block, blocks_of(tmp_path, tmp_path / "out")))
     status = parquet.read_table(tmp_path / "out").sort_by("epoch").column("status").to_pylist()
-    assert [i + 1 for i, word in enumerate(status) if word != "ok"] == [41]
-    assert status[40] == "repeated_frame"
+    assert [i + 1 for i, word in enumerate(status) if word != "ok"] == [21]
+    assert status[20] == "repeated_frame"
 
 
 def test_a_folder_that_cannot_be_read_is_not_called_empty(archive, tmp_path, monkeypatch, caplog):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.conftest import address, count, execute
+from tests.marks import mostly_slow
 from thermocald.fleet.forward import Cursor, Forwarder
 from thermocald.fleet.overview import fleet_document
 from thermocald.store.database.store import Store
@@ -158,7 +159,7 @@ CLONES = ["copied", "by backup", "with its cursor", "before the first report", "
           "far behind", "under another name"]  # fmt: skip
 
 
-@pytest.mark.parametrize("how", CLONES)
+@pytest.mark.parametrize("how", mostly_slow(CLONES, "with its cursor", "under another name"))
 def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, make_result, how):
     """A card's image has the cursor, the store's inode and identity too: only what the two take
     afterwards tells them apart.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import compileall
 import contextlib
 import os
 import shutil
@@ -9,6 +10,7 @@ import socket
 import threading
 import zipfile
 from pathlib import Path
+from py_compile import PycInvalidationMode
 
 import pytest
 
@@ -50,6 +52,11 @@ def machine(tmp_path_factory):
     (wheel,) = sorted((BUILT / "wheel").glob("thermocald-*.whl"))
     with zipfile.ZipFile(wheel) as file:
         file.extractall(guest.share / "thermocald")
+    # here, because the daemon in the guest may not write what it compiles, and is slow at it
+    compileall.compile_dir(
+        guest.share / "thermocald", ddir="/opt/thermocald", quiet=1,
+        invalidation_mode=PycInvalidationMode.UNCHECKED_HASH,
+    )  # fmt: skip
     shutil.copytree(HERE / "guest", guest.share / "guest")
     (guest.share / "tests_hil").mkdir()
     shutil.copy(HERE / "bars.py", guest.share / "tests_hil")

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 import socket
 import subprocess
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tests.hil import thermal_zone
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 BOOT_S = 240.0
 # The least that NumPy and OpenCV need (x86-64-v2). With "max", which also has AVX, Python and NumPy
 # sometimes crashed in the emulation (QEMU 7.2)
 CPU = "Nehalem"
+GUEST = "/mnt/host/guest"
+PRELOADED = "/run/preloaded.sock"
 _SSH_FAILED = 255  # our commands never end with it
 STORE_SIZE = "48M"  # small, so that little has to be freed for observations (20 MB)
 WRITES_BYTES = 4 << 30  # sparse
@@ -40,6 +45,7 @@ class Machine:
         self.share.mkdir(exist_ok=True)
         self.serial = folder / "serial.sock"
         self.wire = folder / "wire.sock"
+        self.scripts = folder / "scripts.sock"
         self.zone = folder / "zone.aml"
         self.zone.write_bytes(thermal_zone.table())
         self.process: subprocess.Popen[bytes] | None = None
@@ -120,8 +126,10 @@ class Machine:
     def _share_a_connection(self) -> None:
         """Open one connection for all commands: a key exchange takes two seconds."""
         quiet = subprocess.DEVNULL
+        self.scripts.unlink(missing_ok=True)
+        forward = ("-L", f"{self.scripts}:{PRELOADED}")
         self._master = subprocess.Popen(
-            self._ssh("-M", "-N"), stdin=quiet, stdout=quiet, stderr=quiet
+            self._ssh("-M", "-N", *forward), stdin=quiet, stdout=quiet, stderr=quiet
         )
         while not (self.folder / "ssh").exists() and self._master.poll() is None:
             time.sleep(0.05)
@@ -147,11 +155,42 @@ class Machine:
             raise RuntimeError(f"{command}: status {done.returncode}\n{done.stdout}{done.stderr}")
         return done
 
-    def python(self, script: str, *arguments: object, timeout_s: float = 300.0) -> object:
-        """Run a script of tests/hil/guest in the guest; return the JSON of its last line."""
-        words = " ".join(shlex.quote(str(a)) for a in arguments)
-        out = self.run(f"python3 /mnt/host/guest/{script} {words}", timeout_s=timeout_s).stdout
-        return json.loads(out.strip().splitlines()[-1])
+    def python(
+        self, script: str, *arguments: object, timeout_s: float = 300.0, **steps: Callable[[], None]
+    ) -> Any:
+        """Run a script of tests/hil/guest in the guest; return the JSON of its last line.
+
+        steps: what to do when the script prints a line with this name.
+        """
+        words = [f"{GUEST}/{script}", *map(str, arguments)]
+        with self._preloaded() as line:
+            line.settimeout(timeout_s)
+            line.sendall(json.dumps(words).encode() + b"\n")
+            printed = []
+            for text in line.makefile():
+                steps.get(text.strip(), lambda: None)()
+                printed.append(text)
+        try:
+            return json.loads(printed[-1])
+        except (ValueError, IndexError):
+            raise RuntimeError(f"{words}:\n{''.join(printed)}") from None
+
+    def _preloaded(self, timeout_s: float = 240.0) -> socket.socket:
+        """Return a connection to the process that runs scripts, which is started if it is not."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            line = socket.socket(socket.AF_UNIX)
+            line.connect(str(self.scripts))
+            if line.recv(6) == b"ready\n":
+                return line
+            line.close()  # nothing listens in the guest
+            if time.monotonic() > deadline:
+                why = self.run("journalctl -u preloaded -n 20 --no-pager -o cat").stdout
+                raise RuntimeError(f"no scripts can be run in the guest: {why}")
+            start = f"python3 {GUEST}/preloaded.py {PRELOADED}"
+            start = f"systemd-run -q --collect --unit preloaded {start}"
+            self.run(f"systemctl is-active -q preloaded || {start}", check=False)
+            time.sleep(0.2)
 
     def wait(self, command: str, timeout_s: float = 60.0) -> str:
         """Wait until a command succeeds in the guest; return its output."""

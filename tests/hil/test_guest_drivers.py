@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 
 import pytest
@@ -14,8 +13,13 @@ STAMP_S = 0.005
 TRANSIENT = ("BadReading", "DeviceGone", "DeviceTimeout")
 
 
-def check(machine, name, *arguments, timeout_s=300.0):
-    return machine.python("check.py", name, *arguments, timeout_s=timeout_s)
+def check(machine, name, *arguments, **steps):
+    return machine.python("check.py", name, *arguments, **steps)
+
+
+def unplugged(machine, device, scenario, argument):
+    """Run a scenario while a device is pulled and plugged in again; return its result."""
+    return check(machine, scenario, argument, pull=device.pull, plug=device.plug)
 
 
 def milliseconds(seconds):
@@ -118,23 +122,6 @@ def test_serial(machine, instrument, report):
     result = check(machine, "serial_line", instrument.port)
     assert result["values"] == [{"temperature": -12.375}] * 20
     report(f"serial (ftdi_sio): read to value {milliseconds(result['took_s'])}")
-
-
-def unplugged(machine, device, scenario, argument):
-    """Run a scenario while a device is pulled and plugged in again; return its result."""
-    machine.run("rm -f /run/cable /run/result /run/errors")
-    machine.run(
-        f"nohup python3 /mnt/host/guest/check.py {scenario} {argument} "
-        ">/run/result 2>/run/errors </dev/null &"
-    )
-    machine.wait("grep -q pull /run/cable")
-    device.pull()
-    machine.wait("grep -q plug /run/cable")
-    device.plug()
-    machine.wait("test -s /run/result || test -s /run/errors", 120)
-    errors = machine.run("cat /run/errors").stdout
-    assert not errors, errors
-    return json.loads(machine.run("cat /run/result").stdout)
 
 
 def test_serial_unplugged_and_plugged_again(machine, instrument):

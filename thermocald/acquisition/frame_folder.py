@@ -37,6 +37,11 @@ _OURS = re.compile(r"\d{7,}(-corrected)?\.(jpg|png)(\.partial)?")
 _FAST_PNG = 1  # of 9: higher levels take longer, and the file is hardly smaller
 
 
+def is_chosen(rule: str, every_n: int, number: int, eventful: bool) -> bool:
+    """Return whether `all`, `every_n`, `events` or `none` chooses the frame of an epoch."""
+    return {"all": True, "every_n": number % every_n == 0, "events": eventful}.get(rule, False)
+
+
 class FrameFolder:
     """The folder with the frames of all cameras; threads may share it."""
 
@@ -49,8 +54,7 @@ class FrameFolder:
 
     def wanted(self, number: int, eventful: bool) -> bool:
         """Return whether the frame of an epoch is to be kept by the configuration."""
-        kinds = {"all": True, "every_n": number % self.config.every_n == 0, "events": eventful}
-        return kinds.get(self.config.keep, False)
+        return is_chosen(self.config.keep, self.config.every_n, number, eventful)
 
     def keep(self, camera: str, series: str, number: int, frame: Frame) -> Path | None:
         """Write a frame; return its path relative to the folder, None if it cannot be written.

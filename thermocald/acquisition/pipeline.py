@@ -47,8 +47,10 @@ def calibrate_frame(calibrator: EpochCalibrator, epoch: Epoch, frame: Frame) -> 
     """Measure and adjust a frame; one that is not an image gives the status `bad_frame`."""
     try:
         if frame.observations is not None:
-            seen = observations_from_lists(frame.observations, calibrator.testfield)
-            return calibrator.calibrate(replace(epoch, observations=seen))
+            if len(calibrator.testfield):  # else it is a gauge, without control points
+                seen = observations_from_lists(frame.observations, calibrator.testfield)
+                epoch = replace(epoch, observations=seen)
+            return calibrator.calibrate(epoch)
         image = EncodedImage(frame.encoded or b"") if frame.image is None else frame.image
     except DataError as error:
         return CalibratedEpoch(epoch, failed("bad_frame", str(error)), {})

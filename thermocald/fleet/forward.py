@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from thermocald.acquisition.frame_folder import is_chosen
 from thermocald.config import ForwardConfig
 from thermocald.errors import ServerError, ServerGone, StoreError
 from thermocald.files import write_text
@@ -220,12 +221,13 @@ class Forwarder:
 
         A frame that retention has deleted is skipped.
         """
-        count = 0
+        count, rule = 0, self.rule
         files = FileFolder(self.frames)
         series = {one.id: one for one in store.all_series()}
         while frames := store.frames_after(cursor.sent["frame"], _FRAMES):
             for frame in frames:
-                data = _read_frame(files, frame) if self._wants(frame) else None
+                wanted = is_chosen(rule.frames, rule.every_n, frame.number, frame.eventful)
+                data = _read_frame(files, frame) if wanted else None
                 if frame.series not in series or (
                     data is not None and not self._has_room(cursor, len(data))
                 ):
@@ -246,14 +248,6 @@ class Forwarder:
                     cursor.write(self._path)
             cursor.write(self._path)
         return count
-
-    def _wants(self, frame: KeptFrame) -> bool:
-        """Return whether the rule chooses an epoch's frame."""
-        if frame.path is None or self.rule.frames == "all":
-            return frame.path is not None
-        if self.rule.frames == "events":
-            return frame.eventful
-        return frame.number % self.rule.every_n == 0
 
     def _has_room(self, cursor: Cursor, size: int) -> bool:
         day = int(self._clock() // _DAY_S)
@@ -286,8 +280,7 @@ class Forwarder:
 
 
 def _read_frame(files: FileFolder, frame: KeptFrame) -> bytes | None:
-    assert frame.path is not None
-    path = files.find(frame.path)
+    path = None if frame.path is None else files.find(frame.path)
     try:
         if path is None:
             return None

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -30,16 +31,16 @@ PLAIN = InteriorOrientation(
 )
 CAMERAS = {
     "plain": PLAIN,
-    "without A3": PLAIN.with_values(A3=0.0),
+    "without A3": replace(PLAIN, A3=0.0),
     "pinhole with shear": InteriorOrientation(c=3.05, x0=0.02, y0=-0.01, C1=2e-3, C2=-1e-3),
-    "all": PLAIN.with_values(C1=3e-4, C2=-2e-4),
+    "all": replace(PLAIN, C1=3e-4, C2=-2e-4),
 }
 FORMATS = list(camera_files.FORMATS)
 every_camera = pytest.mark.parametrize("camera", CAMERAS)
 
 
 def _camera(name="plain", **changes):
-    return CameraModel(SENSOR, CAMERAS[name].with_values(**changes))
+    return CameraModel(SENSOR, replace(CAMERAS[name], **changes))
 
 
 X, Y = (v.ravel() for v in np.meshgrid(np.linspace(-0.58, 0.58, 23), np.linspace(-0.43, 0.43, 17)))

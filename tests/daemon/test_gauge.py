@@ -146,7 +146,7 @@ def test_check_doubts_names_that_a_symmetry_leaves_untested(river):
     file, camera = river / "gcp.csv", load_camera(river / "camera.thermal.yaml").at(20.0)
     control = ControlPoints.read(file, "m")
     corners = [[-4e3, 1e4, 0.0], [4e3, 1e4, 9e2], [4e3, 16e3, 0.0], [-4e3, 16e3, 9e2]]
-    corners = np.array(corners) + [0.0, 0.0, 139e3]
+    corners = np.add(corners, [0.0, 0.0, 139e3])
     seen = camera.project(corners, control.pose(camera).values[10:])
     table = np.column_stack([(corners + control.origin) / 1000, np.full((4, 3), 0.01), seen])
     rows = [",".join(map(str, (f"g{i}", *row, 1, 1))) for i, row in enumerate(table.tolist())]

@@ -222,14 +222,3 @@ def test_bad_photographs_in_a_small_network_are_refused():
         distances = [cases.distance(field, 0, 19, 0.01)]
         with pytest.raises(GeometryError, match="contradict each other"):
             adjust_network(cases.SENSOR, photos, names, distances, interior=cases.INTERIOR)
-
-
-def test_photographs_of_a_moving_field_are_refused():
-    """Each photograph shows another random field; chance agreement is refused."""
-    rng = np.random.default_rng(8)
-    photos = {}
-    for i, station in enumerate(cases.convergent_stations(_BENT, 4)):
-        moved = _BENT + rng.normal(0, 30, _BENT.shape)
-        photos[f"photo{i}"] = cases.photographs(moved, [station], 0.05, rng)[0]["photo0"]
-    with pytest.raises(GeometryError):
-        _adjust(photos, interior=cases.INTERIOR)

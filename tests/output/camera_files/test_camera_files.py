@@ -247,18 +247,6 @@ def test_exact_where_the_convention_allows(tmp_path, interior, exact_in):
     assert exact == exact_in
 
 
-@pytest.mark.parametrize(
-    ("changes", "name", "least", "most"),
-    [({"C1": 3e-4}, "opencv", 1e-5, 1e-3), ({"C2": 2e-4}, "opencv", 0.1, 0.5),
-     ({"C2": 2e-4}, "metashape", 0.0, 1e-3)],
-)  # fmt: skip
-def test_affinity_costs_thousandths_and_shear_a_quarter_of_a_pixel(
-    tmp_path, changes, name, least, most
-):
-    """What the docs say; CONVENTIONS §2 lets both be fits."""
-    camera_files.write(_camera(**changes), tmp_path / "a", name)
-    assert least < _stated((tmp_path / "a").read_text())[0] < most
-
 
 # --- round trips -------------------------------------------------------------------------------
 

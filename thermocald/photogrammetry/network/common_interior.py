@@ -134,8 +134,9 @@ def adjust_common_interior(
     variance = part.cost(bundle, part.residuals(bundle), np.ones(len(part.rays))) / redundancy
     # the image points' own: targets that are better than stated would lower the noise of both
     own = 2 * len(part.rays) - float(np.einsum("nii->", part.explained(bundle, found)))
-    of_image = float(np.sum(part.residuals(bundle) ** 2)) / max(own, 1.0)
-    noise = max((variance, redundancy), (of_image, own))
+    noise: tuple[float, float] = variance, redundancy
+    if own >= TRUSTED_REDUNDANCY:
+        noise = max(noise, (float(np.sum(part.residuals(bundle) ** 2)) / own, own))
     f, eops = len(free), bundle.exteriors()
     # how weak the geometry is, whatever the photographs disagree in
     weak = _weaknesses(bundle, part, found.cameras[:f, :f] * noise[0], s)

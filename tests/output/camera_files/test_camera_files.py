@@ -247,7 +247,6 @@ def test_exact_where_the_convention_allows(tmp_path, interior, exact_in):
     assert exact == exact_in
 
 
-
 # --- round trips -------------------------------------------------------------------------------
 
 

@@ -64,8 +64,6 @@ if TYPE_CHECKING:
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
 _SEVERAL = 10  # targets of a known camera, of which two may be rejected
-
-
 _MINIMUM_REDUNDANCY = 6
 MAX_RELATIVE_SD_C = 0.01
 """Largest sd(c)/c of an epoch with a result."""
@@ -308,10 +306,9 @@ def adjust(
                 )
             solution = resolve(problem, solution, use)
             tests = point_tests(solution, use)
-    except GeometryError as error:
-        return failed("weak_geometry", str(error), observations, s.free)
-    except NoConvergenceError as error:
-        return failed("no_convergence", str(error), observations, s.free)
+    except (GeometryError, NoConvergenceError) as error:
+        word = "weak_geometry" if isinstance(error, GeometryError) else "no_convergence"
+        return failed(word, str(error), observations, s.free)
     return _result(problem, solution, s, use, redundancy)
 
 

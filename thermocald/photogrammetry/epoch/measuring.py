@@ -108,13 +108,14 @@ def resect(
             "that the camera is this one, with this lens and image size"
         )
         return failed("too_many_rejected", why, observations)
-    sd = float(np.sqrt(np.linalg.eigvalsh(result.covariance[10:13, 10:13])[-1]))
-    if result.ok and thin and sd > _LARGEST_SD:
-        why = (
-            "the control points lie nearly on one line, about which the camera's direction is "
-            f"known to {np.degrees(sd):.0f}° only: add one beside"
-        )
-        return failed("no_orientation", why, observations)
+    if result.ok and thin:
+        sd = float(np.sqrt(np.linalg.eigvalsh(result.covariance[10:13, 10:13])[-1]))
+        if sd > _LARGEST_SD:
+            why = (
+                "the control points lie nearly on one line, about which the camera's direction is "
+                f"known to {np.degrees(sd):.0f}° only: add one beside"
+            )
+            return failed("no_orientation", why, observations)
     if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
         why = (
             "the control points lie in one plane, and a second, mirrored pose fits nearly as "

@@ -132,7 +132,7 @@ def adjust_common_interior(
         return replace(rest, left_out=left_out | more)
     bundle, part, found, used, redundancy = _snooped(every, bundle, used, few, s)
     variance = part.cost(bundle, part.residuals(bundle), np.ones(len(part.rays))) / redundancy
-    # the image points' own: targets that are better than stated would lower the noise of both
+    # redundancy of the image points alone: targets that are better than stated lower the variance
     own = 2 * len(part.rays) - float(np.einsum("nii->", part.explained(bundle, found)))
     noise: tuple[float, float] = variance, redundancy
     if own >= TRUSTED_REDUNDANCY:

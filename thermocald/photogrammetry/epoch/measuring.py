@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _FEWEST = 4  # control points: three have up to four poses
 _START = 0.005  # of the image's width: largest RMS residual of a start from all control points
 _THIN = 0.005  # extent across over extent along, up to which points count as one line
-_NEARLY_THIN = 0.2  # the same, up to which a pose may fail for that reason
+_NEARLY_THIN = 0.03  # the same, up to which a pose may fail for that reason
 _LARGEST_SD = np.radians(4.0)  # of the camera's direction: beyond, its covariance is not true
 _BESIDE_PX = 5.0  # an image point may be this far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # least angle of a ray to a plane; below, a pixel means metres

@@ -75,7 +75,7 @@ def before(scene: Scene, s: Any) -> SeriesInput:
     )  # fmt: skip
     device, true = replace(s.device, sensor=scene.sensor), replace(scene.field, points=scene.points)
     source = seen(replace(s, model=model, device=device, field=true))
-    return replace(source, field=scene.field, interior=model.interior.with_values(C1=0.0, C2=0.0))
+    return replace(source, field=scene.field, interior=replace(model.interior, C1=0.0, C2=0.0))
 
 
 def other_cameras(draws: int, rng: np.random.Generator) -> list[Row]:

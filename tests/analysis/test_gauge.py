@@ -43,7 +43,7 @@ def thermal_camera(tau: float | None = None) -> ThermalCamera:
     return ThermalCamera(
         ThermalModel(
             name="gauge", camera="gauge", sensor=Sensor(*SIZE, PITCH), T0=20.0,
-            interior=InteriorOrientation.from_mapping(CAMERA), rates=RATES, effects=effects,
+            interior=InteriorOrientation(**CAMERA), rates=RATES, effects=effects,
             validity={"temperature": (-5.0, 45.0)}, covariance=covariance,
             covariance_names=tuple(parameters),
         )

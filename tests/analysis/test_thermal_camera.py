@@ -57,8 +57,9 @@ def test_covariance_against_draws():
     values = []
     for draw in draws:
         change = dict(zip(names, draw, strict=True))
-        interior = model.interior.with_values(
-            **{n: getattr(model.interior, n) + change[f"interior.{n}"] for n in ("c", "x0", "y0")}
+        interior = replace(
+            model.interior,
+            **{n: getattr(model.interior, n) + change[f"interior.{n}"] for n in ("c", "x0", "y0")},
         )
         rates = {n: model.rates[n] + change[f"rates.{n}"] for n in ("c", "x0", "y0")}
         listed = tuple(

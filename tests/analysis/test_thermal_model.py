@@ -277,7 +277,7 @@ def test_correlated_constants_are_reported_by_slope_and_curvature():
 def test_an_unstated_affinity_is_reported_and_estimated(tmp_path):
     """fx and fy of a phone differ by 0.3 %; a held affinity gives rates 6 to 20 sds off."""
     s = simulated(11, epochs=60, listed=())
-    s = replace(s, model=replace(s.model, interior=s.model.interior.with_values(C1=3e-3)))
+    s = replace(s, model=replace(s.model, interior=replace(s.model.interior, C1=3e-3)))
     s.write(tmp_path / "M1")
     series = tc.open(tmp_path / "M1")
     text = " ".join(series.calibrate().lines())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -122,7 +123,7 @@ def written(path, camera, C=None):
 
 def test_two_cameras_differ_by_what_was_put_in(tmp_path):
     """A principal point moved by 1 px moves every point by 1 px; a rotation absorbs most of it."""
-    moved = COLD.with_values(x0=COLD.x0 + SENSOR.pixel_pitch)
+    moved = replace(COLD, x0=COLD.x0 + SENSOR.pixel_pitch)
     a = written(tmp_path / "a.json", COLD, covariance(1))
     b = written(tmp_path / "b.json", moved, covariance(2))
     document = json.loads(call("camera", "diff", a, b, "--json", "-").stdout)

@@ -14,6 +14,8 @@ from PIL import Image
 
 from tests.commands import call
 from tests.daemon.conftest import fast_run, make_recording, replayed_camera
+from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.analysis.thermal.thermal_camera import load_camera
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.testfield_file import read_testfield
@@ -189,6 +191,20 @@ def test_check_says_what_the_control_points_are_worth(river):
     assert done.returncode == 0, done.stderr
     assert "camera bridge: 10 control points, 10 within the reference frame, sigma0" in done.stdout
     assert "the interior orientation alone" in call("check", river / "bank.yaml").stdout
+
+
+def test_check_doubts_names_that_a_symmetry_leaves_untested(river):
+    """Four points in a rectangle, which a turn by 180° puts on each other."""
+    file, camera = river / "gcp.csv", load_camera(river / "camera.thermal.yaml").at(20.0)
+    control = ControlPoints.read(file, "m")
+    corners = [[-4e3, 1e4, 0.0], [4e3, 1e4, 9e2], [4e3, 16e3, 0.0], [-4e3, 16e3, 9e2]]
+    corners = np.add(corners, [0.0, 0.0, 139e3])
+    seen = camera.project(corners, control.pose(camera).values[10:])
+    table = np.column_stack([(corners + control.origin) / 1000, np.full((4, 3), 0.01), seen])
+    rows = [",".join(map(str, (f"g{i}", *row, 1, 1))) for i, row in enumerate(table.tolist())]
+    file.write_text("\n".join([file.read_text().splitlines()[0], *rows]) + "\n")
+    said = call("check", river / "bridge.yaml").stdout
+    assert "doubtful: the control points fit as well with g2, g3, g0, g1 named g0, g1" in said
 
 
 def test_a_reference_frame_of_another_size_and_clicks_of_another_image_are_said(river):

@@ -32,13 +32,14 @@ def pyorc():
     return pytest.importorskip("pyorc", reason="pip install pyopenrivercam")
 
 
-def configuration(path: Path, n: int = 8) -> tuple[Path, np.ndarray]:
+def configuration(path: Path, n: int = 8, points=None) -> tuple[Path, np.ndarray]:
     """A site in a national grid, clicked when the camera was cold; also its true points in mm."""
     rng = np.random.default_rng(1)
-    y = rng.uniform(8_000, 28_000, n)
-    points = np.column_stack(
-        [np.where(np.arange(n) % 2, 0.3, -0.3) * y, y, rng.uniform(-200, 2_500, n)]
-    )
+    if points is None:
+        y = rng.uniform(8_000, 28_000, n)
+        points = np.column_stack(
+            [np.where(np.arange(n) % 2, 0.3, -0.3) * y, y, rng.uniform(-200, 2_500, n)]
+        )
     warm = {"c": 0.4e-3, "x0": 0.35e-3, "y0": -0.2e-3}
     interior = {k: CAMERA[k] + warm[k] * (WARM - 20.0) for k in warm}
     src = project(points, POSE, **interior)
@@ -76,6 +77,17 @@ def test_the_camera_is_the_warm_one_and_all_else_stays(tmp_path):
     )  # fmt: skip
     # the iteration ends with a step that is small against 20 mm
     assert seen[:, 0] == pytest.approx(src, abs=0.05)
+
+
+def test_names_that_a_symmetry_leaves_untested_are_doubted(tmp_path):
+    write_model(tmp_path / "model.yaml")
+    corners = [[-3e3, 1e4, 0.0], [3e3, 1e4, 9e2], [3e3, 2e4, 0.0], [-3e3, 2e4, 9e2]]
+    old, _ = configuration(tmp_path / "site.json", points=np.array(corners))
+    done = finish(
+        "camera", "at", tmp_path / "model.yaml", "--temperature", WARM, "--to", "pyorc", "--renew",
+        old, "-o", tmp_path / "warm.json",
+    )  # fmt: skip
+    assert "doubtful: the control points fit as well with gcp2, gcp3" in done.stdout
 
 
 def assert_projects(read, path: Path, points: np.ndarray, ours: np.ndarray) -> None:

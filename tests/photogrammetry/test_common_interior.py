@@ -14,7 +14,6 @@ from tests.photogrammetry.exact_rendering import look_at
 from tests.photogrammetry.network_cases import looking_at
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import (
-    PRINCIPAL,
     CameraSpec,
     InteriorOrientation,
     Sensor,
@@ -70,7 +69,7 @@ def adjusted(field, measured, stations=STATIONS, c=3.0, sensor=scene.SENSOR):
 
 
 def errors(draws: int, seed: int, **drawn):
-    """Yield each draw's result, its stations, and error over sd of c, x0, y0."""
+    """Yield each draw's result, its stations, and error over sd of c, x0, y0, A1, A2, A3."""
     for k in range(draws):
         rng = np.random.default_rng([seed, k])
         stations = STATIONS
@@ -81,15 +80,15 @@ def errors(draws: int, seed: int, **drawn):
             ]
         known, measured = photographs(rng, 0.05, stations=stations, **drawn)
         r = adjust_common_interior(scene.SENSOR, known, measured, scene.INTERIOR, stations)
-        sd = np.sqrt(np.diag(r.covariance))[PRINCIPAL]
-        yield r, stations, (r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / sd
+        sd = np.sqrt(np.diag(r.covariance))[:6]
+        yield r, stations, (r.interior.as_array() - scene.INTERIOR.as_array())[:6] / sd
 
 
 def test_the_camera_is_as_accurate_as_stated():
-    """In 24 draws of field and image noise; benchmarks.audit has more."""
-    found, _, z = zip(*errors(24, 7, step=4), strict=True)
+    """In 16 draws of field and image noise; benchmarks.audit has more."""
+    found, _, z = zip(*errors(16, 7, step=4), strict=True)
     rms = np.sqrt(np.mean(np.square(z), axis=0))
-    assert rms == pytest.approx(np.ones(3), abs=3 / np.sqrt(2 * 24))
+    assert rms == pytest.approx(np.ones(6), abs=3 / np.sqrt(2 * 16))
     assert np.mean([r.sigma0 for r in found]) == pytest.approx(1.0, abs=0.03)
 
 
@@ -106,7 +105,7 @@ def test_the_camera_is_as_accurate_as_stated_if_the_focus_moves_between_photogra
         off.append((found - true) / np.sqrt(variances))
         assert r.disagreement > 1.5
         assert r.sigma0 < 1.5
-    assert np.sqrt(np.mean(np.square(z), axis=0)) == pytest.approx(np.ones(3), abs=0.6)
+    assert np.sqrt(np.mean(np.square(z), axis=0))[:3] == pytest.approx(np.ones(3), abs=0.6)
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.3)
 
 
@@ -122,6 +121,21 @@ def _of_board(tilt: float, c: float, rng, points=BOARD.points, sigma: float = 0.
     seen = np.flatnonzero(SENSOR.contains(image))
     image = image[seen] + rng.normal(0, sigma, (len(seen), 2))
     return Observations(seen, image, np.full(image.shape, sigma)), station
+
+
+def test_targets_that_are_better_than_stated_do_not_lower_the_standard_deviations():
+    """Their small corrections lowered sigma0: in 30 draws, A3 was off by 1.4 standard deviations.
+
+    They are larger than with exactly known targets, up to the chance of the estimated noise.
+    """
+    rng = np.random.default_rng(11)
+    seen = [_of_board(rng.uniform(0.3, 0.7), 2.8, rng) for _ in range(4)]
+    exact = replace(BOARD, sigmas=np.zeros_like(BOARD.sigmas))
+    doubtful, sure = (
+        np.diag(adjusted(field, *zip(*seen, strict=True), 2.8, SENSOR).covariance)[:8]
+        for field in (BOARD, exact)
+    )
+    assert np.sqrt(doubtful / sure).min() > 0.85
 
 
 def test_a_photograph_of_another_zoom_is_left_out():

@@ -133,7 +133,7 @@ def test_a_mirrored_frame_is_called_so(frame):
 def test_all_targets_are_measured_after_a_large_drift(frame):
     """30 px of the principal point and 1 % of c, as after a day in the sun."""
     i = SMALL_CAMERA.interior
-    earlier = i.with_values(c=i.c * 0.99, x0=i.x0 + 30 * SMALL_SENSOR.pixel_pitch)
+    earlier = replace(i, c=i.c * 0.99, x0=i.x0 + 30 * SMALL_SENSOR.pixel_pitch)
     found = measure(frame, FIELD, CameraSpec("", SMALL_SENSOR, interior=earlier))
     assert len(found.observations) == VISIBLE
     assert np.abs(_z(found.observations, _truth())).max() < 5

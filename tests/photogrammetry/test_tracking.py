@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ def _shifted(px: float) -> CameraModel:
     """Return the camera with its principal point drifted by `px` in x and half as much in y."""
     shift = px * SMALL_SENSOR.pixel_pitch
     i = SMALL_CAMERA.interior
-    return CameraModel(SMALL_SENSOR, i.with_values(x0=i.x0 + shift, y0=i.y0 - shift / 2))
+    return CameraModel(SMALL_SENSOR, replace(i, x0=i.x0 + shift, y0=i.y0 - shift / 2))
 
 
 @pytest.fixture

@@ -300,7 +300,7 @@ def test_the_covariance_equals_differences(distortion):
         value = base.value(name) + step
         if name.startswith("interior"):
             key = name.removeprefix("interior.")
-            m = replace(base, interior=INTERIOR.with_values(**{key: value}))
+            m = replace(base, interior=replace(INTERIOR, **{key: value}))
         else:
             m = base.with_values({name: value})
         return np.array([camera.values for camera in cameras(m)])

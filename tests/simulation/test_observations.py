@@ -108,7 +108,7 @@ def test_another_camera_is_refused():
 
 def test_a_view_without_targets_is_refused():
     s = simulation()
-    away = s.model.exterior.with_values(kappa=0.0, phi=3.0)
+    away = replace(s.model.exterior, kappa=0.0, phi=3.0)
     with pytest.raises(GeometryError, match="the camera sees 0 of 147 targets"):
         next(replace(s, model=replace(s.model, exterior=away)).observations())
 

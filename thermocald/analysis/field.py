@@ -26,7 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.epoch.adjustment import GeometryBounds, image_coverage, weaknesses
+from thermocald.photogrammetry.epoch.adjustment import image_coverage, weaknesses
 from thermocald.photogrammetry.field.testfield import field_normals, plane_fit
 from thermocald.photogrammetry.linalg import scaled_inverse, unit_diagonal
 from thermocald.photogrammetry.targets.outline import facing, local_maps
@@ -272,9 +272,7 @@ def check_field(
     covariance[np.ix_(_USED, _USED)] = scaled_inverse(
         _normal_matrix(A, np.eye(2) * sigma_px**2), 1e-13
     )
-    weak = weaknesses(
-        camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
-    )
+    weak = weaknesses(camera.sensor, points, image, values, covariance)
     depth = -((points - station.centre) @ station.rotation)[:, 2]
     _, axes, _ = plane_fit(points)
     w, h = camera.sensor.width, camera.sensor.height

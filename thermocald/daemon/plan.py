@@ -18,7 +18,7 @@ from thermocald.config import parse_config
 from thermocald.errors import ConfigurationError, RecordingError
 from thermocald.hal import load_driver, open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, GeometryBounds
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
@@ -99,7 +99,7 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
                 free=tuple(calibration.free),
                 priors={name: (p.value, p.sd) for name, p in calibration.priors.items()},
                 snooping_alpha=calibration.snooping_alpha,
-                bounds=GeometryBounds(correlation=calibration.correlation_bound),
+                correlation_bound=calibration.correlation_bound,
             ),
             nominal_c=one.principal_distance_mm,
             interior=_held(one, calibration),
@@ -178,7 +178,7 @@ def _held(one: CameraConfig, calibration: CalibrationConfig) -> InteriorOrientat
                 f"camera {one.name!r}: `fixed` also needs principal_distance_mm, or c in `fixed`"
             )
         values["c"] = one.principal_distance_mm
-    return InteriorOrientation.from_mapping(values)
+    return InteriorOrientation(**values)
 
 
 def series_head(

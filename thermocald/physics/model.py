@@ -268,7 +268,7 @@ class ThermalModel:
         )
         return replace(
             self,
-            interior=self.interior.with_values(**own.get("interior", {})),
+            interior=replace(self.interior, **own.get("interior", {})),
             rates={**self.rates, **own.get("rates", {})},
             effects=effects,
         )

@@ -27,7 +27,6 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import (
     AdjustmentSettings,
-    GeometryBounds,
     adjust,
     cold_start,
 )
@@ -191,7 +190,6 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
 
 
 _MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image's points
-_ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
 def _make_settings(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
@@ -199,7 +197,7 @@ def _make_settings(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSet
     c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
     spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
     priors = {n: (0.0, sd) for n, sd in zip(IOP_NAMES[3:], spreads, strict=True) if n in names}
-    return AdjustmentSettings(names, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
+    return AdjustmentSettings(names, priors, max_rejected=0.9, correlation_bound=None)
 
 
 def linearise_series(source: SeriesInput) -> Partials:

@@ -288,7 +288,7 @@ def _first_camera(
         start = approximate_orientation(camera.sensor, points, o.points, nominal)[0]
     if not first.ok and camera.interior is None:
         # distortion from a weak photograph is a bad initial value for the others
-        start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
+        start = replace(start, A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
     return start
 
 

@@ -142,7 +142,7 @@ def estimate_level(
     moved = inverse[:n] @ (lever * field.sigmas.ravel())
     of_field = moved @ moved.T
     if interior:
-        stated = series[0].source.interior or models[0].interior.with_values(C1=0.0, C2=0.0)
+        stated = series[0].source.interior or replace(models[0].interior, C1=0.0, C2=0.0)
         off = shared[_AFFINITY] - stated.as_array()[_AFFINITY]
         noise = inverse[np.ix_(_AFFINITY, _AFFINITY)]
         if off @ np.linalg.solve(noise + of_field[np.ix_(_AFFINITY, _AFFINITY)], off) < _SHOWN:

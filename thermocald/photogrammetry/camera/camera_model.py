@@ -19,7 +19,7 @@ El-Hakim (1986).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -28,7 +28,7 @@ import numpy as np
 from thermocald.errors import GeometryError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from numpy.typing import ArrayLike
 
@@ -120,15 +120,6 @@ class _Parameters:
         """Build from a vector: the inverse of `as_array`."""
         return cls(*np.asarray(values, dtype=float).tolist())
 
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, float]) -> Self:
-        """Build from a mapping by name; missing names get their defaults."""
-        return cls(**{f.name: float(values[f.name]) for f in fields(cls) if f.name in values})  # type: ignore[arg-type]
-
-    def with_values(self, **changes: float) -> Self:
-        """Return a copy with some values changed."""
-        return replace(self, **changes)  # type: ignore[type-var]
-
 
 @dataclass(frozen=True, slots=True)
 class InteriorOrientation(_Parameters):
@@ -219,7 +210,7 @@ class CameraSpec:
             inner.only(IOP_NAMES)
             inner.number("c", "mm", above=0.0, low=1e-3, high=1e5)
             known = {k: inner.finite(k, v) for k, v in inner.mapping.items() if v is not None}
-            interior = InteriorOrientation.from_mapping(known)
+            interior = InteriorOrientation(**known)
         return cls(reader.text("name", name), sensor, distance, interior)
 
 

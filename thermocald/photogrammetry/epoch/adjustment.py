@@ -57,31 +57,21 @@ from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.orientation import approximate_orientation, resection
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Mapping
+    from collections.abc import Collection, Mapping
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
 _SEVERAL = 10  # targets of a known camera, of which two may be rejected
-
-
-@dataclass(frozen=True, slots=True)
-class GeometryBounds:
-    """Bounds beyond which an epoch's geometry is weak.
-
-    minimum_redundancy: of the adjustment; correlation: largest |coefficient| of two estimated
-    parameters; relative_sd_c: sd(c)/c; sd_point_px: sd of x0, y0; coverage: share of the image
-    inside the targets' convex hull; plane_obliqueness_deg: angle between the optical axis and the
-    normal of a plane field.
-    """
-
-    minimum_redundancy: int = 6
-    correlation: float = 0.9999
-    relative_sd_c: float = 0.01
-    sd_point_px: float = 25.0
-    coverage: float = 0.10
-    plane_obliqueness_deg: float = 15.0
+_MINIMUM_REDUNDANCY = 6
+MAX_RELATIVE_SD_C = 0.01
+"""Largest sd(c)/c of an epoch with a result."""
+MAX_SD_POINT_PX = 25.0
+"""Largest sd of x0 and y0."""
+MIN_COVERAGE = 0.10
+"""Smallest share of the image inside the targets' convex hull."""
+_MIN_OBLIQUENESS_DEG = 15.0  # angle between the optical axis and the normal of a plane field
 
 
 def image_coverage(sensor: Sensor, image_points: Array) -> float:
@@ -104,73 +94,69 @@ def weaknesses(
     image_points: Array,
     values: Array,
     covariance: Array,
-    free: Iterable[str],
-    bounds: GeometryBounds,
+    free: Collection[str] = DEFAULT_FREE,
+    correlation_bound: float | None = 0.9999,
 ) -> list[str]:
     """Return the reasons why the geometry does not determine the free IOP; empty if it does.
 
     points (n, 3) mm and image_points (n, 2) px of the targets used; values (16,) and covariance
-    (16, 16) of the adjustment. Held parameters are not tested: a pose alone needs far less.
+    (16, 16) of the adjustment; correlation_bound: of an IOP with any parameter. Held parameters are
+    not tested: a pose alone needs far less. None: nothing is.
     """
+    if correlation_bound is None:
+        return []
     sd = np.sqrt(covariance.diagonal())
-    free = set(free)
-    reasons = uncertain(sensor, values, sd, free, bounds)
-    if "c" in free and not _has_depth(points):
+    reasons = uncertain(sensor, values, sd, free)
+    if "c" in free:
         _, axes, flat = plane_fit(points)
         angle = obliqueness_deg(values[EOP], axes[2])
-        if flat and angle < bounds.plane_obliqueness_deg:
+        if flat and angle < _MIN_OBLIQUENESS_DEG:
             reasons.append(
                 f"one plane seen at {angle:.0f}° from frontal (at least "
-                f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
+                f"{_MIN_OBLIQUENESS_DEG:.0f}° are needed): principal distance and "
                 "distance to the field cannot be separated"
             )
-    if free & {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}:
-        coverage = image_coverage(sensor, image_points)
-        if coverage < bounds.coverage:
-            reasons.append(
-                f"the targets cover {percent(coverage, 1)} of the image (at least "
-                f"{percent(bounds.coverage)} are needed)"
-            )
+    if {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}.intersection(free):
+        reasons += little_covered(sensor, image_points, "the targets cover {} of the image")
     # only pairs with an IOP: correlated EOP do no harm to the camera
     scale = 1.0 / np.where(sd > 0, sd, np.inf)
     inner = np.abs(covariance[: len(IOP_NAMES)] * scale) * scale[: len(IOP_NAMES), None]
     inner.flat[:: len(sd) + 1] = 0.0
     i, j = divmod(int(inner.argmax()), len(sd))
-    if inner[i, j] > bounds.correlation:
+    if inner[i, j] > correlation_bound:
         reasons.append(
             f"{PARAMETER_NAMES[i]} and {PARAMETER_NAMES[j]} correlate at {inner[i, j]:.5f} "
-            f"(bound {bounds.correlation})"
+            f"(bound {correlation_bound})"
         )
     return reasons
 
 
-def uncertain(
-    sensor: Sensor, values: Array, sd: Array, free: Container[str], bounds: GeometryBounds
-) -> list[str]:
+def little_covered(sensor: Sensor, image_points: Array, sentence: str) -> list[str]:
+    """Return the sentence, with the share in place of {}, if image points cover too little."""
+    coverage = image_coverage(sensor, image_points)
+    if coverage >= MIN_COVERAGE:
+        return []
+    least = f" (at least {percent(MIN_COVERAGE)} are needed)"
+    return [sentence.format(percent(coverage, 1)) + least]
+
+
+def uncertain(sensor: Sensor, values: Array, sd: Array, free: Collection[str]) -> list[str]:
     """Return a reason for each of c, x0 and y0 that is free and has an sd beyond its bound.
 
     values, sd (16,): of the adjustment.
     """
     reasons = []
     share = sd[0] / values[0]
-    if "c" in free and share > bounds.relative_sd_c:
+    if "c" in free and share > MAX_RELATIVE_SD_C:
         known = f"is known to {percent(share, 1)} only" if share < 1 else "is not determined"
-        reasons.append(f"the principal distance {known} (bound {percent(bounds.relative_sd_c, 1)})")
+        reasons.append(f"the principal distance {known} (bound {percent(MAX_RELATIVE_SD_C, 1)})")
     for name, column in (("x0", 1), ("y0", 2)):
         size = sd[column] / sensor.pixel_pitch
-        if name in free and size > bounds.sd_point_px:
+        if name in free and size > MAX_SD_POINT_PX:
             inside = size < max(sensor.width, sensor.height)
             known = f"is known to {size:.0f} px only" if inside else "is not determined"
-            reasons.append(f"{name} {known} (bound {bounds.sd_point_px:.0f} px)")
+            reasons.append(f"{name} {known} (bound {MAX_SD_POINT_PX:.0f} px)")
     return reasons
-
-
-def _has_depth(points: Array) -> bool:
-    """Return whether points are certainly not in one plane: a quick test before `plane_fit`."""
-    reduced = points - np.full(len(points), 1.0 / len(points)) @ points
-    (a, b, c), (_, d, e), (_, _, f) = (points.T @ reduced).tolist()
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    return bool(determinant > 1e-4 * (a + d + f) ** 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,14 +165,15 @@ class AdjustmentSettings:
 
     free: names of the IOP to estimate, the others keep their start values; priors: {name: (value,
     sd)} in the parameter's unit; snooping_alpha: error probability of a single test, 0 for no
-    snooping; max_rejected: share of rejected targets beyond which the epoch fails.
+    snooping; max_rejected: share of rejected targets beyond which the epoch fails;
+    correlation_bound: of `weaknesses`, None if any geometry will do.
     """
 
     free: tuple[str, ...] = DEFAULT_FREE
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     snooping_alpha: float = 0.0005
     max_rejected: float = 0.35
-    bounds: GeometryBounds = field(default_factory=GeometryBounds)
+    correlation_bound: float | None = 0.9999
 
     def __post_init__(self) -> None:
         for name in (*self.free, *self.priors):
@@ -194,6 +181,11 @@ class AdjustmentSettings:
                 raise ConfigurationError(
                     f"{name!r} is not a parameter; choose from {', '.join(PARAMETER_NAMES)}"
                 )
+
+    @property
+    def minimum_redundancy(self) -> int:
+        """Smallest redundancy of a result."""
+        return 0 if self.correlation_bound is None else _MINIMUM_REDUNDANCY
 
     @property
     def unknowns(self) -> Index:
@@ -281,17 +273,15 @@ def adjust(
     unknowns = s.unknowns
     n = len(observations)
     redundancy = _redundancy(n, s, len(unknowns), known is not None)
-    if redundancy < s.bounds.minimum_redundancy:
+    if redundancy < s.minimum_redundancy:
         return _refuse_few(observations, s, redundancy)
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    before = None
-    if known is not None or s.priors:
-        before = start.copy(), np.zeros((16, 16))
-        before[1][IOP, IOP] = 0.0 if known is None else known
-        for name, (value, sd) in s.priors.items() if known is None else ():
-            k = PARAMETER_NAMES.index(name)
-            before[0][k], before[1][k, k] = value, sd**2
-    problem = Problem.build(sensor, testfield, observations, unknowns, before)
+    before, covariance = start.copy(), np.zeros((16, 16))
+    covariance[IOP, IOP] = 0.0 if known is None else known
+    for name, (value, sd) in s.priors.items() if known is None else ():
+        k = PARAMETER_NAMES.index(name)
+        before[k], covariance[k, k] = value, sd**2
+    problem = Problem.build(sensor, testfield, observations, unknowns, before, covariance)
     use = np.ones(n, dtype=bool) if suspects is None else ~suspects
     most = most_rejected(s.max_rejected, 2 * n - len(unknowns))
     if known is not None and n >= _SEVERAL:  # eight points are left for six unknowns
@@ -316,10 +306,9 @@ def adjust(
                 )
             solution = resolve(problem, solution, use)
             tests = point_tests(solution, use)
-    except GeometryError as error:
-        return failed("weak_geometry", str(error), observations, s.free)
-    except NoConvergenceError as error:
-        return failed("no_convergence", str(error), observations, s.free)
+    except (GeometryError, NoConvergenceError) as error:
+        word = "weak_geometry" if isinstance(error, GeometryError) else "no_convergence"
+        return failed(word, str(error), observations, s.free)
     return _result(problem, solution, s, use, redundancy)
 
 
@@ -334,7 +323,7 @@ def _refuse_few(observations: Observations, s: AdjustmentSettings, redundancy: i
     return failed(
         "too_few_targets",
         f"{len(observations)} targets for {len(s.unknowns)} unknowns leave a redundancy of "
-        f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed: show more targets or "
+        f"{redundancy}; at least {s.minimum_redundancy} is needed: show more targets or "
         "hold parameters fixed",
         observations,
         s.free,
@@ -380,14 +369,13 @@ def _result(
         )
         return replace(result, status="global_test", reason=why)
     reasons = weaknesses(
-        problem.sensor, points, observed, solution.values, covariance, s.free, s.bounds
+        problem.sensor, points, observed, solution.values, covariance, s.free, s.correlation_bound
     )
     if reasons:
         return replace(result, status="weak_geometry", reason="; ".join(reasons))
     return result
 
 
-NO_BOUNDS = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 _FEWEST_FOR_POSE = 8  # two markers: one alone has two poses and little redundancy
 _AMBIGUITY = 2.0  # a second pose is excluded if its residuals are this many times as large
 _GROSS = 6.0  # times the median residual; a target beyond it is left out at first
@@ -396,7 +384,7 @@ _GROSS = 6.0  # times the median residual; a target beyond it is left out at fir
 def with_few_free(s: AdjustmentSettings) -> AdjustmentSettings:
     """Return settings for a start: only c and A1, as far as they are free, without any bounds."""
     few = tuple(name for name in ("c", "A1") if name in s.free)
-    return replace(s, free=few, bounds=NO_BOUNDS, priors={})
+    return replace(s, free=few, correlation_bound=None, priors={})
 
 
 def cold_start(
@@ -417,7 +405,7 @@ def cold_start(
     if len(observations) == 0:
         return failed("no_observations", "no target was measured", observations, s.free)
     redundancy = _redundancy(len(observations), s, len(s.unknowns))
-    if redundancy < s.bounds.minimum_redundancy:  # few targets may have no orientation either
+    if redundancy < s.minimum_redundancy:  # few targets may have no orientation either
         return _refuse_few(observations, s, redundancy)
     points = testfield.points[observations.targets]
     try:

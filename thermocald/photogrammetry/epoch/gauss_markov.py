@@ -60,27 +60,23 @@ class Whitening:
     """Multiplication by the inverse Cholesky factors of the points' covariances.
 
     factor (2, n) px⁻¹: one over the diagonal of the Cholesky factors; slope (n,): regression of y
-    on x, None if x and y are uncorrelated in all points.
+    on x.
     """
 
     factor: Array
-    slope: Array | None
+    slope: Array
 
     @classmethod
     def build(cls, covariance: Array) -> Whitening:
         """Build the whitening of points with covariances (n, 3) px²: xx, yy, xy."""
-        xy = covariance[:, 2]
-        variances, slope = covariance.T[:2], None
-        if xy.any():
-            slope = xy / covariance[:, 0]
-            variances = variances.copy()
-            variances[1] -= slope * xy
+        slope = covariance[:, 2] / covariance[:, 0]
+        variances = covariance.T[:2].copy()
+        variances[1] -= slope * covariance[:, 2]
         return cls(1.0 / np.sqrt(variances), slope)
 
     def whiten(self, pairs: Array) -> Array:
         """Whiten x and y (..., 2, n) in place."""
-        if self.slope is not None:
-            pairs[..., 1, :] -= self.slope * pairs[..., 0, :]
+        pairs[..., 1, :] -= self.slope * pairs[..., 0, :]
         pairs *= self.factor
         return pairs
 
@@ -101,7 +97,7 @@ class Problem:
 
     points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
     unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight (u, u), prior_value (u,): parameters
-    observed beforehand, with weight 0 for the others; both empty if none was.
+    observed beforehand, with weight 0 for the others; no weight if none was.
     """
 
     sensor: Sensor
@@ -119,26 +115,27 @@ class Problem:
         field: TestField,
         observations: Observations,
         unknowns: Index,
-        known: tuple[Array, Array] | None = None,
+        values: Array,
+        covariance: Array,
     ) -> Problem:
         """Collect the inputs of the iteration.
 
-        known: values (16,) and covariance (16, 16) of parameters that were observed beforehand.
+        values (16,), covariance (16, 16): of parameters observed beforehand, 0 for the others.
         """
-        weight = value = np.empty(0)
-        if known is not None:
-            weight = np.zeros((len(unknowns), len(unknowns)))
-            value, variances = known[0][unknowns], known[1].diagonal()[unknowns]
-            some = np.flatnonzero(variances > 0)
+        weight, variances = np.empty(0), covariance.diagonal()[unknowns]
+        some = np.flatnonzero(variances > 0)
+        if len(some):
+            weight = np.zeros((len(unknowns),) * 2)
             # a combination with almost no variance gets an sd of 1e-4 of its parameters' sds
             scale, among = np.sqrt(variances[some]), unknowns[some]
-            covariance = known[1][np.ix_(among, among)]
-            share, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+            scaled = covariance[np.ix_(among, among)] / np.outer(scale, scale)
+            share, vectors = np.linalg.eigh(scaled)
             rows = (vectors / np.sqrt(np.maximum(share, _SINGULAR))) / scale[:, None]
             weight[np.ix_(some, some)] = rows @ rows.T
         targets = observations.targets
         of_targets = field.sigmas[targets] ** 2 if field.sigmas.any() else None
-        return cls(sensor, field.points[targets], observations, of_targets, unknowns, weight, value)
+        places, value = field.points[targets], values[unknowns]
+        return cls(sensor, places, observations, of_targets, unknowns, weight, value)
 
     def sums(self, whitened: Array, use: Mask, values: Array) -> tuple[Array, Array, float]:
         """Return the normal matrix (u, u), gradient (u,) and sum of squares of the points in use.
@@ -185,8 +182,7 @@ class Solution:
     def residuals(self) -> Array:
         """Residuals (2, n) px."""
         coloured: Array = self.whitened[-1] / self.whitening.factor
-        if self.whitening.slope is not None:
-            coloured[1] += self.whitening.slope * coloured[0]
+        coloured[1] += self.whitening.slope * coloured[0]
         return coloured
 
 

@@ -10,6 +10,7 @@ Sources: Luhmann et al. (2014), sections 4.2.3 (resection) and 4.2.7 (monoplotti
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     rotation,
 )
 from thermocald.photogrammetry.epoch.adjustment import (
-    NO_BOUNDS,
     Adjustment,
     AdjustmentSettings,
     adjust,
@@ -46,8 +46,10 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
-_START = 0.005  # of the image's width: largest RMS residual of a start from four control points
+_START = 0.005  # of the image's width: largest RMS residual of a start from all control points
 _THIN = 0.005  # extent across over extent along, up to which points count as one line
+_NEARLY_THIN = 0.03  # the same, up to which a pose may fail for that reason
+_LARGEST_SD = np.radians(4.0)  # of the camera's direction: beyond, its covariance is not true
 _BESIDE_PX = 5.0  # an image point may be this far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # least angle of a ray to a plane; below, a pixel means metres
 
@@ -68,7 +70,7 @@ def resect(
     the data: without a result there are a status and a reason.
     """
     known = tuple(n for n, v in zip(IOP_NAMES, covariance.diagonal(), strict=True) if v > 0)
-    s = AdjustmentSettings(free=known, snooping_alpha=snooping_alpha, bounds=NO_BOUNDS)
+    s = AdjustmentSettings(free=known, snooping_alpha=snooping_alpha, correlation_bound=None)
     n, fewest = len(observations), _FEWEST - (start is not None)
     if n < fewest:
         return failed(
@@ -82,20 +84,23 @@ def resect(
     if (np.ptp(observations.points, axis=0) <= observations.sigmas.max()).all():
         why = "the control points are all seen at one place in the image; check x, y (px)"
         return failed("no_orientation", why, observations)
-    suspects, pose = None, start
+    suspects, pose, thin = None, start, extent[1] <= _NEARLY_THIN * extent[0]
     if pose is None:
-        try:
+        with suppress(GeometryError):
             _, pose, fits = approximate_orientation(
                 sensor, points, observations.points, interior=interior
             )
             suspects = ~fits
-        except GeometryError:
-            # of four points it draws three, whose pose may miss the fourth
-            found = resection(sensor, interior, points, observations.points)[:1]
-            pose = next((p for rms, p in found if rms <= _START * sensor.width), None)
-            if n > _FEWEST or pose is None:
-                why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
-                return failed("no_orientation", why, observations)
+        if suspects is None or suspects.any():
+            # the pose of three or four points that it draws may miss the others
+            for rms, whole in resection(sensor, interior, points, observations.points)[:1]:
+                if rms <= _START * sensor.width:
+                    pose, suspects = whole, None
+        if pose is None:
+            nearly = ", which lie nearly on one line: add one beside, or" if thin else ";"
+            belong = "check that x, y (px) belong to X, Y, Z"
+            why = f"no pose fits the {n} control points{nearly} {belong}"
+            return failed("no_orientation", why, observations)
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
     if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
         why = (
@@ -103,6 +108,14 @@ def resect(
             "that the camera is this one, with this lens and image size"
         )
         return failed("too_many_rejected", why, observations)
+    if result.ok and thin:
+        sd = float(np.sqrt(np.linalg.eigvalsh(result.covariance[10:13, 10:13])[-1]))
+        if sd > _LARGEST_SD:
+            why = (
+                "the control points lie nearly on one line, about which the camera's direction is "
+                f"known to {np.degrees(sd):.0f}° only: add one beside"
+            )
+            return failed("no_orientation", why, observations)
     if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
         why = (
             "the control points lie in one plane, and a second, mirrored pose fits nearly as "

@@ -211,9 +211,7 @@ class Observations:
             covariances[:, 0, 1],
             dict(quality),
         )
-        if (rows[1:] < rows[:-1]).any():
-            return built.select(np.argsort(rows, kind="stable"))
-        return built
+        return built.select(np.argsort(rows, kind="stable"))
 
     @classmethod
     def none(cls) -> Observations:
@@ -226,10 +224,6 @@ class Observations:
         Both must be in this order and have covariances, and no target may be in both. A quality
         that only one of them has is NaN for the other.
         """
-        if len(other) == 0:
-            return self
-        if len(self) == 0:
-            return other
         parts = self, other
         names = dict.fromkeys([*other.quality, *self.quality])
         both = Observations(

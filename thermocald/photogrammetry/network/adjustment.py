@@ -19,7 +19,8 @@ Wrobel, B. (2016): Photogrammetric Computer Vision, section 4.6.4 (test of a poi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -44,7 +45,7 @@ from thermocald.photogrammetry.network.bundle import (
 from thermocald.photogrammetry.network.start import approximate
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Container, Mapping, Sequence
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Distance, Observations
@@ -148,14 +149,14 @@ def refuse_before(
         )
     if not distances:
         reasons.append("no distance gives the scale: measure one and give --scale A B MM")
-    seen = {names[t] for t in np.unique(rays.target)}
-    for d in distances:
-        missing = [name for name in (d.a, d.b) if name not in seen]
-        if missing:
-            reasons.append(
-                f"the scale needs target {' and '.join(missing)} in at least {MIN_RAYS} photographs"
-            )
-    _refuse(reasons)
+    _refuse(reasons + _missing_ends(distances, {names[t] for t in np.unique(rays.target)}))
+
+
+def _missing_ends(distances: Sequence[Distance], seen: Container[str]) -> list[str]:
+    """Return a reason for each distance whose targets are not both determined."""
+    ends = (" and ".join(name for name in (d.a, d.b) if name not in seen) for d in distances)
+    least = f"in at least {MIN_RAYS} photographs that agree"
+    return [f"the scale needs target {missing} {least}" for missing in ends if missing]
 
 
 def refuse_weak(network: Network, found: Cofactors) -> None:
@@ -255,12 +256,9 @@ def snoop(
         part, used, photos, targets = _in_use(bundle, rays, ~rejected)
         adjustment = BundleAdjustment(sensor, used, free)
         part = adjustment.solve(part)
-        rotations, centres, points = (
-            a.copy() for a in (bundle.rotations, bundle.centres, bundle.points)
-        )
-        rotations[photos], centres[photos] = part.rotations, part.centres
-        points[targets] = part.points
-        bundle = Bundle(part.interior, rotations, centres, points)
+        bundle = deepcopy(bundle)
+        bundle.interior[:], bundle.points[targets] = part.interior, part.points
+        bundle.rotations[photos], bundle.centres[photos] = part.rotations, part.centres
         v = whole.residuals(bundle)
         explained = adjustment.explained(part, adjustment.cofactors(part))
         tests = np.sum(v * v, axis=1)
@@ -300,11 +298,10 @@ def _in_use(bundle: Bundle, rays: ImageRays, good: Mask) -> tuple[Bundle, ImageR
     """Return the photographs and targets of good rays, renumbered, and their rows before."""
     photos, photo = np.unique(rays.photo[good], return_inverse=True)
     targets, target = np.unique(rays.target[good], return_inverse=True)
-    used = ImageRays(photo, target, rays.points[good], rays.whitening[good])
     part = Bundle(
         bundle.interior, bundle.rotations[photos], bundle.centres[photos], bundle.points[targets]
     )
-    return part, used, photos, targets
+    return part, replace(rays.select(good), photo=photo, target=target), photos, targets
 
 
 def adjust_network(
@@ -354,6 +351,7 @@ def adjust_network(
         meet, least = f"{np.degrees(angle):.0f}°", f"{np.degrees(MIN_ANGLE):.0f}°"
         where = "take photographs from further to the left, right, above, and below"
         _refuse([f"the rays meet at {meet} (median), at least {least} are needed: {where}"])
+    _refuse(_missing_ends(distances, kept_names))
     adjustment = BundleAdjustment(sensor, final, free_rows)
     unknowns = len(free_rows) + 6 * len(in_use) + 3 * len(kept_names) - 7
     redundancy = 2 * len(final) - unknowns
@@ -456,12 +454,6 @@ def _scaled(
     n, m3 = len(distances), points.size
     H, r, noise = np.zeros((n, m3)), np.zeros(n), np.zeros(n)
     for i, d in enumerate(distances):
-        missing = [name for name in (d.a, d.b) if name not in index]
-        if missing:
-            raise GeometryError(
-                f"the distance {d.a}–{d.b} cannot give the scale: target {' and '.join(missing)} "
-                "was not determined; at least three photographs must show both of its ends"
-            )
         a, b = index[d.a], index[d.b]
         e = points[b] - points[a]
         length = float(np.linalg.norm(e))

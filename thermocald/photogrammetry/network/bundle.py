@@ -319,7 +319,7 @@ class BundleAdjustment:
         return total
 
     def shared_errors(
-        self, bundle: Bundle, found: Cofactors, variance: float, redundancy: int
+        self, bundle: Bundle, found: Cofactors, variance: float, redundancy: float
     ) -> SharedErrors:
         """Estimate the errors that the image points of one photograph share.
 

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.numbers import percent
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -28,7 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import (
     AdjustmentSettings,
-    image_coverage,
+    little_covered,
     obliqueness_deg,
     uncertain,
 )
@@ -133,10 +132,15 @@ def adjust_common_interior(
         return replace(rest, left_out=left_out | more)
     bundle, part, found, used, redundancy = _snooped(every, bundle, used, few, s)
     variance = part.cost(bundle, part.residuals(bundle), np.ones(len(part.rays))) / redundancy
+    # redundancy of the image points alone: targets that are better than stated lower the variance
+    own = 2 * len(part.rays) - float(np.einsum("nii->", part.explained(bundle, found)))
+    noise: tuple[float, float] = variance, redundancy
+    if own >= TRUSTED_REDUNDANCY:
+        noise = max(noise, (float(np.sum(part.residuals(bundle) ** 2)) / own, own))
     f, eops = len(free), bundle.exteriors()
     # how weak the geometry is, whatever the photographs disagree in
-    weak = _weaknesses(bundle, part, found.cameras[:f, :f] * variance, s)
-    shared = part.shared_errors(bundle, found, variance, redundancy)
+    weak = _weaknesses(bundle, part, found.cameras[:f, :f] * noise[0], s)
+    shared = part.shared_errors(bundle, found, *noise)
     Q = found.cameras * shared.noise + shared.cameras.T @ shared.cameras
     covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[:f, :f]
@@ -172,10 +176,10 @@ def _snooped(
         part = BundleAdjustment(every.sensor, rays.select(used), every.free, every.known)
         n = len(part.rays)
         redundancy = 2 * n - len(every.free) - 6 * len(bundle.rotations)
-        if redundancy < s.bounds.minimum_redundancy:
+        if redundancy < s.minimum_redundancy:
             raise GeometryError(
                 f"{n} image points in {len(bundle.rotations)} photographs leave a redundancy of "
-                f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
+                f"{redundancy}; at least {s.minimum_redundancy} is needed"
             )
         bundle = part.solve(bundle, iterations=_ITERATIONS)
         found = part.cofactors(bundle)
@@ -262,12 +266,8 @@ def _weaknesses(
                 "distance and distance to the field cannot be separated, however small the "
                 "residuals are"
             )
-    coverage = image_coverage(adjustment.sensor, adjustment.rays.points)
-    if coverage < s.bounds.coverage:
-        reasons.append(
-            f"the targets cover {percent(coverage, 1)} of the image in all photographs together "
-            f"(at least {percent(s.bounds.coverage)} are needed)"
-        )
+    sentence = "the targets cover {} of the image in all photographs together"
+    reasons += little_covered(adjustment.sensor, adjustment.rays.points, sentence)
     sd = np.zeros(16)
     sd[adjustment.free] = np.sqrt(np.diag(Q))
-    return reasons + uncertain(adjustment.sensor, bundle.interior, sd, s.free, s.bounds)
+    return reasons + uncertain(adjustment.sensor, bundle.interior, sd, s.free)

@@ -31,7 +31,11 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
     free_columns,
 )
-from thermocald.photogrammetry.epoch.adjustment import weaknesses
+from thermocald.photogrammetry.epoch.adjustment import (
+    MAX_RELATIVE_SD_C,
+    MAX_SD_POINT_PX,
+    weaknesses,
+)
 from thermocald.photogrammetry.epoch.gauss_markov import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
@@ -370,7 +374,7 @@ def judge_epochs(
     """
     sensor, testfield, grid, s = series.sensor, series.testfield, series.grid, series.s
     values, use = estimate.values.copy(), estimate.system.use
-    observed, bounds = grid.observed, s.bounds
+    observed = grid.observed
     offered, used = observed.sum(axis=1), use.sum(axis=1)
     status, reasons = ["ok"] * len(use), [""] * len(use)
 
@@ -412,14 +416,14 @@ def judge_epochs(
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     c, pitch = values[:, 0], sensor.pixel_pitch
     fail(
-        np.sqrt(np.maximum(variance[:, 0], 0.0)) > bounds.relative_sd_c * c,
+        np.sqrt(np.maximum(variance[:, 0], 0.0)) > MAX_RELATIVE_SD_C * c,
         "weak_geometry",
-        f"the principal distance is known to worse than {percent(bounds.relative_sd_c, 1)}",
+        f"the principal distance is known to worse than {percent(MAX_RELATIVE_SD_C, 1)}",
     )
     fail(
-        np.sqrt(variance[:, PRINCIPAL_POINT].max(axis=1).clip(0.0)) > bounds.sd_point_px * pitch,
+        np.sqrt(variance[:, PRINCIPAL_POINT].max(axis=1).clip(0.0)) > MAX_SD_POINT_PX * pitch,
         "weak_geometry",
-        f"the principal point is known to worse than {bounds.sd_point_px:.0f} px",
+        f"the principal point is known to worse than {MAX_SD_POINT_PX:.0f} px",
     )
     # The best epoch's geometry stands for all; only epochs with few targets are tested one by one.
     ever = use.any(axis=0).sum()
@@ -431,7 +435,7 @@ def judge_epochs(
         seen = use[row]
         weak = weaknesses(
             sensor, testfield.points[seen], grid.points[row, seen], values[row], covariance[row],
-            s.free, bounds,
+            s.free, s.correlation_bound,
         )  # fmt: skip
         if weak:
             rows = np.full(len(use), row == typical)

@@ -226,4 +226,4 @@ class SeriesAdjustment:
 def enough_targets(grid: ObservationGrid, s: SeriesSettings) -> Mask:
     """Return a mask (E,) of the epochs with enough targets for their own parameters."""
     count = 2 * grid.observed.sum(axis=1) - s.carried
-    return np.asarray(count >= s.bounds.minimum_redundancy)
+    return np.asarray(count >= s.minimum_redundancy)

@@ -323,11 +323,17 @@ def build_camera(
 
 
 def _find_ranges(series: Sequence[ReducedSeries]) -> dict[str, tuple[float, float]]:
-    """Return the lowest and the highest reading of each thermometer, °C, to 0.1 K outwards."""
+    """Return the lowest and the highest reading of each thermometer, °C, to 0.1 K outwards.
+
+    A log begins an hour before the frames, when the camera was not seen.
+    """
     readings: dict[str, Array] = {}
     for s in series:
+        times, frames = s.source.reading_times, s.source.frame_times
+        step = float(np.median(np.diff(frames)))
+        seen = (times >= frames[0] - step) & (times <= frames[-1] + step)
         for channel, read in s.source.readings.items():
-            if len(finite := read[np.isfinite(read)]):
+            if len(finite := read[seen & np.isfinite(read)]):
                 readings[channel] = np.append(readings.get(channel, finite[:0]), finite)
     return {
         c: (float(np.floor(10 * T.min()) / 10), float(np.ceil(10 * T.max()) / 10))

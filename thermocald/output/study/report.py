@@ -426,6 +426,11 @@ def _dependence(study: SeriesStudy) -> str:
     found = channel.dependences.items()
     significant = [parameter_label(n) for n, d in found if d.p_holm < _SIGNIFICANT]
     name = parameter_label(channel.thermometer.name)
+    if not study.series.free:
+        return (
+            f"{study.series.name}: all parameters were held fixed; whether they depend on {name} "
+            "was not examined."
+        )
     if not significant:
         return f"{study.series.name}: no parameter depends significantly on {name}."
     depends = "depends" if len(significant) == 1 else "depend"

@@ -141,11 +141,18 @@ def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed, epochs
     assert all(a.significance < 6.0 for a in found.examination.adequacy)
 
 
-def test_a_camera_that_walks_at_random_is_given_no_name():
-    """Regression: in 33 epochs, `mount_motion` and `softening` imitated a walk of 0.03 px."""
-    found = discover_series(trembling((), 0.03, 0, 33, walks=True, with_m2=False))
+WALKING = (
+    ((), 0.03, 0, 33), ((), 0.05, 276313, 45),
+    (("cyclic_interference",), 0.05, 744678, 45), (("cyclic_interference",), 0.02, 435362, 45),
+)  # fmt: skip
 
-    assert {e.effect for e in found.effects} <= {"unnamed"}
+
+@pytest.mark.parametrize(("effects", "px", "seed", "epochs"), mostly_slow(WALKING, WALKING[0]))
+def test_a_camera_that_walks_at_random_is_given_no_name(effects, px, seed, epochs):
+    """Regression: `mount_motion` and `softening` imitated it, also beside an effect."""
+    found = discover_series(trembling(effects, px, seed, epochs, walks=True, with_m2=False))
+
+    assert {e.effect for e in found.effects} - {"unnamed"} == set(effects)
 
 
 @pytest.mark.parametrize(

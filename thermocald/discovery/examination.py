@@ -155,7 +155,8 @@ def examine_series(
         result = _examine_standing(ready, shaking, say, given, jobs)
         if result.walks:
             say("the camera may have moved at random: searching again")
-            result = _examine_beside_mount(calibrated, say, given, jobs) or result
+            guide = result.best.terms
+            result = _examine_beside_mount(calibrated, say, given, jobs, guide) or result
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
@@ -194,7 +195,7 @@ def _examine_standing(
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
-        alongside = _examine_beside_mount(shaking, say, given, jobs)
+        alongside = _examine_beside_mount(shaking, say, given, jobs, found.best.terms)
         if alongside is not None:
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
@@ -452,16 +453,18 @@ def _examine_beside_mount(
     say: Callable[[str], None],
     given: Sequence[ModelEffect],
     jobs: int,
+    guide: Sequence[Term] = (),
 ) -> Examination | None:
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
     It is then an influence that was not recorded; None also if the series contradict each other.
+    guide: effects beside which the tremble is measured, as the ends of a strong one look like it.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = add_tremble(fitter, fitter.fit(()))
+    shaken = add_tremble(fitter, fitter.fit(guide))
     beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))

@@ -17,9 +17,11 @@ from thermocald.discovery.search import Search, Solution, by_score, say_searched
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Proportional
+from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.movement import (
     Mount,
+    add_tremble,
     estimate_mount_motion,
     find_combinations,
     guess_mount_motion,
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.physics.model import ModelEffect
-    from thermocald.thermal.fit import HypothesisFitter
 
 _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
@@ -57,7 +58,8 @@ def search_beside_mount(
     first = Search(fitter)
     start = first.base(given)
     W = find_combinations(fitter.series)
-    guess = guess_mount_motion(fitter, start.fit, W)
+    # beside a movement as large as the whole misfit, a scan would find no effect
+    guess = guess_mount_motion(fitter, start.fit, W, whole=False)
     say("estimating how the camera moves on its mount")
     trials = [_fit_beside(start, Mount(W, guess, corner), 4) for corner in _CORNERS]
     plain = best = min(trials, key=by_score)
@@ -100,9 +102,11 @@ def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
 
 def fit_beside_walk(solution: Solution) -> Solution:
     """Fit a solution beside a random walk of the camera, as large as the solution leaves it."""
-    W = find_combinations(solution.fitter.series)
-    guess = guess_mount_motion(solution.fitter, solution.fit, W)
-    return _fit_beside(solution, Mount(W, guess, 0.0), 5)
+    fitter = HypothesisFitter(add_tremble(solution.fitter, solution.fit))
+    fit = fitter.fit(solution.terms, solution.fit.coefficients)
+    W = find_combinations(fitter.series)
+    mount = Mount(W, guess_mount_motion(fitter, fit, W), 0.0)
+    return _fit_beside(replace(solution, fit=fit, fitter=fitter), mount, 5)
 
 
 def _settle(solution: Solution, best: float) -> Solution:

@@ -128,16 +128,25 @@ def solve_combinations(N: Array, b: Array, W: Array) -> tuple[Array, Array]:
     return normal, np.linalg.solve(normal, (b @ W)[..., None])[..., 0]
 
 
-def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
-    """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise."""
+def guess_mount_motion(
+    fitter: HypothesisFitter, fit: Fit, W: Array, whole: bool = True
+) -> Array:
+    """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise.
+
+    whole: with what the weights have taken for a tremble.
+    """
     total = np.zeros((W.shape[1], W.shape[1]))
     count = 0
     for s, e in enumerate(fitter.series):
         w = fit.weightings[s]
-        z = subtract_level(w.N, w.left(fit.parameters(s))) @ W
+        noise = np.eye(len(total))  # with the tremble, which the weights have
+        if whole and e.tremble is not None:
+            along = W.T @ e.N.mean(axis=0) @ e.tremble
+            noise += along @ along.T
+        z = subtract_level(w.N, w.left(fit.parameters(s))) @ W @ noise
         A = waves(e.times, _count_waves(e)).T @ z
         k = np.arange(1, len(A) + 1)
-        total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
+        total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * noise
         count += len(A)
     # EM leaves a zero variance at zero, and rough half-waves can hide a slow drift in the moments
     return symmetric_power(total / count, 1.0, _FLOOR)

@@ -81,19 +81,6 @@ def test_effect_free_recordings_are_at_the_floor(evidence_of):
     assert fitter.fit(()).chi2 / free > 2.0
 
 
-@pytest.mark.parametrize(
-    ("gain", "expected"),
-    [
-        ([30.0, 5.0, -3.0, 0.0, 20.0, 1.0], True),
-        ([30.0, 5.0, -30.0, 0.0, 20.0, 1.0], False),  # one block contradicts it
-        ([-1.0, -2.0, 1.0, 0.0, 0.0, 0.0], False),  # nothing is predicted
-        ([1e5, 2e4, -300.0, 10.0, 20.0, 1.0], True),  # small relative to what it explains
-    ],
-)
-def test_what_confirms(gain, expected):
-    assert is_confirmed(np.array(gain)) == expected
-
-
 def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
     """A cycle is fitted to a recording without effects, at the best period."""
     lab = HypothesisFitter(evidence_of(px=0.2, seed=92, epochs=90, with_m2=False)[0])

@@ -217,13 +217,6 @@ def test_two_drives_are_applied_in_order():
     np.testing.assert_allclose(both, lagged, atol=1e-5)
 
 
-def test_the_temperature_before_a_series_is_its_first():
-    h = history(T=lambda s: np.full_like(s, T0 + 7.0))
-    for name, values in (("thermal_lag", {"tau": 500.0}), ("time_offset", {"d": 100.0}),
-                         ("hysteresis", {"half_width": 3.0})):  # fmt: skip
-        np.testing.assert_allclose(catalogue.get(name).drive(h, **values), T0 + 7.0, rtol=1e-14)
-
-
 def test_sentences():
     lag, play = catalogue.get("thermal_lag"), catalogue.get("hysteresis")
     sentence = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})

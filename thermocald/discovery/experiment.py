@@ -19,6 +19,7 @@ from thermocald.errors import DataError, UsageError
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import trial_values
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
 from thermocald.thermal.series import in_blocks
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from thermocald.arrays import Array
-    from thermocald.physics.effect import Parameter
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -303,30 +303,12 @@ def _trajectories(name: str, history: History) -> list[Array]:
         if parameter.text:
             trials = [{**t, key: "other"} for t in trials]
         elif parameter.role != "phase":
-            trials = [{**t, key: float(v)} for t in trials for v in _values(parameter, history)]
+            values = trial_values(parameter, history.times, history.temperature())
+            trials = [{**t, key: float(v)} for t in trials for v in values]
     if effect.is_drive:
         T = history.temperature()
         return [(effect.drive(history, **t) - T)[:, None] for t in trials]
     return [effect.signal(history, **t) for t in trials]
-
-
-def _values(parameter: Parameter, history: History) -> Array:
-    duration, T = float(history.times[-1]), history.temperature()
-    low, high = float(T.min()), float(T.max())
-    match parameter.role:
-        case "threshold":
-            return np.linspace(low, high, 14)[2:-2]
-        case "width":
-            return np.geomspace(0.2, 0.4 * (high - low), 12)
-        case "time_constant":
-            return np.geomspace(10.0, duration, 24)
-        case "delay":
-            return np.linspace(5.0, 0.2 * duration, 24)
-        case "event":
-            return np.linspace(0.1, 0.9, 17) * duration
-        case "period":
-            return np.geomspace(duration / 40, duration / 2, 60)
-    return np.linspace(parameter.low, parameter.high, 20)
 
 
 def _measure_left(name: str, other: str | None, history: History) -> float:

@@ -128,9 +128,7 @@ def solve_combinations(N: Array, b: Array, W: Array) -> tuple[Array, Array]:
     return normal, np.linalg.solve(normal, (b @ W)[..., None])[..., 0]
 
 
-def guess_mount_motion(
-    fitter: HypothesisFitter, fit: Fit, W: Array, whole: bool = True
-) -> Array:
+def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array, whole: bool = True) -> Array:
     """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise.
 
     whole: with what the weights have taken for a tremble.

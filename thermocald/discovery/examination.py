@@ -453,19 +453,20 @@ def _examine_beside_mount(
     say: Callable[[str], None],
     given: Sequence[ModelEffect],
     jobs: int,
-    guide: Sequence[Term] = (),
+    guide: Sequence[Term] | None = None,
 ) -> Examination | None:
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
     It is then an influence that was not recorded; None also if the series contradict each other.
-    guide: effects beside which the tremble is measured, as the ends of a strong one look like it.
+    guide: if the camera trembles or walks, the effects beside which the tremble is measured, as the
+    ends of a strong one look like it.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = add_tremble(fitter, fitter.fit(guide))
-    beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
+    shaken = HypothesisFitter(add_tremble(fitter, fitter.fit(guide or ())))
+    beside, ranking, seen, like = search_beside_mount(shaken, say, given, guide is not None)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))
     if mount is None or mount.smoothness(fitter, whole.fit) > criteria.SMOOTH:

@@ -105,6 +105,7 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
 _STEP_S = 60.0  # steps by which a thermostat follows a ramp
 _FINE_S = 2.0
 _NOISE_PX = 0.01  # of an epoch: its image points, and a thermometer with 0.02 K
+_STRENGTH_PX = 0.1
 _HYSTERESIS_K = 0.5
 _LEAST_S = 900.0
 _LEAST_K = 5.0  # least warming that shows effects
@@ -191,12 +192,11 @@ def rank_experiments(
     body: Body,
     epochs: int,
     interval: float,
-    strength_px: float = 0.1,
 ) -> list[Experiment]:
     """Rank the programmes within the limits, the one that separates best first.
 
-    strength_px: what the base model leaves of each effect under two equal cycles. Raises DataError
-    if the limits allow too little heating.
+    The base model leaves 0.1 px of each effect under two equal cycles. Raises DataError if the
+    limits allow too little heating.
     """
     highest = min(limits.max_c - _HYSTERESIS_K, body.ambient + 0.9 * body.rise)
     if highest - body.ambient < _LEAST_K:
@@ -222,7 +222,7 @@ def rank_experiments(
         runs[name] = steps, temperature, duty
     usual = runs["two equal cycles"]
     history = _history(times, usual[1], body)
-    sizes = {n: _measure_left(n, None, history) / strength_px for n in (first, second)}
+    sizes = {n: _measure_left(n, None, history) / _STRENGTH_PX for n in (first, second)}
     out = []
     for name, (steps, temperature, duty) in runs.items():
         history = _history(times, temperature, body)

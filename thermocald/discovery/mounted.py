@@ -49,19 +49,20 @@ def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
     given: Sequence[ModelEffect],
+    walks: bool,
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks one by one while the penalised likelihood improves.
 
-    Returns the best solution, the single effects by score, all solutions tried, each with its
+    walks: whether the tremble is the fast part of a movement. Returns the best solution, the single effects by score, all solutions tried, each with its
     movement, and a search whose trajectories can be reused in the best solution's fitter.
     """
     first = Search(fitter)
     start = first.base(given)
     W = find_combinations(fitter.series)
     # beside a movement as large as the whole misfit, a scan would find no effect
-    guess = guess_mount_motion(fitter, start.fit, W, whole=False)
+    guess = guess_mount_motion(fitter, start.fit, W, walks=False)
     say("estimating how the camera moves on its mount")
-    trials = [_fit_beside(start, Mount(W, guess, corner), 4) for corner in _CORNERS]
+    trials = [_fit_beside(start, Mount(W, guess, corner, walks), 4) for corner in _CORNERS]
     plain = best = min(trials, key=by_score)
     ranking, seen = list[Solution](), list[Solution]()
     for level in range(_LEVELS):
@@ -105,7 +106,7 @@ def fit_beside_walk(solution: Solution) -> Solution:
     fitter = HypothesisFitter(add_tremble(solution.fitter, solution.fit))
     fit = fitter.fit(solution.terms, solution.fit.coefficients)
     W = find_combinations(fitter.series)
-    mount = Mount(W, guess_mount_motion(fitter, fit, W), 0.0)
+    mount = Mount(W, guess_mount_motion(fitter, fit, W, walks=True), 0.0)
     return _fit_beside(replace(solution, fit=fit, fitter=fitter), mount, 5)
 
 
@@ -132,7 +133,8 @@ def _profile(best: Solution, solution: Solution) -> Solution:
     best: the solution that it extends, in the same fitter, with its movement.
     """
     assert best.mount is not None
-    guess = guess_mount_motion(best.fitter, solution.fit, best.mount.combinations)
+    W, walks = best.mount.combinations, best.mount.walks
+    guess = guess_mount_motion(best.fitter, solution.fit, W, walks)
     # with a share of the movement before, since a direction that starts at zero stays zero
     mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
     fitted = _fit_beside(solution, mount, 5)

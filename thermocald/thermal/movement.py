@@ -53,12 +53,14 @@ _KINKS = 3 * (_FAST + 1)  # differences that a lamp switched three times may ben
 class Mount:
     """A movement of the mount: covariance (m, m) of combinations (P, m), corner in half-waves.
 
-    The combinations have unit variance if there is image noise only.
+    The combinations have unit variance if there is image noise only. walks: whether the tremble is
+    the fast part of this movement.
     """
 
     combinations: Array
     covariance: Array
     corner: float
+    walks: bool = False
 
     def modes(self) -> tuple[Array, Array]:
         """Return the variances and directions (P, ·) of the independent movements that matter."""
@@ -128,17 +130,17 @@ def solve_combinations(N: Array, b: Array, W: Array) -> tuple[Array, Array]:
     return normal, np.linalg.solve(normal, (b @ W)[..., None])[..., 0]
 
 
-def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array, whole: bool = True) -> Array:
+def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array, walks: bool) -> Array:
     """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise.
 
-    whole: with what the weights have taken for a tremble.
+    walks: whether to count what the weights have taken for a tremble.
     """
     total = np.zeros((W.shape[1], W.shape[1]))
     count = 0
     for s, e in enumerate(fitter.series):
         w = fit.weightings[s]
         noise = np.eye(len(total))  # with the tremble, which the weights have
-        if whole and e.tremble is not None:
+        if walks and e.tremble is not None:
             along = W.T @ e.N.mean(axis=0) @ e.tremble
             noise += along @ along.T
         z = subtract_level(w.N, w.left(fit.parameters(s))) @ W @ noise

@@ -337,20 +337,26 @@ def smooth_channel(
             points, weights = _weigh_neighbours(t, times[row], sharp)
             mixing.rows[row], mixing.data[row] = knot[points].tolist(), weights.tolist()
             trajectory[row] = weights @ smooth[points]
-    if len(rows):
-        bend, limit = _measure_bends(t, filled, noise)
-        for row, i in zip(rows, index, strict=True):
-            share = (times[row] - t[i]) / (t[i + 1] - t[i])
-            mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
-            size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
-            # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; intervals
-            # next to it have a bend too, but no bulge
-            top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
-            trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1]
-            trajectory[row] -= bend[i] / 8 * top
-            sd[row] = 0.12 * size + 0.25 * noise
+    bend, limit = _measure_bends(t, filled, noise)
+    for row, i in zip(rows, index, strict=True):
+        share = (times[row] - t[i]) / (t[i + 1] - t[i])
+        mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
+        bulge, sd[row] = _estimate_kink(bend, limit, i, noise)
+        trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1] - bulge
     deviation = np.nan_to_num(readings - trajectory)
     return Thermometer(times, trajectory, deviation, sd, csr_array(mixing), own, noise)
+
+
+def _estimate_kink(bend: Array, limit: float, i: int, noise: float) -> tuple[float, float]:
+    """Return by how much a kink bulges in the middle of an interval, K, and its sd.
+
+    bend (K - 1,), limit: of `_measure_bends`.
+    """
+    size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
+    # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; intervals next to it
+    # have a bend too, but no bulge
+    top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
+    return float(bend[i] / 8 * top), float(0.12 * size + 0.25 * noise)
 
 
 def _weigh_neighbours(t: Array, at: float, sharp: NDArray[np.bool_]) -> tuple[Index, Array]:

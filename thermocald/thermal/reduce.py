@@ -155,9 +155,7 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
     d = misclosure - running_median(misclosure, _HALF, itself=False)
     d -= take_median(d, 1)[:, None]  # the whole image may move
     own = MAD_TO_SD * take_median(np.abs(d).reshape(len(d), -1), 1)
-    # beside a step, an epoch differs from its neighbours' median, but not from that with itself
-    with_itself = misclosure - running_median(misclosure, _HALF)
-    size = np.min([np.abs(np.nan_to_num(x)).max(axis=2) for x in (d, with_itself)], axis=0)
+    size = np.max(np.abs(np.nan_to_num(d)), axis=2)
     finite = own[np.isfinite(own)]
     level = float(np.median(finite)) if len(finite) else 0.0
     limit = criteria.SPIKE * np.fmax(np.nan_to_num(own), level)

@@ -464,8 +464,8 @@ def _examine_beside_mount(
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
     It is then an influence that was not recorded; None also if the series contradict each other.
-    guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of a
-    strong one look like it.
+    guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of
+    a strong one look like it.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(

@@ -9,6 +9,7 @@ to the noise of an epoch.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -249,19 +250,9 @@ def _steps(
     held: list[float] = [float(body.ambient)]
     for value in wanted[1:]:
         held.append(min(float(value), held[-1] + limits.max_rate * _STEP_S / 60.0))
-    seconds, current = 0.0, _hold(held[0], body)
-    for value in held:
-        hold = _hold(value, body)
-        if hold != current and seconds:
-            yield seconds, current
-            seconds = 0.0
-        current, seconds = hold, seconds + _STEP_S
-    yield seconds, current
-
-
-def _hold(value: float, body: Body) -> float | None:
-    """Return a step's temperature, rounded to 0.1 °C; None without heating."""
-    return round(value, 1) if value > body.ambient + 0.5 else None
+    holds = (round(value, 1) if value > body.ambient + 0.5 else None for value in held)
+    for hold, run in groupby(holds):
+        yield _STEP_S * len(list(run)), hold
 
 
 def _simulate(

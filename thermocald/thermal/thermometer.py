@@ -225,18 +225,12 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
 
 def _third_differences(t: Array, y: Array) -> Array:
     """Return third divided differences of neighbours, scaled to the variance of one reading."""
-    n = len(t) - 3
-    at = [t[k : k + n] for k in range(4)]
-    total, square = np.zeros(n), np.zeros(n)
-    for i in range(4):
-        product = np.ones(n)
-        for j in range(4):
-            if i != j:
-                apart = at[i] - at[j]
-                product *= np.where(apart == 0.0, 1e-3, apart)
-        total += y[i : i + n] / product
-        square += product**-2.0
-    return np.asarray(total / np.sqrt(square))
+    at, values = np.lib.stride_tricks.sliding_window_view([t, y], len(t) - 3, axis=1)  # (4, n)
+    apart = at[:, None] - at
+    apart[apart == 0.0] = 1e-3
+    apart[np.arange(4), np.arange(4)] = 1.0
+    product = np.prod(apart, axis=1)
+    return np.asarray(np.sum(values / product, axis=0) / np.sqrt(np.sum(product**-2.0, axis=0)))
 
 
 def find_times_between(

@@ -49,7 +49,7 @@ from thermocald.thermal.noise import (
     weight_slow_noise,
 )
 from thermocald.thermal.reduce import reweight
-from thermocald.thermal.scan import examine_all, remove_curvature
+from thermocald.thermal.scan import examine_all, remove_curvature, scan_candidate
 from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ def _search_beside_knocks(
     whole, inside = (make_candidate(event, names, series) for names in (EOP_NAMES, BASE))
     knocks: tuple[Term, ...] = ()
     for _ in range(KNOCKS):
-        steps = (search.scanner.scan(c, base.fit).gains for c in (whole, inside))
+        steps = (scan_candidate(search.fitter, c, base.fit).gains for c in (whole, inside))
         differences = [a - np.maximum(b, 0.0) for a, b in zip(*steps, strict=True)]
         fresh = tuple(
             ((whole.name, float(e.times[np.argmax(more) + 1])),)

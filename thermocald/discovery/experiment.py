@@ -22,6 +22,7 @@ from thermocald.physics.history import History
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import trial_values
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
+from thermocald.thermal.scan import scan_candidate
 from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
@@ -89,7 +90,8 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
     found = []
     for name in (first, second):
         own = [c for c in search.candidates if c.effect == name]
-        promises = [search.promise(c, search.scanner.scan(c, base.fit)) for c in own]
+        scans = [scan_candidate(search.fitter, c, base.fit) for c in own]
+        promises = [search.promise(c, s) for c, s in zip(own, scans, strict=True)]
         if not promises:
             raise UsageError(
                 f"{name} cannot be tested in this series: it needs a quantity that was not recorded"

@@ -186,9 +186,7 @@ def estimate_mount_motion(
     fitter of the series with the movement, the fit, and the movement.
     """
     for turn in range(max_iterations + 1):
-        own = HypothesisFitter(mount.on(fitter.series))
-        own.thermometer_factor = fitter.thermometer_factor
-        own.share_trajectories(fitter)
+        own = HypothesisFitter(mount.on(fitter.series), like=fitter)
         fit = own.fit(terms, start, 1 if turn else 2)
         start = fit.coefficients
         if turn < max_iterations:

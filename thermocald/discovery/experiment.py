@@ -310,7 +310,7 @@ def _measure_left(name: str, other: str | None, history: History) -> float:
     other: another effect beside the base model, with the constants that leave least.
     """
     every = _trajectories(name, history)
-    y = every[len(every) // 3][:, 0]
+    y = every[2 * len(every) // 3][:, 0]  # of the delays, a positive one
     base = np.column_stack([np.ones(len(history.times)), history.temperature()])
     beside = [np.zeros((len(y), 0))] if other is None else _trajectories(other, history)
     left = []

@@ -55,7 +55,7 @@ class HypothesisFitter:
         self, series: Sequence[ReducedSeries], like: HypothesisFitter | None = None
     ) -> None:
         self.series = tuple(series)
-        self.thermometer_factor = like.thermometer_factor if like else 1.0
+        self.thermometer_factor: float = like.thermometer_factor if like else 1.0
         self.stacks: dict[tuple[Candidate, int], Array] = like.stacks if like else {}
         self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
         self.priors: dict[str, tuple[float, float]] = {}  # {non-linear parameter: value, sd}

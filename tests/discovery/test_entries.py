@@ -89,22 +89,6 @@ def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alon
     assert "known only together, as other values fit as well: slope and " in say_together(found)
 
 
-@pytest.mark.parametrize(("middle", "width"), [(50.0, 20.0), (3783.7, 288.2)])
-def test_what_is_known_of_it_is_slope_and_curvature(lagging, middle, width):
-    """The curve is the same for all formulas that explain the same."""
-    found = find_tied_constants(lagging, saturating(lagging, middle, width), 0)
-    square = Node("square", (Node("offset", (T,), (found["temperature"],)),))
-    parabola = lagging.refine(lagging.fit((Term(square.text(), BASE),)), max_iterations=0)
-
-    own = parabola.blocks[1]
-    scale = lagging.series[0].scale[:3]
-    for i, p in enumerate(BASE):
-        curvature, value = found["curvature"][p], 2 * parabola.coefficients[own.start + i]
-        assert curvature["value"] == pytest.approx(value / scale[i], abs=4 * curvature["sd"])
-        assert 0 < curvature["sd"] < 1e-4
-        assert found["slope"][p]["sd"] < 1e-5
-
-
 def test_a_saturation_within_the_recorded_range_is_known(lagging):
     middle = float(lagging.series[0].history.temperature().mean())
     assert find_tied_constants(lagging, saturating(lagging, middle, 8.0), 0) is None

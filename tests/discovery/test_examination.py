@@ -13,7 +13,6 @@ import thermocald as tc
 from tests.blind.bridge import generated
 from tests.blind.case import Case
 from tests.blind.score import discover_case, judge_discovery
-from tests.marks import mostly_slow
 from thermocald.discovery import examination
 from thermocald.discovery.entries import estimate_term
 from thermocald.discovery.evidence import find_displaced_targets
@@ -26,21 +25,6 @@ from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
 from thermocald.thermal.reduce import reduce_series, reduce_together
 from thermocald.thermal.series import in_blocks
-
-
-@pytest.mark.parametrize("effect", ["target_displacement", "defocus"])
-def test_what_shows_in_the_image_is_named(evidence_of, effect):
-    """All effects are in the blind corpus of tests/golden."""
-    evidence, truth = evidence_of(effect, px=0.1, seed=21, epochs=90)
-
-    found = discover_series(evidence)
-
-    assert found.verdict == "effects_found"
-    assert [e.effect for e in found.effects] == [effect]
-    if effect == "target_displacement":
-        true, said = truth["effects"][0][0], found.effects[0].estimates
-        assert [int(v) for v in said["targets"]["value"]] == [t + 1 for t in true["targets"]]
-        assert said["time"]["value"] == pytest.approx(true["time"], abs=10)
 
 
 @pytest.mark.slow
@@ -56,7 +40,7 @@ def test_the_time_of_a_weak_displacement_is_as_accurate_as_stated():
 
 
 def test_no_effect_no_name(evidence_of):
-    evidence, _ = evidence_of(seed=23, epochs=90)
+    evidence, _ = evidence_of(seed=23, epochs=45, with_m2=False)
     found = discover_series(evidence)
     assert (found.verdict, found.effects) == ("adequate", ())
     assert "field" not in found.as_dict()  # which stands still
@@ -132,17 +116,17 @@ def test_what_readings_hide_is_named(evidence_of, effect, px, seed, constant):
 
 def test_a_lag_as_long_as_the_series_has_no_delay_beside_it(evidence_of):
     """A time offset of so many seconds leaves one temperature, whose rates are not determined."""
-    evidence, _ = evidence_of("thermal_lag", seed=31, epochs=90)
+    evidence, _ = evidence_of("thermal_lag", seed=31, epochs=90, with_m2=False)
     search = Search(HypothesisFitter(evidence))
     lag = next(c for c in search.candidates if c.effect == "thermal_lag")
-    found = search.refine((*search.base().terms, lag.term(904.0, 2)), (0.0, 0.0))
+    found = search.refine((*search.base().terms, lag.term(904.0, 1)), (0.0, 0.0))
     assert dict(found.terms[-1].nonlinear)["tau"] > 800.0
 
     assert search.with_other_delay(found) is None
 
 
 def test_a_gross_error_near_the_end_is_no_target_that_moved(evidence_of):
-    evidence = evidence_of(seed=26)[0][0]
+    (evidence,), _ = evidence_of(seed=26, epochs=60, with_m2=False)
     for epochs, moved in ((slice(-3, -2), 0), (slice(-3, None), 1)):
         residuals = evidence.residuals.copy()
         residuals[epochs, 30] += 1.0
@@ -163,11 +147,16 @@ def test_surrogates_tried_at_once_give_the_same_bits(evidence_of):
     np.testing.assert_array_equal(two.surrogates, one.surrogates)
 
 
-@pytest.mark.parametrize("effect", mostly_slow(("defocus", "target_displacement"), "defocus"))
-def test_an_effect_in_image_space_is_not_named_again(evidence_of, effect):
+@pytest.mark.parametrize("effect", ["defocus", "target_displacement"])
+def test_an_effect_in_image_space_is_named_once(evidence_of, effect):
     """The model that a discovery wrote has it, and keeps it."""
-    evidence, _ = evidence_of(effect, px=0.1, seed=21, epochs=60, with_m2=False)
+    evidence, truth = evidence_of(effect, px=0.1, seed=21, epochs=60, with_m2=False)
     first = discover_series(evidence)
+    assert first.headline == f"effects_found: {effect}"
+    if effect == "target_displacement":
+        true, said = truth["effects"][0][0], first.effects[0].estimates
+        assert [int(v) for v in said["targets"]["value"]] == [t + 1 for t in true["targets"]]
+        assert said["time"]["value"] == pytest.approx(true["time"], abs=10)
     model = build_model(first)
     assert [e.name for e in model.effects] == [effect]
 
@@ -252,17 +241,19 @@ def test_effects_of_a_preset_are_named(preset, expected, tmp_path):
 
 @pytest.fixture
 def short_blocks(monkeypatch):
-    """Make every series count as long: 120 epochs in 40 rows."""
-    monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=40))
+    """Make every series count as long: three epochs in a row."""
+    monkeypatch.setattr(
+        examination, "in_blocks", lambda series: in_blocks(series, rows=len(series.times) // 3)
+    )
 
 
 def test_an_effect_in_a_long_series(short_blocks, evidence_of):
-    evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, epochs=120, with_m2=False)
+    evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, epochs=72, with_m2=False)
     found = discover_series(evidence)
     assert [e.effect for e in found.effects] == ["nonlinear_expansion"]
     first, last = found.effects[0].where["epochs"]
     assert 0 <= first < last <= evidence[0].source.numbers[-1]
-    assert last > 40  # epochs, not rows
+    assert last > 24  # epochs, not rows
     page = report_html(found, "long")
     assert "<svg" in page
     assert re.search(r"Made on \d{4}-\d\d-\d\d at \d\d:\d\d UTC with thermocald", page)

@@ -23,7 +23,7 @@ from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Candidate, Term
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
 from thermocald.thermal.reduce import reduce_together
-from thermocald.thermal.scan import Scanner, examine_all
+from thermocald.thermal.scan import examine_all, scan_candidate
 
 TEN = (
     "tanh", "sign_rate_square", "integral_above", "abs_rate", "two_lags", "product", "switch",
@@ -102,7 +102,7 @@ def test_condensed_evidence_is_the_likelihood(above):
     fit = above.fitter.fit(above.base.terms)
     structure, values = whole.named()
     candidate = Candidate(structure.text(), BASE, "k", np.array([values["k"]]))
-    full = float(Scanner(above.fitter).scan(candidate, fit).gains[0][0])
+    full = float(scan_candidate(above.fitter, candidate, fit).gains[0][0])
     assert gain == pytest.approx(full, rel=0.002)
     assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T is in the base
 

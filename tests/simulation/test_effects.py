@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
@@ -217,13 +216,6 @@ def test_two_drives_are_applied_in_order():
     np.testing.assert_allclose(both, lagged, atol=1e-5)
 
 
-def test_the_temperature_before_a_series_is_its_first():
-    h = history(T=lambda s: np.full_like(s, T0 + 7.0))
-    for name, values in (("thermal_lag", {"tau": 500.0}), ("time_offset", {"d": 100.0}),
-                         ("hysteresis", {"half_width": 3.0})):  # fmt: skip
-        np.testing.assert_allclose(catalogue.get(name).drive(h, **values), T0 + 7.0, rtol=1e-14)
-
-
 def test_sentences():
     lag, play = catalogue.get("thermal_lag"), catalogue.get("hysteresis")
     sentence = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})
@@ -277,40 +269,3 @@ def test_a_drift_of_the_distortion_adds_to_the_constants_of_the_angle():
     T = h.temperature() - drifts.T0
     k1 = opencv(drifts.predict(h).iop)[:, 0]
     np.testing.assert_allclose(k1, (INTERIOR.A1 + 1e-5 * T) * INTERIOR.c**2, rtol=1e-12)
-
-
-@pytest.mark.parametrize("distortion", ["angle", "image"])
-def test_the_covariance_equals_differences(distortion):
-    """For the steady camera and along a history, compared with differences of predictions."""
-    effects = (
-        ModelEffect("nonlinear_expansion", {"c": 2e-5}),
-        ModelEffect("radial_distortion_drift", {"A1": 1e-5}),
-    )
-    base = replace(follows_angle(*effects), distortion=distortion)
-    names = ("interior.c", "interior.A1", "rates.c", "nonlinear_expansion.c",
-             "radial_distortion_drift.A1")  # fmt: skip
-    scales = np.array([1e-2, 1e-4, 1e-4, 1e-6, 1e-6])
-    T = base.T0 + 15.0
-
-    def cameras(m):
-        camera = ThermalCamera(m)
-        return camera.at(T), camera.along([0.0, 10.0], [T, T])[1]
-
-    def moved(name, step):
-        value = base.value(name) + step
-        if name.startswith("interior"):
-            key = name.removeprefix("interior.")
-            m = replace(base, interior=replace(INTERIOR, **{key: value}))
-        else:
-            m = base.with_values({name: value})
-        return np.array([camera.values for camera in cameras(m)])
-
-    sides = [(moved(n, 1e-3 * s), moved(n, -1e-3 * s)) for n, s in zip(names, scales, strict=True)]
-    J = np.stack([one - other for one, other in sides], axis=-1) / (2e-3 * scales)
-    covariance = tuple(map(tuple, np.diag(scales**2).tolist()))
-    known = replace(base, covariance_names=names, covariance=covariance)
-    for camera, j in zip(cameras(known), J, strict=True):
-        expected = j * scales**2 @ j.T
-        size = np.sqrt(np.maximum(np.diag(expected), 1e-30))
-        scale = np.outer(size, size)
-        np.testing.assert_allclose(camera.covariance / scale, expected / scale, atol=2e-5)

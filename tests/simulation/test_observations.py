@@ -13,7 +13,6 @@ from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import CameraDevice, Measuring, Programme
 from thermocald.physics.heat import Course, SimulatedThermometer
-from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import read_model
 from thermocald.physics.presets import preset_simulation
 from thermocald.physics.simulation import Simulation
@@ -53,18 +52,6 @@ def test_noise_missing_targets_and_gross_errors_are_as_given():
     assert abs(good.std() / 0.05 - 1) < 0.02
     assert np.abs(good.mean(axis=0)).max() < 0.001
     assert all(np.all(o.sigmas == 0.05) for o in rows)
-
-
-def test_defocus_affects_the_noise_only():
-    s = simulation(effects=[ModelEffect("defocus", {"factor": 0.1})])
-    plain = simulation()
-    a, b = list(s.observations()), list(plain.observations())
-    true = plain.image_points(slice(0, 180))
-    k = int(np.argmax(s.truth.noise_factor))
-    ratio = (a[k].points - true[k, a[k].targets]) / (b[k].points - true[k, b[k].targets])
-    assert s.truth.noise_factor[k] > 1.5
-    good = np.abs(b[k].points - true[k, b[k].targets]) < 0.3
-    np.testing.assert_allclose(ratio[good], s.truth.noise_factor[k], rtol=1e-6)
 
 
 def test_errors_of_thermometers():

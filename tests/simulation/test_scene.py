@@ -69,18 +69,6 @@ def test_centres_agree_with_the_projected_truth():
     assert np.abs(areas).max() < 2e-3
 
 
-def test_corners_agree_with_the_projected_truth():
-    """Without noise and distortion, fitted corners agree to 0.01 px RMS."""
-    field = demonstration_field("markers")
-    iop = InteriorOrientation(c=3.04, x0=0.012, y0=-0.018).as_array()
-    eop = corner_view(field, 1330.0).as_array()
-    image = Scene(SENSOR, field, CLEAN).render(iop, eop)
-    seen = measure_corners(image, locate_markers(image, field, {}), {})
-    assert len(seen) >= 160
-    error = seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]
-    assert np.sqrt(np.mean(error**2)) < 0.01
-
-
 @pytest.mark.slow
 def test_corners_have_true_sds_at_any_position_in_a_pixel():
     """With blur on the pixel grid, errors would be 1.16 sds and depend on the position.

@@ -244,14 +244,9 @@ def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) ->
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     v = np.where(np.abs(v - np.nanmedian(v, axis=0)).max(axis=2, keepdims=True) < 1e6, v, np.nan)
     firsts = np.array([jumps[row][0] for row in rows.tolist()])
-    groups: list[list[int]] = []
-    for k in np.argsort(firsts):
-        if groups and firsts[k] - firsts[groups[-1][-1]] <= 1:
-            groups[-1].append(int(k))
-        else:
-            groups.append([int(k)])
+    order = np.argsort(firsts)
     out = []
-    for group in groups:
+    for group in np.split(order, np.flatnonzero(np.diff(firsts[order]) > 1) + 1):
         first = int(np.median(firsts[group]))
         steps, vectors, sds = [], [], []
         later = np.zeros(len(v))

@@ -49,7 +49,7 @@ from thermocald.thermal.noise import (
     weight_slow_noise,
 )
 from thermocald.thermal.reduce import reweight
-from thermocald.thermal.scan import examine_all, remove_curvature
+from thermocald.thermal.scan import examine_all, remove_curvature, scan_candidate
 from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
@@ -155,7 +155,8 @@ def examine_series(
         result = _examine_standing(ready, shaking, say, given, jobs)
         if result.walks:
             say("the camera may have moved at random: searching again")
-            result = _examine_beside_mount(calibrated, say, given, jobs) or result
+            guide = result.best.terms
+            result = _examine_beside_mount(calibrated, say, given, jobs, guide) or result
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
@@ -194,7 +195,8 @@ def _examine_standing(
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
-        alongside = _examine_beside_mount(shaking, say, given, jobs)
+        known = found.best.terms if _is_short(search, base, found.best) else None
+        alongside = _examine_beside_mount(shaking, say, given, jobs, known)
         if alongside is not None:
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
@@ -220,7 +222,7 @@ def _search_beside_knocks(
     whole, inside = (make_candidate(event, names, series) for names in (EOP_NAMES, BASE))
     knocks: tuple[Term, ...] = ()
     for _ in range(KNOCKS):
-        steps = (search.scanner.scan(c, base.fit).gains for c in (whole, inside))
+        steps = (scan_candidate(search.fitter, c, base.fit).gains for c in (whole, inside))
         differences = [a - np.maximum(b, 0.0) for a, b in zip(*steps, strict=True)]
         fresh = tuple(
             ((whole.name, float(e.times[np.argmax(more) + 1])),)
@@ -315,10 +317,15 @@ def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
     not show it.
     """
     found = range(len(base.terms), len(best.terms))
-    if search.epochs >= criteria.NO_WALK_EACH * len(found):
+    if not _is_short(search, base, best):
         return False
     limit = fit_beside_walk(best).score + criteria.BAND
     return any(fit_beside_walk(_drop_effect(search, base, best, i)).score < limit for i in found)
+
+
+def _is_short(search: Search, base: Solution, best: Solution) -> bool:
+    """Test whether effects found in so few epochs could imitate a random walk."""
+    return search.epochs < criteria.NO_WALK_EACH * (len(best.terms) - len(base.terms))
 
 
 def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool:
@@ -452,17 +459,20 @@ def _examine_beside_mount(
     say: Callable[[str], None],
     given: Sequence[ModelEffect],
     jobs: int,
+    guide: Sequence[Term] | None = None,
 ) -> Examination | None:
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
     It is then an influence that was not recorded; None also if the series contradict each other.
+    guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of
+    a strong one look like it.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = add_tremble(fitter, fitter.fit(()))
-    beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
+    shaken = HypothesisFitter(add_tremble(fitter, fitter.fit(guide or ())))
+    beside, ranking, seen, like = search_beside_mount(shaken, say, given, guide is not None)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))
     if mount is None or mount.smoothness(fitter, whole.fit) > criteria.SMOOTH:

@@ -9,6 +9,7 @@ to the noise of an epoch.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,14 +20,15 @@ from thermocald.errors import DataError, UsageError
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import trial_values
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
+from thermocald.thermal.scan import scan_candidate
 from thermocald.thermal.series import in_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from thermocald.arrays import Array
-    from thermocald.physics.effect import Parameter
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -88,7 +90,8 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
     found = []
     for name in (first, second):
         own = [c for c in search.candidates if c.effect == name]
-        promises = [search.promise(c, search.scanner.scan(c, base.fit)) for c in own]
+        scans = [scan_candidate(search.fitter, c, base.fit) for c in own]
+        promises = [search.promise(c, s) for c, s in zip(own, scans, strict=True)]
         if not promises:
             raise UsageError(
                 f"{name} cannot be tested in this series: it needs a quantity that was not recorded"
@@ -105,6 +108,7 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
 _STEP_S = 60.0  # steps by which a thermostat follows a ramp
 _FINE_S = 2.0
 _NOISE_PX = 0.01  # of an epoch: its image points, and a thermometer with 0.02 K
+_STRENGTH_PX = 0.1
 _HYSTERESIS_K = 0.5
 _LEAST_S = 900.0
 _LEAST_K = 5.0  # least warming that shows effects
@@ -191,12 +195,11 @@ def rank_experiments(
     body: Body,
     epochs: int,
     interval: float,
-    strength_px: float = 0.1,
 ) -> list[Experiment]:
     """Rank the programmes within the limits, the one that separates best first.
 
-    strength_px: what the base model leaves of each effect under two equal cycles. Raises DataError
-    if the limits allow too little heating.
+    The base model leaves 0.1 px of each effect under two equal cycles. Raises DataError if the
+    limits allow too little heating.
     """
     highest = min(limits.max_c - _HYSTERESIS_K, body.ambient + 0.9 * body.rise)
     if highest - body.ambient < _LEAST_K:
@@ -222,7 +225,7 @@ def rank_experiments(
         runs[name] = steps, temperature, duty
     usual = runs["two equal cycles"]
     history = _history(times, usual[1], body)
-    sizes = {n: _measure_left(n, None, history) / strength_px for n in (first, second)}
+    sizes = {n: _measure_left(n, None, history) / _STRENGTH_PX for n in (first, second)}
     out = []
     for name, (steps, temperature, duty) in runs.items():
         history = _history(times, temperature, body)
@@ -249,19 +252,9 @@ def _steps(
     held: list[float] = [float(body.ambient)]
     for value in wanted[1:]:
         held.append(min(float(value), held[-1] + limits.max_rate * _STEP_S / 60.0))
-    seconds, current = 0.0, _hold(held[0], body)
-    for value in held:
-        hold = _hold(value, body)
-        if hold != current and seconds:
-            yield seconds, current
-            seconds = 0.0
-        current, seconds = hold, seconds + _STEP_S
-    yield seconds, current
-
-
-def _hold(value: float, body: Body) -> float | None:
-    """Return a step's temperature, rounded to 0.1 °C; None without heating."""
-    return round(value, 1) if value > body.ambient + 0.5 else None
+    holds = (round(value, 1) if value > body.ambient + 0.5 else None for value in held)
+    for hold, run in groupby(holds):
+        yield _STEP_S * len(list(run)), hold
 
 
 def _simulate(
@@ -303,30 +296,12 @@ def _trajectories(name: str, history: History) -> list[Array]:
         if parameter.text:
             trials = [{**t, key: "other"} for t in trials]
         elif parameter.role != "phase":
-            trials = [{**t, key: float(v)} for t in trials for v in _values(parameter, history)]
+            values = trial_values(parameter, history.times, history.temperature())
+            trials = [{**t, key: float(v)} for t in trials for v in values]
     if effect.is_drive:
         T = history.temperature()
         return [(effect.drive(history, **t) - T)[:, None] for t in trials]
     return [effect.signal(history, **t) for t in trials]
-
-
-def _values(parameter: Parameter, history: History) -> Array:
-    duration, T = float(history.times[-1]), history.temperature()
-    low, high = float(T.min()), float(T.max())
-    match parameter.role:
-        case "threshold":
-            return np.linspace(low, high, 14)[2:-2]
-        case "width":
-            return np.geomspace(0.2, 0.4 * (high - low), 12)
-        case "time_constant":
-            return np.geomspace(10.0, duration, 24)
-        case "delay":
-            return np.linspace(5.0, 0.2 * duration, 24)
-        case "event":
-            return np.linspace(0.1, 0.9, 17) * duration
-        case "period":
-            return np.geomspace(duration / 40, duration / 2, 60)
-    return np.linspace(parameter.low, parameter.high, 20)
 
 
 def _measure_left(name: str, other: str | None, history: History) -> float:
@@ -335,7 +310,7 @@ def _measure_left(name: str, other: str | None, history: History) -> float:
     other: another effect beside the base model, with the constants that leave least.
     """
     every = _trajectories(name, history)
-    y = every[len(every) // 3][:, 0]
+    y = every[2 * len(every) // 3][:, 0]  # of the delays, a positive one
     base = np.column_stack([np.ones(len(history.times)), history.temperature()])
     beside = [np.zeros((len(y), 0))] if other is None else _trajectories(other, history)
     left = []

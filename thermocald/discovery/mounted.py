@@ -17,9 +17,11 @@ from thermocald.discovery.search import Search, Solution, by_score, say_searched
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Proportional
+from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.movement import (
     Mount,
+    add_tremble,
     estimate_mount_motion,
     find_combinations,
     guess_mount_motion,
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.physics.model import ModelEffect
-    from thermocald.thermal.fit import HypothesisFitter
 
 _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
@@ -48,18 +49,21 @@ def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
     given: Sequence[ModelEffect],
+    walks: bool,
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks one by one while the penalised likelihood improves.
 
-    Returns the best solution, the single effects by score, all solutions tried, each with its
-    movement, and a search whose trajectories can be reused in the best solution's fitter.
+    walks: whether the tremble is the fast part of a movement. Returns the best solution, the single
+    effects by score, all solutions tried, each with its movement, and a search whose trajectories
+    can be reused in the best solution's fitter.
     """
     first = Search(fitter)
     start = first.base(given)
     W = find_combinations(fitter.series)
-    guess = guess_mount_motion(fitter, start.fit, W)
+    # beside a movement as large as the whole misfit, a scan would find no effect
+    guess = guess_mount_motion(fitter, start.fit, W, walks=False)
     say("estimating how the camera moves on its mount")
-    trials = [_fit_beside(start, Mount(W, guess, corner), 4) for corner in _CORNERS]
+    trials = [_fit_beside(start, Mount(W, guess, corner, walks), 4) for corner in _CORNERS]
     plain = best = min(trials, key=by_score)
     ranking, seen = list[Solution](), list[Solution]()
     for level in range(_LEVELS):
@@ -100,9 +104,11 @@ def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
 
 def fit_beside_walk(solution: Solution) -> Solution:
     """Fit a solution beside a random walk of the camera, as large as the solution leaves it."""
-    W = find_combinations(solution.fitter.series)
-    guess = guess_mount_motion(solution.fitter, solution.fit, W)
-    return _fit_beside(solution, Mount(W, guess, 0.0), 5)
+    fitter = HypothesisFitter(add_tremble(solution.fitter, solution.fit))
+    fit = fitter.fit(solution.terms, solution.fit.coefficients)
+    W = find_combinations(fitter.series)
+    mount = Mount(W, guess_mount_motion(fitter, fit, W, walks=True), 0.0)
+    return _fit_beside(replace(solution, fit=fit, fitter=fitter), mount, 5)
 
 
 def _settle(solution: Solution, best: float) -> Solution:
@@ -128,7 +134,8 @@ def _profile(best: Solution, solution: Solution) -> Solution:
     best: the solution that it extends, in the same fitter, with its movement.
     """
     assert best.mount is not None
-    guess = guess_mount_motion(best.fitter, solution.fit, best.mount.combinations)
+    W, walks = best.mount.combinations, best.mount.walks
+    guess = guess_mount_motion(best.fitter, solution.fit, W, walks)
     # with a share of the movement before, since a direction that starts at zero stays zero
     mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
     fitted = _fit_beside(solution, mount, 5)

@@ -7,9 +7,7 @@ would be found, which remain ambiguous, and which experiment separates them.
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,10 +23,11 @@ from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import ReducedSeries, SeriesInput, unit_directions
-from thermocald.thermal.source import series_input
+from thermocald.thermal.source import epochs_input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from pathlib import Path
 
     from thermocald.arrays import Array
     from thermocald.physics.simulation import Simulation
@@ -119,12 +118,7 @@ def set_ups(
 
 
 def _record(simulation: Simulation) -> SeriesInput:
-    from thermocald.store.recording.reader import read_recording
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plan"
-        simulation.write(path)
-        return series_input(read_recording(path))
+    return epochs_input(simulation.head, simulation.field, list(simulation.epochs()), "plan")
 
 
 def plan_power(

@@ -24,7 +24,7 @@ import numpy as np
 from thermocald.discovery import criteria
 from thermocald.physics import catalogue
 from thermocald.thermal.hypothesis import BASE, Candidate, Term, make_candidate, make_known_term
-from thermocald.thermal.scan import Scanner
+from thermocald.thermal.scan import count_trials, scan_candidate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -125,12 +125,11 @@ class Search:
         progress: Callable[[str], None] | None = None,
         like: Search | None = None,
     ) -> None:
-        """Prepare a search; like: one in the same histories, whose trajectories are reused."""
+        """Prepare a search; like: one in the same histories, whose candidates are reused."""
         self.fitter = fitter
         self.candidates: list[Candidate] = (
             like.candidates if like else list_candidates(fitter.series)
         )
-        self.scanner: Scanner = Scanner(fitter, like.scanner if like else None)
         self.epochs = sum(int((e.n > 0).sum()) for e in fitter.series)
         # the more the noise is correlated, the less certain is its model
         self.margin = criteria.MARGIN * max(e.correlation for e in fitter.series)
@@ -157,7 +156,7 @@ class Search:
         if not candidate.kind.is_event:
             key = (candidate.effect, candidate.parameters)
             if key not in self._trials:
-                self._trials[key] = self.scanner.trials(candidate)
+                self._trials[key] = count_trials(self.fitter, candidate)
             best = scan.best
             value = float(candidate.grid[best]) if len(candidate.grid) else None
             penalty = (count + (value is not None)) * each + once
@@ -228,7 +227,7 @@ class Search:
         """
         if solution.fit not in self._scanned:
             self._scanned[solution.fit] = [
-                self.promise(c, self.scanner.scan(c, solution.fit))
+                self.promise(c, scan_candidate(self.fitter, c, solution.fit))
                 for c in self.candidates
                 if c.effect not in solution.names
             ]
@@ -283,7 +282,7 @@ class Search:
             candidate = next((c for c in self.candidates if (c.effect, c.parameters) == key), None)
             if candidate is None:  # a knock of the mount
                 continue
-            gains = self.scanner.scan(candidate, solution.fit).gains
+            gains = scan_candidate(self.fitter, candidate, solution.fit).gains
             for s, now in enumerate(term.fresh):
                 if now is None:
                     continue

@@ -42,16 +42,7 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
     this movement.
     """
     a, e = x.base_adequacy[0] if alone.adequate else alone, x.fitter.series[0]
-    rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
-    rest = rest - rest.mean(axis=0)
-    seen = e.columns[e.weights[..., 0].any(axis=0)].reshape(-1, rest.shape[1])
-    metric = seen.T @ seen / len(seen)
-    moved = rest.T @ rest / len(rest)
-    size = float(np.sqrt(np.sum(metric * moved)))
-    values, vectors = np.linalg.eigh(metric)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    u, s, _ = np.linalg.svd(rest @ root, full_matrices=False)
-    course_px = u[:, 0] * s[0]
+    size, course_px, share, parameters = _measure_movement(e, a)
     rate, channels = _recorded(e)
     recorded = {**channels, "rate of temperature": rate, "time": e.times, "sigma0": e.sigma0}
     correlation = {
@@ -64,7 +55,6 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
     duration = float(e.times[-1] - e.times[0])
     most = np.abs(course_px - course_px.mean())
     large = np.flatnonzero(most > 0.5 * most.max())
-    parameters = _choose_movers(metric, moved)
     amplitudes = a.amplitudes / e.scale
     strongest = max(correlation, key=lambda k: abs(correlation[k]))
     moving = ", ".join(map(parameter_label, parameters))
@@ -87,7 +77,7 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
         },
         {
             "correlation": correlation,
-            "share_of_first_pattern": float(s[0] ** 2 / np.sum(s**2)),
+            "share_of_first_pattern": share,
             "significance_sigmas": float(a.significance),
             # explains the rest in this series only: amplitudes of cos(k π t / duration),
             # k = 1, 2, …, t from the first frame, in each parameter's own unit
@@ -104,6 +94,24 @@ def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
         },
         [],
     )
+
+
+def _measure_movement(e: ReducedSeries, a: Adequacy) -> tuple[float, Array, float, list[str]]:
+    """Measure the movement of the image in a misfit.
+
+    Returns its RMS, px, its strongest pattern's course (E,) and share, and the parameters that move
+    the image.
+    """
+    rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
+    rest = rest - rest.mean(axis=0)
+    seen = e.columns[e.weights[..., 0].any(axis=0)].reshape(-1, rest.shape[1])
+    metric = seen.T @ seen / len(seen)
+    moved = rest.T @ rest / len(rest)
+    values, vectors = np.linalg.eigh(metric)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    u, s, _ = np.linalg.svd(rest @ root, full_matrices=False)
+    size, share = float(np.sqrt(np.sum(metric * moved))), float(s[0] ** 2 / np.sum(s**2))
+    return size, u[:, 0] * s[0], share, _choose_movers(metric, moved)
 
 
 def _choose_movers(metric: Array, moved: Array) -> list[str]:

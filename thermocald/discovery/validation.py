@@ -31,7 +31,7 @@ from thermocald.discovery import criteria
 from thermocald.photogrammetry.linalg import orthonormal_combinations, subtract_level
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import solve_combinations
-from thermocald.thermal.scan import gains_beside
+from thermocald.thermal.scan import gains_beside, scan_candidate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,10 +95,8 @@ def is_confirmed(gain: Array) -> bool:
 def _keep_epochs(fitter: HypothesisFitter, masks: Sequence[NDArray[np.bool_]]) -> HypothesisFitter:
     """Return a fitter with the weights of some epochs only and the same trajectories."""
     pairs = zip(fitter.series, masks, strict=True)
-    part = HypothesisFitter([replace(e.weighted(m.astype(float)), n=e.n * m) for e, m in pairs])
-    part.thermometer_factor = fitter.thermometer_factor
-    part.share_trajectories(fitter)
-    return part
+    part = [replace(e.weighted(m.astype(float)), n=e.n * m) for e, m in pairs]
+    return HypothesisFitter(part, like=fitter)
 
 
 _FIRST = 20  # surrogates, one of which suffices to drop a name
@@ -140,7 +138,7 @@ def compare_with_surrogates(
     scans: list[tuple[Candidate, Scan, float]] = []
     for candidate in search.candidates:
         if candidate.effect not in without.names:
-            scan = search.scanner.scan(candidate, without.fit)
+            scan = scan_candidate(search.fitter, candidate, without.fit)
             scans.append((candidate, scan, search.promise(candidate, scan).penalty))
     without.fit.forget()
     tops = np.zeros(0)

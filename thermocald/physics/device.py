@@ -85,11 +85,6 @@ class Programme:
     begin: float = 1_600_000_000.0
     initial: float | None = None
 
-    @property
-    def duration(self) -> float:
-        """The nominal time from the first frame to the last, s."""
-        return (self.epochs - 1) * self.interval
-
 
 def read_programme(path: Path) -> Programme:
     """Read a programme file; ConfigurationError names the file, the key, and any gap."""
@@ -214,10 +209,10 @@ def read_camera_device(path: Path) -> CameraDevice:
         group = top.inner("thermometers")
         thermometers = {str(n): read_thermometer(group.inner(n)) for n in group.mapping}
     for name, thermometer in thermometers.items():
-        if thermometer.body not in (*network.bodies, *network.boundaries):
+        if thermometer.body not in (*network.capacities, *network.boundaries):
             raise top.fail(
                 f"thermometers.{name}.body",
-                f"is {thermometer.body!r}; bodies are {', '.join(network.bodies)}",
+                f"is {thermometer.body!r}; bodies are {', '.join(network.capacities)}",
             )
     if not thermometers:
         raise top.fail("thermometers", "is empty; give at least one thermometer")

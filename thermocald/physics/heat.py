@@ -221,11 +221,6 @@ class HeatNetwork:
                 raise ConfigurationError(f"neither {first!r} nor {second!r} is a body")
 
     @property
-    def bodies(self) -> tuple[str, ...]:
-        """The names of the bodies."""
-        return tuple(self.capacities)
-
-    @property
     def boundaries(self) -> tuple[str, ...]:
         """The names of the boundaries, whose temperatures are given."""
         names = dict.fromkeys(n for link in self.links for n in link[:2])
@@ -233,7 +228,7 @@ class HeatNetwork:
 
     def _matrices(self) -> tuple[Array, Array, Array]:
         """Return capacities (n,), conductance matrix (n, n), conductances to boundaries (n, m)."""
-        names, n = [*self.bodies, *self.boundaries], len(self.bodies)
+        names, n = [*self.capacities, *self.boundaries], len(self.capacities)
         G = np.zeros((len(names), len(names)))
         for first, second, conductance in self.links:
             i, j = names.index(first), names.index(second)
@@ -263,7 +258,7 @@ class HeatNetwork:
             if name not in self.capacities:
                 raise ConfigurationError(
                     f"a source heats {name!r}, which is not a body; the bodies are "
-                    f"{', '.join(self.bodies)}"
+                    f"{', '.join(self.capacities)}"
                 )
         inner = [c.times for c in (*powers.values(), *temperatures.values())]
         last = float(t.max(initial=0.0))
@@ -275,7 +270,7 @@ class HeatNetwork:
             for j, name in enumerate(self.boundaries):
                 q += B[:, j : j + 1] * temperatures[name].at(grid, side)
             for name, course in powers.items():
-                q[self.bodies.index(name)] += course.at(grid, side)
+                q[list(self.capacities).index(name)] += course.at(grid, side)
         root = np.sqrt(capacity)
         rate, modes = np.linalg.eigh(K / np.outer(root, root))
         into = (modes / root[:, None]).T
@@ -288,7 +283,7 @@ class HeatNetwork:
         )  # fmt: skip
         solved = (modes / root[:, None]) @ z
         place = np.searchsorted(grid, t)
-        result = {name: solved[i, place] for i, name in enumerate(self.bodies)}
+        result = {name: solved[i, place] for i, name in enumerate(self.capacities)}
         for name in self.boundaries:
             result[name] = temperatures[name].at(t)
         return result

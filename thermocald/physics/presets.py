@@ -134,6 +134,19 @@ PRESETS: Mapping[str, Preset] = {
 """The presets, by name."""
 
 
+_LOSS = 0.2375  # W/K
+_HOUSED = HeatNetwork(
+    {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
+    (
+        ("board", "housing", 6.0),
+        ("lens", "housing", 0.4),
+        ("sensor", "lens", 0.2),
+        ("housing", "ambient", _LOSS),
+    ),
+)
+"""A camera module in a housing that cools in air: 63 % of the change in 300 s."""
+
+
 def preset_simulation(
     name: str, seed: int = 0, series: str = "M1", field: TestField | None = None
 ) -> Simulation:
@@ -144,18 +157,9 @@ def preset_simulation(
     if name not in PRESETS:
         raise ConfigurationError(f"unknown preset {name!r}; known are: {', '.join(PRESETS)}")
     preset = PRESETS[name]
-    # a camera module in a housing that cools in air: 63 % of the change in 300 s
-    loss = 0.2375
-    links = (
-        ("board", "housing", 6.0),
-        ("lens", "housing", 0.4),
-        ("sensor", "lens", 0.2),
-        ("housing", "ambient", loss),
-    )
-    network = HeatNetwork({"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4}, links)
-    device = CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
+    device = CameraDevice(preset.camera, preset.sensor, _HOUSED, distance=preset.distance_mm)
     ambient = preset.begin_degc if preset.lamp else 23.0
-    power = loss * (preset.end_degc - ambient)
+    power = _LOSS * (preset.end_degc - ambient)
     lamp = Course.steps([0.0, _HEATED_S, _EPOCHS * _INTERVAL_S + 50.0], [power, 0.0])
     programme = Programme(
         preset.name,
@@ -176,9 +180,14 @@ def preset_simulation(
         image_sigma=device.measuring.sigma,
         name=preset.name,
     )
+    still = Simulation(bare, device, test_field, programme, seed)
     # without jitter, the temperature at the frames depends neither on the seed nor on the drift
-    course = Simulation(bare, device, test_field, programme).true_history.temperature()
-    warming = float(np.max(np.abs(course - course[0])))
+    course = still.true_history.temperature()
+    return replace(still, model=_add_drift(bare, preset, float(np.max(np.abs(course - course[0])))))
+
+
+def _add_drift(bare: ThermalModel, preset: Preset, warming: float) -> ThermalModel:
+    """Return the model with the preset's drift over a warming by some K."""
     angle = np.deg2rad(preset.direction_deg)
     way = preset.drift_px * preset.sensor.pixel_pitch * np.array([np.cos(angle), np.sin(angle)])
     x0, y0 = (way / warming).tolist()
@@ -190,7 +199,7 @@ def preset_simulation(
         (lambda e: e.usual == ("B1", "B2"), {"B1": b1, "B2": b2}),
         (lambda e: e.seen_in == "noise", {"factor": (preset.noise_ratio - 1.0) / warming}),
     ]
-    model = replace(
+    return replace(
         bare,
         rates={"c": preset.drift_c_mm / warming, "x0": returns * x0, "y0": returns * y0},
         effects=tuple(
@@ -199,7 +208,6 @@ def preset_simulation(
             if any(sizes.values())
         ),
     )
-    return Simulation(model, device, test_field, programme, seed)
 
 
 def given_simulation(

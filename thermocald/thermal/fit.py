@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
+    from thermocald.thermal.hypothesis import Candidate
 
 
 T = TypeVar("T")
@@ -45,18 +46,20 @@ _PERIODS = 1.6  # least number of periods in a series; a scan begins at 1.8
 
 
 class HypothesisFitter:
-    """The fitter of hypotheses to some series, with what all hypotheses have in common."""
+    """The fitter of hypotheses to some series, with what all hypotheses have in common.
 
-    def __init__(self, series: Sequence[ReducedSeries]) -> None:
+    like: a fitter of the same histories, whose trajectories are shared; stacks: those of scans.
+    """
+
+    def __init__(
+        self, series: Sequence[ReducedSeries], like: HypothesisFitter | None = None
+    ) -> None:
         self.series = tuple(series)
-        self.thermometer_factor = 1.0
+        self.thermometer_factor: float = like.thermometer_factor if like else 1.0
+        self.stacks: dict[tuple[Candidate, int], Array] = like.stacks if like else {}
         self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
         self.priors: dict[str, tuple[float, float]] = {}  # {non-linear parameter: value, sd}
-        self._caches: dict[str, dict[Any, Any]] = {}
-
-    def share_trajectories(self, other: HypothesisFitter) -> None:
-        """Share the trajectories that a fitter of the same histories has computed."""
-        self._caches = other._caches
+        self._caches: dict[str, dict[Any, Any]] = like._caches if like else {}
 
     def _once(self, what: str, key: Any, compute: Callable[[], T], most: int = 60) -> T:
         """Compute a value once; a cache with more than `most` values is emptied first."""
@@ -420,7 +423,8 @@ class HypothesisFitter:
         """Refine a fit in better series, if there are any; they replace the fitter's."""
         if better is None:
             return fit
-        self.series, self.thermometer_factor, self._caches = tuple(better), 1.0, {}
+        self.series, self.thermometer_factor = tuple(better), 1.0
+        self.stacks, self._caches = {}, {}
         return self.refine(self.fit(fit.terms, fit.coefficients), 20, least_squares=True)
 
 

@@ -3,9 +3,9 @@
 Physical constants are shared by the series. Levels belong to one series, and so do the times and
 phases that are `fresh` parameters of an effect.
 
-Fit and discovery have the same grid of trial values for a non-linear parameter. It covers whatever
-the recordings can show, as finely as they can resolve it, so that no result depends on a lucky
-start value.
+Fit, discovery and the plan of an experiment have the same grid of trial values for a non-linear
+parameter. It covers whatever the recordings can show, as finely as they can resolve it, so that no
+result depends on a lucky start value.
 
 For a fit, a user gives an effect as `--effect NAME[:PARAMETER=VALUE,…]`:
 
@@ -227,12 +227,10 @@ def make_known_term(name: str, values: Mapping[str, Any], series: int) -> Term:
     return Term(name, parameters or BASE, shared, fresh)
 
 
-def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array:
-    """Choose the values to scan by the parameter's role, for the first series' times and range."""
-    first = series[0]
-    duration = float(first.times[-1])
-    step = float(np.median(np.diff(first.times)))
-    T = first.history.temperature()
+def trial_values(parameter: Parameter, times: Array, T: Array) -> Array:
+    """Choose the values to scan by the parameter's role, for times (E,) s and temperatures °C."""
+    duration = float(times[-1])
+    step = float(np.median(np.diff(times)))
     low, high = float(T.min()), float(T.max())
     match parameter.role:
         case "period":
@@ -246,7 +244,7 @@ def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array
         case "time_constant":
             return np.geomspace(max(0.2 * parameter.low, 0.05 * step), 2.0 * duration, 44)
         case "event":
-            return first.times[1:]
+            return times[1:]
         case "delay":
             reach = min(parameter.high, 0.25 * duration)
             coarse = np.arange(max(parameter.low, -reach), reach, min(0.5 * step, reach / 20)) + 0.1
@@ -308,7 +306,8 @@ def make_candidate(
         own = key in effect.fresh and parameter.role != "event"
         left_out = plain and key in effect.optional
         if not (parameter.text or own or left_out or key in given):
-            return Candidate(effect.name, columns, key, trial_values(parameter, series), fixed)
+            grid = trial_values(parameter, series[0].times, series[0].history.temperature())
+            return Candidate(effect.name, columns, key, grid, fixed)
     return Candidate(effect.name, columns, "", np.zeros(0), fixed)
 
 

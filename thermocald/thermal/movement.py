@@ -53,12 +53,14 @@ _KINKS = 3 * (_FAST + 1)  # differences that a lamp switched three times may ben
 class Mount:
     """A movement of the mount: covariance (m, m) of combinations (P, m), corner in half-waves.
 
-    The combinations have unit variance if there is image noise only.
+    The combinations have unit variance if there is image noise only. walks: whether the tremble is
+    the fast part of this movement.
     """
 
     combinations: Array
     covariance: Array
     corner: float
+    walks: bool = False
 
     def modes(self) -> tuple[Array, Array]:
         """Return the variances and directions (P, ·) of the independent movements that matter."""
@@ -128,16 +130,23 @@ def solve_combinations(N: Array, b: Array, W: Array) -> tuple[Array, Array]:
     return normal, np.linalg.solve(normal, (b @ W)[..., None])[..., 0]
 
 
-def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
-    """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise."""
+def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array, walks: bool) -> Array:
+    """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise.
+
+    walks: whether to count what the weights have taken for a tremble.
+    """
     total = np.zeros((W.shape[1], W.shape[1]))
     count = 0
     for s, e in enumerate(fitter.series):
         w = fit.weightings[s]
-        z = subtract_level(w.N, w.left(fit.parameters(s))) @ W
+        noise = np.eye(len(total))  # with the tremble, which the weights have
+        if walks and e.tremble is not None:
+            along = W.T @ e.N.mean(axis=0) @ e.tremble
+            noise += along @ along.T
+        z = subtract_level(w.N, w.left(fit.parameters(s))) @ W @ noise
         A = waves(e.times, _count_waves(e)).T @ z
         k = np.arange(1, len(A) + 1)
-        total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
+        total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * noise
         count += len(A)
     # EM leaves a zero variance at zero, and rough half-waves can hide a slow drift in the moments
     return symmetric_power(total / count, 1.0, _FLOOR)
@@ -177,9 +186,7 @@ def estimate_mount_motion(
     fitter of the series with the movement, the fit, and the movement.
     """
     for turn in range(max_iterations + 1):
-        own = HypothesisFitter(mount.on(fitter.series))
-        own.thermometer_factor = fitter.thermometer_factor
-        own.share_trajectories(fitter)
+        own = HypothesisFitter(mount.on(fitter.series), like=fitter)
         fit = own.fit(terms, start, 1 if turn else 2)
         start = fit.coefficients
         if turn < max_iterations:

@@ -68,68 +68,59 @@ class Scan:
         return int(np.argmax(np.sum(self.gains, axis=0)))
 
 
-class Scanner:
-    """A scanner of candidates; it computes their trajectories over the grids once.
+def lay_stack(fitter: HypothesisFitter, candidate: Candidate, series: int, fit: Fit) -> Array:
+    """Return a candidate's trajectories (G, E, m) over its grid in a series."""
+    drives = [t for t in fit.terms if t.is_drive]
+    chained = candidate.kind.is_drive and bool(drives)
+    key = (candidate, series)
+    if key in fitter.stacks and not chained:
+        return fitter.stacks[key]
+    if candidate.kind.is_event:
+        times = fitter.series[series].times
+        return (times[None, :, None] >= times[1:, None, None]).astype(float)
+    rows = []
+    for value in candidate.grid if len(candidate.grid) else [None]:
+        term = candidate.term(value, len(fitter.series))
+        if candidate.kind.is_drive:
+            rows.append(fitter.drive_trajectory([*drives, term], series)[:, None])
+        else:
+            rows.append(fitter.trajectories(term, series, operators=False)[0])
+    stack: Array = np.stack(rows)
+    stack -= stack.mean(axis=1, keepdims=True)
+    if not chained:
+        fitter.stacks[key] = stack
+    return stack
 
-    like: a scanner of the same histories with other noise, whose trajectories are shared.
-    """
 
-    def __init__(self, fitter: HypothesisFitter, like: Scanner | None = None) -> None:
-        self.fitter = fitter
-        self._stacks: dict[tuple[Candidate, int], Array] = like._stacks if like else {}
+def scan_candidate(fitter: HypothesisFitter, candidate: Candidate, fit: Fit) -> Scan:
+    """Scan a candidate over its grid beside a fitted hypothesis."""
+    every = range(len(fitter.series))
+    stacks = tuple(lay_stack(fitter, candidate, s, fit) for s in every)
+    parts = []
+    for s in every:
+        C, V, index = fit.designs[s]
+        A, c, B = fit.weightings[s].scan(stacks[s], candidate.directions, (C, V))
+        full = np.zeros((*c.shape, len(fit.coefficients)))
+        full[..., index] = B
+        parts.append((A, c, full))
+    base_A, base_c = fit.normals()
+    columns = [(A, c[..., None], B) for A, c, B in parts]
+    gains = [g[:, 0] for g in gains_beside(candidate, columns, base_A, base_c[:, None])]
+    count = 0 if candidate.kind.is_drive else len(candidate.parameters)
+    count *= 2 * len(gains) if candidate.kind.is_periodic else 1
+    return Scan(tuple(gains), count, stacks, tuple(parts))
 
-    def stack(self, candidate: Candidate, series: int, fit: Fit) -> Array:
-        """Return a candidate's trajectories (G, E, m) over its grid in a series."""
-        fitter = self.fitter
-        drives = [t for t in fit.terms if t.is_drive]
-        chained = candidate.kind.is_drive and bool(drives)
-        key = (candidate, series)
-        if key in self._stacks and not chained:
-            return self._stacks[key]
-        if candidate.kind.is_event:
-            times = fitter.series[series].times
-            return (times[None, :, None] >= times[1:, None, None]).astype(float)
-        rows = []
-        for value in candidate.grid if len(candidate.grid) else [None]:
-            term = candidate.term(value, len(fitter.series))
-            if candidate.kind.is_drive:
-                rows.append(fitter.drive_trajectory([*drives, term], series)[:, None])
-            else:
-                rows.append(fitter.trajectories(term, series, operators=False)[0])
-        stack: Array = np.stack(rows)
-        stack -= stack.mean(axis=1, keepdims=True)
-        if not chained:
-            self._stacks[key] = stack
-        return stack
 
-    def scan(self, candidate: Candidate, fit: Fit) -> Scan:
-        """Scan a candidate over its grid beside a fitted hypothesis."""
-        every = range(len(self.fitter.series))
-        stacks = tuple(self.stack(candidate, s, fit) for s in every)
-        parts = []
-        for s in every:
-            C, V, index = fit.designs[s]
-            A, c, B = fit.weightings[s].scan(stacks[s], candidate.directions, (C, V))
-            full = np.zeros((*c.shape, len(fit.coefficients)))
-            full[..., index] = B
-            parts.append((A, c, full))
-        base_A, base_c = fit.normals()
-        columns = [(A, c[..., None], B) for A, c, B in parts]
-        gains = [g[:, 0] for g in gains_beside(candidate, columns, base_A, base_c[:, None])]
-        count = 0 if candidate.kind.is_drive else len(candidate.parameters)
-        count *= 2 * len(gains) if candidate.kind.is_periodic else 1
-        return Scan(tuple(gains), count, stacks, tuple(parts))
-
-    def trials(self, candidate: Candidate) -> float:
-        """Return the number of independent trajectories of a grid: its length in angles / 90°."""
-        stack = self._stacks.get((candidate, 0))
-        if stack is None or len(stack) < 2:
-            return max(float(len(candidate.grid)), 1.0)
-        s = stack[..., 0]
-        s = s - s.mean(axis=1, keepdims=True)
-        norm = np.linalg.norm(s, axis=1)
-        cosine = np.sum(s[1:] * s[:-1], axis=1) / np.maximum(norm[1:] * norm[:-1], 1e-12)
-        return 1.0 + float(np.sum(np.arccos(np.clip(np.abs(cosine), 0, 1)))) / (np.pi / 2)
+def count_trials(fitter: HypothesisFitter, candidate: Candidate) -> float:
+    """Return the number of independent trajectories of a grid: its length in angles / 90°."""
+    stack = fitter.stacks.get((candidate, 0))
+    if stack is None or len(stack) < 2:
+        return max(float(len(candidate.grid)), 1.0)
+    s = stack[..., 0]
+    s = s - s.mean(axis=1, keepdims=True)
+    norm = np.linalg.norm(s, axis=1)
+    cosine = np.sum(s[1:] * s[:-1], axis=1) / np.maximum(norm[1:] * norm[:-1], 1e-12)
+    return 1.0 + float(np.sum(np.arccos(np.clip(np.abs(cosine), 0, 1)))) / (np.pi / 2)
 
 
 def gains_beside(
@@ -250,7 +241,7 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
     held = {k: v for k, v in numbers.items() if f"{effect.name}.{k}" in fitter.held}
     candidate = make_candidate(kind, names, fitter.series, (*text.items(), *held.items()))
     if kind.is_event:
-        found = Scanner(fitter).scan(candidate, fit)
+        found = scan_candidate(fitter, candidate, fit)
         fresh: list[tuple[tuple[str, Any], ...] | None] = []
         for s, gains in enumerate(found.gains):
             best = int(np.argmax(gains))
@@ -259,7 +250,7 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
             fresh.append(((candidate.name, time),) if gains[best] > least else None)
         return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
     if search and candidate.name:
-        found = Scanner(fitter).scan(candidate, fit)
+        found = scan_candidate(fitter, candidate, fit)
         return candidate.term(float(candidate.grid[found.best]), len(fitter.series))
     return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
 

@@ -225,18 +225,12 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
 
 def _third_differences(t: Array, y: Array) -> Array:
     """Return third divided differences of neighbours, scaled to the variance of one reading."""
-    n = len(t) - 3
-    at = [t[k : k + n] for k in range(4)]
-    total, square = np.zeros(n), np.zeros(n)
-    for i in range(4):
-        product = np.ones(n)
-        for j in range(4):
-            if i != j:
-                apart = at[i] - at[j]
-                product *= np.where(apart == 0.0, 1e-3, apart)
-        total += y[i : i + n] / product
-        square += product**-2.0
-    return np.asarray(total / np.sqrt(square))
+    at, values = np.lib.stride_tricks.sliding_window_view([t, y], len(t) - 3, axis=1)  # (4, n)
+    apart = at[:, None] - at
+    apart[apart == 0.0] = 1e-3
+    apart[np.arange(4), np.arange(4)] = 1.0
+    product = np.prod(apart, axis=1)
+    return np.asarray(np.sum(values / product, axis=0) / np.sqrt(np.sum(product**-2.0, axis=0)))
 
 
 def find_times_between(
@@ -337,20 +331,26 @@ def smooth_channel(
             points, weights = _weigh_neighbours(t, times[row], sharp)
             mixing.rows[row], mixing.data[row] = knot[points].tolist(), weights.tolist()
             trajectory[row] = weights @ smooth[points]
-    if len(rows):
-        bend, limit = _measure_bends(t, filled, noise)
-        for row, i in zip(rows, index, strict=True):
-            share = (times[row] - t[i]) / (t[i + 1] - t[i])
-            mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
-            size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
-            # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; intervals
-            # next to it have a bend too, but no bulge
-            top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
-            trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1]
-            trajectory[row] -= bend[i] / 8 * top
-            sd[row] = 0.12 * size + 0.25 * noise
+    bend, limit = _measure_bends(t, filled, noise)
+    for row, i in zip(rows, index, strict=True):
+        share = (times[row] - t[i]) / (t[i + 1] - t[i])
+        mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
+        bulge, sd[row] = _estimate_kink(bend, limit, i, noise)
+        trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1] - bulge
     deviation = np.nan_to_num(readings - trajectory)
     return Thermometer(times, trajectory, deviation, sd, csr_array(mixing), own, noise)
+
+
+def _estimate_kink(bend: Array, limit: float, i: int, noise: float) -> tuple[float, float]:
+    """Return by how much a kink bulges in the middle of an interval, K, and its sd.
+
+    bend (K - 1,), limit: of `_measure_bends`.
+    """
+    size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
+    # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; intervals next to it
+    # have a bend too, but no bulge
+    top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
+    return float(bend[i] / 8 * top), float(0.12 * size + 0.25 * noise)
 
 
 def _weigh_neighbours(t: Array, at: float, sharp: NDArray[np.bool_]) -> tuple[Index, Array]:

@@ -155,8 +155,7 @@ def examine_series(
         result = _examine_standing(ready, shaking, say, given, jobs)
         if result.walks:
             say("the camera may have moved at random: searching again")
-            guide = result.best.terms
-            result = _examine_beside_mount(calibrated, say, given, jobs, guide) or result
+            result = _examine_beside_mount(calibrated, say, given, jobs, result.best) or result
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
@@ -195,7 +194,7 @@ def _examine_standing(
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
-        known = found.best.terms if _is_short(search, base, found.best) else None
+        known = found.best if _is_short(search, base, found.best) else None
         alongside = _examine_beside_mount(shaking, say, given, jobs, known)
         if alongside is not None:
             return alongside
@@ -459,7 +458,7 @@ def _examine_beside_mount(
     say: Callable[[str], None],
     given: Sequence[ModelEffect],
     jobs: int,
-    guide: Sequence[Term] | None = None,
+    guide: Solution | None = None,
 ) -> Examination | None:
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
@@ -471,7 +470,7 @@ def _examine_beside_mount(
     fitter = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = HypothesisFitter(add_tremble(fitter, fitter.fit(guide or ())))
+    shaken = HypothesisFitter(add_tremble(fitter, fitter.fit(guide.terms if guide else ())))
     beside, ranking, seen, like = search_beside_mount(shaken, say, given, guide is not None)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))

@@ -128,6 +128,8 @@ def choose_exterior(
     if movement.jumps:
         at = f"at row {', '.join(map(str, movement.jumps))}"
         how += f", with jumps {'in a sample of the epochs' if series.windows else at}"
+    if movement.touched and not series.windows:
+        how += f", touched at row {', '.join(map(str, movement.touched))}"
     why = f"the mount moves by {px:.3f} px about its mean pose{how}{doubt}"
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
@@ -158,7 +160,7 @@ def estimate_mount_movement(
     found = estimate_movement(
         N / variance, b / variance, free, good, scale, series.s.drift_period, correlated, gaps
     )
-    if not series.windows or not found.jumps:
+    if not series.windows or not found.steps:
         return found
     # where between the parts of a long series the mount moved is not known
     memory = max(found.memory, len(N) / 2.0)

@@ -1,6 +1,7 @@
-"""Jumps of a series: a knock of the mount, a slip of a lens, and what happened in a gap.
+"""Jumps of a series: a knock of the mount, a slip of a lens, a touch, and what happened in a gap.
 
-The trajectory may have jumps, if the mount was knocked or a lens slipped. A jump that the
+The trajectory may have jumps, if the mount was knocked or a lens slipped; a mount that was touched
+is elsewhere for one epoch. A jump that the
 perspective attributes to the interior orientation is the camera's; every other one is a step of the
 mount's mean pose, estimated from the jump itself. In a gap the camera may drift: only the
 perspective shows whether the mount moved, and by how much.
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
     Step = tuple[Array, Array]
     """A step (k,) of the pose and the weights (k, k) of what is known of it."""
+    Rows = tuple[int, int]
+    """The first epoch of a step, and the first one after it."""
 
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
@@ -35,12 +38,27 @@ _ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from b
 _LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
 _EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
 _DRIFTS = 39.1  # χ² with 12 degrees of freedom, exceeded by chance in one of 10,000 series
+_TOUCHED = 10.0  # usual deviations from what the epochs before or after predict
+_NEIGHBOURS = 5  # epochs on one side that predict an epoch
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
+
+
+def find_touches(trajectory: Array, scale: Array) -> Mask:
+    """Return the epochs (E,) in which the mount was elsewhere, as if touched.
+
+    trajectory, scale: as in `find_jumps`. An epoch next to an end is not examined.
+    """
+    deviation = least_deviation(trajectory) / scale[:, None]
+    inside = slice(_NEIGHBOURS, len(trajectory) - _NEIGHBOURS)
+    usual = np.maximum(np.median(deviation[inside], axis=0), 1.0)
+    touched = np.zeros(len(trajectory), dtype=bool)
+    touched[inside] = (deviation[inside] > _TOUCHED * usual).any(axis=1)
+    return touched
 
 
 def find_jumps(
     trajectory: Array, M: Array, g: Array, scale: Array, gaps: Sequence[int]
-) -> tuple[Array, dict[int, Step], Array]:
+) -> tuple[Array, dict[Rows, Step], Array]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; scale
@@ -48,16 +66,16 @@ def find_jumps(
     after each gap. Returns the trajectory without any jumps, what is known of the mount's by their
     first epoch, and the covariance (k, k) of a step in a gap that shows none.
     """
-    jumps: dict[int, Step]
-    left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
+    jumps: dict[Rows, Step]
+    left, jumps, hidden, end = trajectory.copy(), {}, np.zeros(M.shape[1:]), len(M)
     # in a gap the camera drifts, too: only the perspective shows how far the mount moved
     for row in gaps:
         step, _ = _step(left, row)
         left[row:] -= step
-        jumps[row] = np.zeros_like(step), _loose(step)
+        jumps[row, end] = np.zeros_like(step), _loose(step)
     for row, (moved, V) in zip(gaps, estimate_steps(M, g, jumps), strict=True):
         if _chi2(moved, V) < _SHOWN:
-            del jumps[row]
+            del jumps[row, end]
             hidden = max(hidden, V, key=np.trace)
     pair = np.hypot(scale[1:], scale[:-1])[:, None]
     change = _without_drift(np.diff(left, axis=0)) / pair
@@ -85,34 +103,34 @@ def find_jumps(
             variance = np.diag(factor * sds**2) + np.outer(bend, bend) / 12.0
         else:
             beside = _step_beside_bend(left, row, sds)
-            if beside is None or beside[0] in jumps:
+            if beside is None or (beside[0], end) in jumps:
                 continue
             row, step, variance = beside
         left[row:] -= step
         if jump := _find_mover(row, step, variance, M, g):
-            jumps[row] = jump
+            jumps[row, end] = jump
     return left, dict(sorted(jumps.items())), hidden
 
 
-def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[Array, Array]]:
-    """Estimate the steps (k,) of the pose at some epochs, and their covariances (k, k).
+def estimate_steps(M: Array, g: Array, jumps: Mapping[Rows, Step]) -> list[tuple[Array, Array]]:
+    """Estimate the steps (k,) of the pose in some epochs, and their covariances (k, k).
 
-    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps, in order of time.
+    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps.
     """
-    k = g.shape[1]
-    starts = [0, *jumps]
-    sums = [M[row:].sum(axis=0) for row in starts]
-    each = range(len(starts))
-    N = np.block([[sums[max(i, j)] for i in each] for j in each])
-    right = np.concatenate([g[row:].sum(axis=0) for row in starts])
+    n, k = g.shape
+    rows = [(0, n), *jumps]
+    N = np.zeros((len(rows), k, len(rows), k))
+    for i, (first, end) in enumerate(rows):
+        for j, (begin, last) in enumerate(rows):
+            N[i, :, j] = M[max(first, begin) : min(end, last)].sum(axis=0)
+    right = np.stack([g[first:end].sum(axis=0) for first, end in rows])
     for j, (step, weights) in enumerate(jumps.values(), start=1):
-        own = np.arange(j * k, (j + 1) * k)
-        N[own[:, None], own] += weights
-        right[own] += weights @ step
-    Q = inverse_of_determined(N)
-    found = (Q @ right).reshape(-1, k)
-    Q = Q.reshape(len(starts), k, len(starts), k)
-    return [(found[j], Q[j, :, j]) for j in each[1:]]
+        N[j, :, j] += weights
+        right[j] += weights @ step
+    Q = inverse_of_determined(N.reshape(right.size, right.size))
+    found = (Q @ right.ravel()).reshape(-1, k)
+    Q = Q.reshape(N.shape)
+    return [(found[j], Q[j, :, j]) for j in range(1, len(rows))]
 
 
 def find_drift(M: Array, g: Array) -> Array:
@@ -131,6 +149,19 @@ def find_drift(M: Array, g: Array) -> Array:
         return np.zeros((k, k))
     course: Array = basis[:, 1:] @ drift.reshape(2, k)
     return np.asarray(course.T @ course / n)
+
+
+def least_deviation(trajectory: Array) -> Array:
+    """Return how far each epoch of a trajectory (E, k) is from the parabola through those before it
+    or after it, whichever is nearer: a spike is far from both, a kink from one.
+    """
+    n = _NEIGHBOURS
+    predict = np.linalg.pinv(np.vander(np.arange(1.0, n + 1), 3))[-1]  # at 0
+    windows = np.lib.stride_tricks.sliding_window_view(trajectory, n, axis=0)
+    out = np.full((2, *trajectory.shape), np.inf)
+    out[0, :-n] = np.abs(trajectory[:-n] - windows[1:] @ predict)
+    out[1, n:] = np.abs(trajectory[n:] - windows[:-1] @ predict[::-1])
+    return np.asarray(out.min(axis=0))
 
 
 def _without_drift(change: Array) -> Array:
@@ -219,7 +250,7 @@ def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> S
     step (k,), variance (k, k): of the trajectory. If the perspective excludes neither that the
     mount jumped nor that the camera did, it alone shows how far.
     """
-    ((moved, V),) = estimate_steps(M, g, {row: (step, np.zeros_like(variance))})
+    ((moved, V),) = estimate_steps(M, g, {(row, len(M)): (step, np.zeros_like(variance))})
     if _chi2(moved, V) > _EXCLUDED:
         return step, np.asarray(np.linalg.inv(variance), dtype=np.float64)
     if _chi2(step - moved, V + variance) > _EXCLUDED:

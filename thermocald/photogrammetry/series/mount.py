@@ -28,7 +28,14 @@ from thermocald.photogrammetry.linalg import (
     unit_diagonal,
 )
 from thermocald.photogrammetry.series.covariances import pose_equations
-from thermocald.photogrammetry.series.jumps import SIDE, estimate_steps, find_drift, find_jumps
+from thermocald.photogrammetry.series.jumps import (
+    SIDE,
+    estimate_steps,
+    find_drift,
+    find_jumps,
+    find_touches,
+    least_deviation,
+)
 from thermocald.photogrammetry.series.target_noise import slow_course
 from thermocald.photogrammetry.series.variance_components import components, mean_variance
 
@@ -48,10 +55,11 @@ class Movement:
     white, slow (6, 6): covariances of the exterior orientation, rad and mm, for movements without
     and with memory; memory: epochs after which the slow movement has lost 63 % of its correlation;
     noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
-    first epoch after each jump of the mean pose; steps: the jumps, each with the course (E,) of a
-    unit step about its mean, the step (6,) and its covariance (6, 6); hidden (6, 6): covariance of
-    a step in a gap that shows none; drift (6, 6): mean square of a drift that the perspectives of
-    all epochs show together.
+    first epoch after each jump of the mean pose; steps: the jumps and touches, each with the course
+    (E,) of a unit step, about its mean if it lasts, the step (6,) and its covariance (6, 6); hidden
+    (6, 6): covariance of a step in a gap that shows none; drift (6, 6): mean square of a drift that
+    the perspectives of all epochs show together; touched: the epochs in which the mount was
+    elsewhere.
     """
 
     white: Array
@@ -62,6 +70,7 @@ class Movement:
     steps: tuple[tuple[Array, Array, Array], ...] = ()
     hidden: Array = field(default_factory=lambda: np.zeros((6, 6)))
     drift: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    touched: tuple[int, ...] = ()
 
     @property
     def shifts(self) -> Array:
@@ -95,7 +104,7 @@ class Movement:
     @property
     def still(self) -> bool:
         """Whether the movement is hidden by the noise of one epoch in every direction."""
-        return not self.jumps and self.over_noise < _HIDDEN
+        return not self.steps and self.over_noise < _HIDDEN
 
     def _whitening(self) -> Array:
         """Return T (6, 6) with T · noise · Tᵀ = 1."""
@@ -151,7 +160,6 @@ _WEAK = 3.0  # times the usual variance of a parameter, beyond which an epoch is
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
 _LEAST_NOISE = 0.2  # variance with correlated errors, whose estimate may even be negative
-_NEIGHBOURS = 5  # epochs on one side that predict an epoch
 _FOLLOWED = 1e-9  # share of a movement that the free parameters follow, beyond rounding
 _PERIODS = 2.5  # periods that a series must have to show a drift
 
@@ -224,8 +232,14 @@ def estimate_movement(
     pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
     pauses = _apart(pauses, len(rows), SIDE)
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
-    trajectory, jumps, hidden = find_jumps(trajectory, M, g, scale, pauses)
+    without_jumps, jumps, hidden = find_jumps(trajectory, M, g, scale, pauses)
+    touched = find_touches(without_jumps, scale)
+    trajectory = _fill(without_jumps, touched)
+    for row in np.flatnonzero(touched).tolist():  # the mount's, or a part of it the camera's
+        away = without_jumps[row] - trajectory[row]
+        jumps[row, row + 1] = away, np.eye(6) / float(away @ away)
     steps = estimate_steps(M, g, jumps)
+    drift = find_drift(M * ~touched[:, None, None], g * ~touched[:, None])
     # what the free parameters do not follow is the mount's, however slow
     found = [
         _separate(trajectory, axes[:, part], alike[part], *how)
@@ -243,14 +257,18 @@ def estimate_movement(
         slow[steady:] = np.maximum(slow[steady:], share * usual[steady:])
     # the directions are uncertain themselves, so that movements leak into all others
     white = np.maximum(white, np.count_nonzero(white + slow) / len(trajectory) - slow)
-    axes, first = back @ directions, tuple(int(rows[k]) for k in jumps)
+    axes, first = back @ directions, [int(rows[row]) for row, _ in jumps]
+    lasting = len(first) - int(touched.sum())
+    courses = [slow_course(len(good), row) for row in first[:lasting]]
+    courses += [(np.arange(len(good)) == row).astype(float) for row in first[lasting:]]
     moved = tuple(
-        (slow_course(len(good), row), back @ step, back @ V @ back.T)
-        for row, (step, V) in zip(first, steps, strict=True)
+        (course, back @ step, back @ V @ back.T)
+        for course, (step, V) in zip(courses, steps, strict=True)
     )
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
-        first, moved, back @ hidden @ back.T, back @ find_drift(M, g) @ back.T,
+        tuple(first[:lasting]), moved, back @ hidden @ back.T,
+        back @ drift @ back.T, tuple(first[lasting:]),
     )  # fmt: skip
 
 
@@ -337,7 +355,7 @@ def _separate(
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
     beyond = np.maximum(np.abs(rough) - limit, 0.0)
     if period:
-        beyond[_least_deviation(trajectory) < limit] = 0.0
+        beyond[least_deviation(trajectory) < limit] = 0.0
     rough -= np.copysign(beyond, rough)
     groups = []
     for part in (axes[:, alike > 0.5], axes[:, alike <= 0.5]):
@@ -349,19 +367,6 @@ def _separate(
     size = [len(p) for p in parts]
     white, slow = (np.average([f[k] for f in found], axis=0, weights=size) for k in (0, 1))
     return directions, white, slow, max(f[2] for f in found)
-
-
-def _least_deviation(trajectory: Array) -> Array:
-    """Return how far each epoch of a trajectory (E, k) is from the parabola through those before it
-    or after it, whichever is nearer: a spike is far from both, a kink from one.
-    """
-    n = _NEIGHBOURS
-    predict = np.linalg.pinv(np.vander(np.arange(1.0, n + 1), 3))[-1]  # at 0
-    windows = np.lib.stride_tricks.sliding_window_view(trajectory, n, axis=0)
-    out = np.full((2, *trajectory.shape), np.inf)
-    out[0, :-n] = np.abs(trajectory[:-n] - windows[1:] @ predict)
-    out[1, n:] = np.abs(trajectory[n:] - windows[:-1] @ predict[::-1])
-    return np.asarray(out.min(axis=0))
 
 
 def _fill(trajectory: Array, missing: Mask) -> Array:

@@ -160,11 +160,12 @@ def estimate_mount_movement(
     found = estimate_movement(
         N / variance, b / variance, free, good, scale, series.s.drift_period, correlated, gaps
     )
-    if not series.windows or not found.steps:
+    if not series.windows:
         return found
-    # where between the parts of a long series the mount moved is not known
-    memory = max(found.memory, len(N) / 2.0)
-    return replace(found, slow=found.slow + found.of_jumps, memory=memory, steps=())
+    if found.jumps:  # where between the parts of a long series the mount moved is not known
+        memory = max(found.memory, len(N) / 2.0)
+        found = replace(found, slow=found.slow + found.of_jumps, memory=memory)
+    return replace(found, steps=())
 
 
 def adjust_series(

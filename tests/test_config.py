@@ -91,6 +91,7 @@ def camera(**changes) -> dict:
 BAD = [
     ({}, "neither a camera nor a thermometer"),
     ({"camera": []}, "camera: unknown; is 'cameras' meant?"),
+    ({"format": "thermocald-model/1"}, "is a thermocald-model/1 file, not a configuration"),
     (document(dashbord={}), "dashbord: unknown; is 'dashboard' meant?"),
     (document(store={"pth": "x"}), "store.pth: unknown; is 'path' meant?"),
     (document(store={"path": ""}), "store.path: is ''; must not be empty"),

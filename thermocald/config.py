@@ -487,6 +487,8 @@ def parse_config(
 ) -> Config:
     """Check a configuration given as a mapping; relative paths and messages refer to `path`."""
     hide_secrets(document)
+    if "format" in document:
+        raise ConfigurationError(f"{path}: is a {document['format']} file, not a configuration")
     try:
         config = Config.model_validate(document, context={"folder": path.absolute().parent})
     except ValidationError as cause:

@@ -69,6 +69,7 @@ def test_a_store_gives_the_same_as_its_recording(recording, tmp_path):
     assert series["deviations"]["x0"]["sd_change"] > 5 * one["x0"]["sd_change"]
     free = document("study", store, "--free", "c,x0", "--sets", "500")["cameras"][0]["series"][0]
     assert "A3, B1, B2, C1, C2 were held fixed" in " ".join(free["notes"])  # `--free` was ignored
+    assert "was not examined" in run(recording, "--free", "none", "--sets", "2").stdout
 
 
 @pytest.mark.parametrize(

@@ -269,6 +269,18 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
     assert abs(other - first) > 0.1
 
 
+def test_a_model_is_valid_where_frames_were_taken(folder, tmp_path):
+    """Its range began with a log an hour before the first frame, 15 K lower."""
+    shutil.copytree(folder / "M1", tmp_path / "M1")
+    columns = ("temperature_time", "temperature", "board_temperature")
+    taken = [[float(row[k]) for k in columns] for row in read_rows(tmp_path / "M1" / "epochs.csv")]
+    before = [[taken[0][0] - 30.0 * k, 5.0, 5.0] for k in range(20, 0, -1)]
+    write_table(tmp_path / "M1" / "readings.csv", ("time", *columns[1:]), before + taken)
+    run("fit", tmp_path / "M1", "--output", tmp_path / "m.yaml")
+    low, _ = yaml.safe_load((tmp_path / "m.yaml").read_text())["validity"]["temperature"]
+    assert low > min(T for _, T, _ in taken) - 0.2
+
+
 def test_what_is_outside_is_said(folder, tmp_path):
     """Far outside by name, and a recording in fahrenheit, with which the model is tested."""
     shutil.copytree(folder / "M2", tmp_path / "warm")

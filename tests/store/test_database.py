@@ -199,6 +199,8 @@ def test_plain_sql_can_read_it(filled, store_path):
 def test_no_store(tmp_path):
     with pytest.raises(StoreError, match="there is no such store"):
         Store.open(tmp_path / "none.db")
+    with pytest.raises(StoreError, match="is a folder, not a store"):
+        Store.open(tmp_path)
     with pytest.raises(StoreError, match="its folder does not exist"):
         Store.open(tmp_path / "nowhere" / "none.db", "append")
     assert list(tmp_path.iterdir()) == []

@@ -1,9 +1,9 @@
 """Jumps of a series: a knock of the mount, a slip of a lens, a touch, and what happened in a gap.
 
 The trajectory may have jumps, if the mount was knocked or a lens slipped; a mount that was touched
-is elsewhere for one epoch. A jump that the perspective attributes to the interior orientation is the
-camera's; every other one is a step of the mount's mean pose, estimated from the jump itself. In a
-gap the camera may drift: only the perspective shows whether the mount moved, and by how much.
+is elsewhere for one epoch. A jump that the perspective attributes to the interior orientation is
+the camera's; every other one is a step of the mount's mean pose, estimated from the jump itself. In
+a gap the camera may drift: only the perspective shows whether the mount moved, and by how much.
 """
 
 from __future__ import annotations

@@ -233,7 +233,8 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
     Raises StoreError; StoreVersionError for a file of a newer version.
     """
     if mode == "read" and not path.is_file():
-        raise StoreError(f"{path}: there is no such store")
+        there = "is a folder, not a store" if path.is_dir() else "there is no such store"
+        raise StoreError(f"{path}: {there}")
     if mode == "read" and written_elsewhere(path):
         raise StoreError(
             f"{path}: is or was written under another of its names (hard links) and lacks the "

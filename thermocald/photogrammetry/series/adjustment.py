@@ -285,7 +285,9 @@ def result(
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)
         inner = len(free_columns(s.free))
-        found = _excess(series, estimate.values[:, own[:inner]], variances[:, :inner], sound)
+        left_alone = sound & ~np.isin(np.arange(len(sound)), movement.touched)
+        values = estimate.values[:, own[:inner]]
+        found = _excess(series, values, variances[:, :inner], left_alone)
         # the pose moves itself; its scatter beyond the noise is as large as the interior's
         usual = variances[sound].mean(axis=0) if sound.any() else np.ones(len(own))
         ratio = np.median(found / usual[:inner]) if inner else 0.0

@@ -38,11 +38,12 @@ _LOOSE = 9.0  # times the square of the image's change: variance of a step in an
 _EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
 _DRIFTS = 39.1  # χ² with 12 degrees of freedom, exceeded by chance in one of 10,000 series
 _TOUCHED = 10.0  # usual deviations from what the epochs before or after predict
+_BRIEF = 3  # epochs for which a mount may be touched
 _NEIGHBOURS = 5  # epochs on one side that predict an epoch
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
 
 
-def find_touches(trajectory: Array, scale: Array) -> Mask:
+def _find_touches(trajectory: Array, scale: Array) -> Mask:
     """Return the epochs (E,) in which the mount was elsewhere, as if touched.
 
     trajectory, scale: as in `find_jumps`. An epoch next to an end is not examined.
@@ -57,13 +58,14 @@ def find_touches(trajectory: Array, scale: Array) -> Mask:
 
 def find_jumps(
     trajectory: Array, M: Array, g: Array, scale: Array, gaps: Sequence[int]
-) -> tuple[Array, dict[Rows, Step], Array]:
+) -> tuple[Array, dict[Rows, Step], Array, Mask]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; scale
     (E,): noise of an epoch over the typical one, as a camera may defocus; gaps: the first epoch
     after each gap. Returns the trajectory without any jumps, what is known of the mount's by their
-    first epoch, and the covariance (k, k) of a step in a gap that shows none.
+    epochs, the covariance (k, k) of a step in a gap that shows none, and the epochs (E,) in which
+    the mount was elsewhere, as if touched.
     """
     jumps: dict[Rows, Step]
     left, jumps, hidden, end = trajectory.copy(), {}, np.zeros(M.shape[1:]), len(M)
@@ -79,6 +81,7 @@ def find_jumps(
     pair = np.hypot(scale[1:], scale[:-1])[:, None]
     change = _without_drift(np.diff(left, axis=0)) / pair
     noise = pair * np.maximum(mad_sd(change, axis=0), 1.0)
+    touches: list[tuple[slice, Array]] = []
     examined = {*gaps}
     while len(examined) < _MOST + len(gaps) and len(left) >= 4 * SIDE:
         every = np.diff(left, axis=0)
@@ -94,21 +97,29 @@ def find_jumps(
         step, factor = _step(left, row)
         lasting = _step(left, row, 1)[0][column]  # a spike is no jump
         certain = abs(step[column]) > _CERTAIN * noise[worst, column] * np.sqrt(factor / 2)
-        if not certain or abs(lasting) < _LASTING * abs(change[worst, column]):
-            continue
+        jumped = certain and abs(lasting) >= _LASTING * abs(change[worst, column])
         sds = noise[worst] / np.sqrt(2.0)
-        bend = _straight_bend(left, row, sds)
+        bend = _straight_bend(left, row, sds) if jumped else None
         if bend is not None:  # which may be anywhere between the two epochs
             variance = np.diag(factor * sds**2) + np.outer(bend, bend) / 12.0
         else:
             beside = _step_beside_bend(left, row, sds)
-            if beside is None or (beside[0], end) in jumps:
+            if beside is None:
                 continue
-            row, step, variance = beside
+            row, last, step, variance = beside
+            if last:
+                left[row:last] -= step
+                touches.append((slice(row, last), step))
+            if last or not jumped or (row, end) in jumps:
+                continue
         left[row:] -= step
         if jump := _find_mover(row, step, variance, M, g):
             jumps[row, end] = jump
-    return left, dict(sorted(jumps.items())), hidden
+    touched = _find_touches(left, scale)
+    for away, step in touches:
+        left[away] += step
+        touched[away] = True
+    return left, dict(sorted(jumps.items())), hidden, touched
 
 
 def estimate_steps(M: Array, g: Array, jumps: Mapping[Rows, Step]) -> list[tuple[Array, Array]]:
@@ -210,9 +221,11 @@ def _straight_bend(trajectory: Array, row: int, sds: Array) -> Array | None:
     return fit[3] * sds if straight and step > rate else None
 
 
-def _step_beside_bend(trajectory: Array, row: int, sds: Array) -> tuple[int, Array, Array] | None:
-    """Return the epoch near `row` at which a trajectory (E, k) steps, the step (k,) and its
-    covariance (k, k); None if a bend alone explains it.
+def _step_beside_bend(
+    trajectory: Array, row: int, sds: Array
+) -> tuple[int, int, Array, Array] | None:
+    """Return the epoch near `row` at which a trajectory (E, k) steps, the one at which it returns
+    (0 if it stays), the step (k,) and its covariance (k, k); None if a bend alone explains it.
 
     sds (k,): of an epoch. The course is a cubic on either side of the bend. A heater is switched
     anywhere between two epochs: if the step is between them too, one hides a part of the other.
@@ -224,8 +237,10 @@ def _step_beside_bend(trajectory: Array, row: int, sds: Array) -> tuple[int, Arr
     cubic = np.broadcast_to(np.vander(t, 4), (len(at), len(t), 4))
     bends = np.concatenate([np.stack([after, after**2, after**3], axis=-1), cubic], axis=-1)
     beyond = np.eye(len(t)) - bends @ np.linalg.pinv(bends)
-    shifts = np.arange(-_BESIDE, _BESIDE + 1)
-    steps = (rows[:, None] >= row + shifts).astype(float)
+    spans = [(row + k, 0) for k in range(-_BESIDE, _BESIDE + 1)]
+    brief = range(1, _BRIEF + 1)
+    spans += [(row, row + m) for m in brief] + [(row - m, row) for m in brief]
+    steps = np.array([(rows >= a) & ~((rows >= b) & (b > 0)) for a, b in spans]).T.astype(float)
     left, free = beyond @ y, beyond @ steps
     least = (left**2).sum(axis=(1, 2))
     gain = ((np.swapaxes(free, 1, 2) @ left) ** 2).sum(axis=2)
@@ -233,14 +248,15 @@ def _step_beside_bend(trajectory: Array, row: int, sds: Array) -> tuple[int, Arr
     bend, k = np.unravel_index(int((least[:, None] - gain).argmin()), gain.shape)
     if least.min() - least[bend] + gain[bend, k] < _CERTAIN_CHI2:
         return None
-    apart = at - (shifts[k] - 0.5)
+    first, last = spans[k]
+    apart = at - (first - row - 0.5)
     together = abs(apart[bend]) < 0.7
     model = np.column_stack([steps[:, k], bends[np.abs(apart).argmin() if together else bend]])
     estimator = np.linalg.pinv(model)
     step, rate = (estimator @ trajectory[rows])[:2]
     variance = np.diag(estimator[0] @ estimator[0] * sds**2)
     variance += together * np.outer(rate, rate) / (12.0 * SIDE**2)
-    return row + int(shifts[k]), step, variance
+    return first, last, step, variance
 
 
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:

@@ -33,7 +33,6 @@ from thermocald.photogrammetry.series.jumps import (
     estimate_steps,
     find_drift,
     find_jumps,
-    find_touches,
     least_deviation,
 )
 from thermocald.photogrammetry.series.target_noise import slow_course
@@ -232,8 +231,7 @@ def estimate_movement(
     pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
     pauses = _apart(pauses, len(rows), SIDE)
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
-    without_jumps, jumps, hidden = find_jumps(trajectory, M, g, scale, pauses)
-    touched = find_touches(without_jumps, scale)
+    without_jumps, jumps, hidden, touched = find_jumps(trajectory, M, g, scale, pauses)
     trajectory = _fill(without_jumps, touched)
     for row in np.flatnonzero(touched).tolist():  # the mount's, or a part of it the camera's
         away = without_jumps[row] - trajectory[row]

@@ -92,12 +92,13 @@ class Machine:
     def _command(self) -> list[str]:
         kernel_line = (
             "console=ttyS0 root=/dev/vda rw quiet loglevel=4 mitigations=off net.ifnames=0 "
-            "systemd.show_status=0"
+            "systemd.show_status=0 panic=-1"
         )
         return [
             *("setpriv", "--pdeathsig", "KILL"),  # QEMU ends with its parent
             *("qemu-system-x86_64", "-M", "q35", "-accel", self.accelerator, "-cpu", CPU),
             *("-smp", "2", "-m", "1536", "-nodefaults", "-no-user-config", "-display", "none"),
+            "-no-reboot",  # a kernel that panics, as v4l2loopback may make it, ends the machine
             *("-kernel", str(self.built / "kernel"), "-initrd", str(self.built / "initrd")),
             *("-append", kernel_line),
             *("-drive", f"file={self.disk},if=virtio,format=qcow2,cache=writeback"),
@@ -138,6 +139,8 @@ class Machine:
         self, command: str, *, check: bool = True, timeout_s: float = 120.0, tries: int = 3
     ) -> subprocess.CompletedProcess[str]:
         """Run a shell command as root in the guest; retry if a busy guest refuses to connect."""
+        if self.process is None or self.process.poll() is not None:
+            raise RuntimeError(f"the guest ended: {(self.folder / 'console').read_text()[-2000:]}")
         quiet = subprocess.DEVNULL
         ssh = [*self._ssh(), command]
         try:

@@ -160,7 +160,7 @@ def test_epochs_in_which_the_mount_was_touched_are_uncertain_and_no_others(touch
         grid, truth = simulate(rng, FIELD, 60, touched=touched, brief=brief, off=off)
         r = scene.adjusted_series(FIELD, grid, exterior="auto")
         assert r.movement.touched == tuple(rows)
-        assert "touched at row 30" in r.choice
+        assert "briefly by more (touched?) at row 30" in r.choice
         error, others = (r.values - truth)[:, PRINCIPAL_POINT], ~np.isin(np.arange(60), rows)
         z = (error - error[others].mean(axis=0)) / r.sd[:, PRINCIPAL_POINT]
         assert np.abs(z[rows]).max() < 2.5

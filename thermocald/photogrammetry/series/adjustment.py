@@ -129,7 +129,8 @@ def choose_exterior(
         at = f"at row {', '.join(map(str, movement.jumps))}"
         how += f", with jumps {'in a sample of the epochs' if series.windows else at}"
     if movement.touched and not series.windows:
-        how += f", touched at row {', '.join(map(str, movement.touched))}"
+        rows = ", ".join(map(str, movement.touched))
+        how += f", and briefly by more (touched?) at row {rows}"
     why = f"the mount moves by {px:.3f} px about its mean pose{how}{doubt}"
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 

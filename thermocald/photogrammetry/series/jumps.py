@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     Step = tuple[Array, Array]
     """A step (k,) of the pose and the weights (k, k) of what is known of it."""
-    Rows = tuple[int, int]
-    """The first epoch of a step, and the first one after it."""
 
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
@@ -48,17 +46,20 @@ def _find_touches(trajectory: Array, scale: Array) -> Mask:
 
     trajectory, scale: as in `find_jumps`. An epoch next to an end is not examined.
     """
+    before, after = _predictions(trajectory)
     deviation = least_deviation(trajectory) / scale[:, None]
     inside = slice(_NEIGHBOURS, len(trajectory) - _NEIGHBOURS)
     usual = np.maximum(np.median(deviation[inside], axis=0), 1.0)
+    # a camera that suddenly drifts does not return
+    returns = np.abs(after - before) < _LASTING * least_deviation(trajectory)
     touched = np.zeros(len(trajectory), dtype=bool)
-    touched[inside] = (deviation[inside] > _TOUCHED * usual).any(axis=1)
+    touched[inside] = ((deviation > _TOUCHED * usual) & returns)[inside].any(axis=1)
     return touched
 
 
 def find_jumps(
     trajectory: Array, M: Array, g: Array, scale: Array, gaps: Sequence[int]
-) -> tuple[Array, dict[Rows, Step], Array, Mask]:
+) -> tuple[Array, dict[int, Step], Array, Mask]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; scale
@@ -67,16 +68,16 @@ def find_jumps(
     epochs, the covariance (k, k) of a step in a gap that shows none, and the epochs (E,) in which
     the mount was elsewhere, as if touched.
     """
-    jumps: dict[Rows, Step]
-    left, jumps, hidden, end = trajectory.copy(), {}, np.zeros(M.shape[1:]), len(M)
+    jumps: dict[int, Step]
+    left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
     # in a gap the camera drifts, too: only the perspective shows how far the mount moved
     for row in gaps:
         step, _ = _step(left, row)
         left[row:] -= step
-        jumps[row, end] = np.zeros_like(step), _loose(step)
+        jumps[row] = np.zeros_like(step), _loose(step)
     for row, (moved, V) in zip(gaps, estimate_steps(M, g, jumps), strict=True):
         if _chi2(moved, V) < _SHOWN:
-            del jumps[row, end]
+            del jumps[row]
             hidden = max(hidden, V, key=np.trace)
     pair = np.hypot(scale[1:], scale[:-1])[:, None]
     change = _without_drift(np.diff(left, axis=0)) / pair
@@ -107,14 +108,14 @@ def find_jumps(
             if beside is None:
                 continue
             row, last, step, variance = beside
-            if last:
+            if last and _returns(left, row, last, step):
                 left[row:last] -= step
                 touches.append((slice(row, last), step))
-            if last or not jumped or (row, end) in jumps:
+            if last or not jumped or row in jumps:
                 continue
         left[row:] -= step
         if jump := _find_mover(row, step, variance, M, g):
-            jumps[row, end] = jump
+            jumps[row] = jump
     touched = _find_touches(left, scale)
     for away, step in touches:
         left[away] += step
@@ -122,25 +123,25 @@ def find_jumps(
     return left, dict(sorted(jumps.items())), hidden, touched
 
 
-def estimate_steps(M: Array, g: Array, jumps: Mapping[Rows, Step]) -> list[tuple[Array, Array]]:
-    """Estimate the steps (k,) of the pose in some epochs, and their covariances (k, k).
+def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[Array, Array]]:
+    """Estimate the steps (k,) of the pose at some epochs, and their covariances (k, k).
 
-    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps.
+    M (E, k, k), g (E, k): as in `find_jumps`; jumps: what is known of the steps, in order of time.
     """
-    n, k = g.shape
-    rows = [(0, n), *jumps]
-    N = np.zeros((len(rows), k, len(rows), k))
-    for i, (first, end) in enumerate(rows):
-        for j, (begin, last) in enumerate(rows):
-            N[i, :, j] = M[max(first, begin) : min(end, last)].sum(axis=0)
-    right = np.stack([g[first:end].sum(axis=0) for first, end in rows])
+    k = g.shape[1]
+    starts = [0, *jumps]
+    sums = [M[row:].sum(axis=0) for row in starts]
+    each = range(len(starts))
+    N = np.block([[sums[max(i, j)] for i in each] for j in each])
+    right = np.concatenate([g[row:].sum(axis=0) for row in starts])
     for j, (step, weights) in enumerate(jumps.values(), start=1):
-        N[j, :, j] += weights
-        right[j] += weights @ step
-    Q = inverse_of_determined(N.reshape(right.size, right.size))
-    found = (Q @ right.ravel()).reshape(-1, k)
-    Q = Q.reshape(N.shape)
-    return [(found[j], Q[j, :, j]) for j in range(1, len(rows))]
+        own = np.arange(j * k, (j + 1) * k)
+        N[own[:, None], own] += weights
+        right[own] += weights @ step
+    Q = inverse_of_determined(N)
+    found = (Q @ right).reshape(-1, k)
+    Q = Q.reshape(len(starts), k, len(starts), k)
+    return [(found[j], Q[j, :, j]) for j in each[1:]]
 
 
 def find_drift(M: Array, g: Array) -> Array:
@@ -165,13 +166,20 @@ def least_deviation(trajectory: Array) -> Array:
     """Return how far each epoch of a trajectory (E, k) is from the parabola through those before it
     or after it, whichever is nearer: a spike is far from both, a kink from one.
     """
+    return np.asarray(np.nanmin(np.abs(trajectory - _predictions(trajectory)), axis=0))
+
+
+def _predictions(trajectory: Array) -> Array:
+    """Return each epoch (2, E, k) as predicted by the parabolas through the epochs before it and
+    after it, NaN near the ends.
+    """
     n = _NEIGHBOURS
     predict = np.linalg.pinv(np.vander(np.arange(1.0, n + 1), 3))[-1]  # at 0
     windows = np.lib.stride_tricks.sliding_window_view(trajectory, n, axis=0)
-    out = np.full((2, *trajectory.shape), np.inf)
-    out[0, :-n] = np.abs(trajectory[:-n] - windows[1:] @ predict)
-    out[1, n:] = np.abs(trajectory[n:] - windows[:-1] @ predict[::-1])
-    return np.asarray(out.min(axis=0))
+    out = np.full((2, *trajectory.shape), np.nan)
+    out[0, n:] = windows[:-1] @ predict[::-1]
+    out[1, :-n] = windows[1:] @ predict
+    return out
 
 
 def _without_drift(change: Array) -> Array:
@@ -259,13 +267,21 @@ def _step_beside_bend(
     return first, last, step, variance
 
 
+def _returns(trajectory: Array, row: int, last: int, step: Array) -> bool:
+    """Test whether a trajectory (E, k) is where it was before a brief step (k,) from `row` on."""
+    t = np.r_[max(row - SIDE, 0) : row, last : min(last + SIDE, len(trajectory))] - last
+    shapes = np.column_stack([np.ones(len(t)), t, t**2, t >= 0])
+    stays = np.linalg.pinv(shapes)[3] @ trajectory[last + t]
+    return bool(np.linalg.norm(stays) < _LASTING * np.linalg.norm(step))
+
+
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:
     """Return what is known of a jump of the pose; None if the camera jumped.
 
     step (k,), variance (k, k): of the trajectory. If the perspective excludes neither that the
     mount jumped nor that the camera did, it alone shows how far.
     """
-    ((moved, V),) = estimate_steps(M, g, {(row, len(M)): (step, np.zeros_like(variance))})
+    ((moved, V),) = estimate_steps(M, g, {row: (step, np.zeros_like(variance))})
     if _chi2(moved, V) > _EXCLUDED:
         return step, np.asarray(np.linalg.inv(variance), dtype=np.float64)
     if _chi2(step - moved, V + variance) > _EXCLUDED:

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
 
 _HIDDEN = 0.3  # of the noise's variance, below which a movement cannot be estimated per epoch
+_FILLED = 1.5  # variance of an epoch about its two neighbours' mean
+_AMISS = 0.5  # share of a brief movement that may be otherwise, which real cameras show
 _FLAT = 1e-6  # of the noise's variance, for directions without movement
 
 
@@ -233,9 +235,6 @@ def estimate_movement(
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
     without_jumps, jumps, hidden, touched = find_jumps(trajectory, M, g, scale, pauses)
     trajectory = _fill(without_jumps, touched)
-    for row in np.flatnonzero(touched).tolist():  # the mount's, or a part of it the camera's
-        away = without_jumps[row] - trajectory[row]
-        jumps[row, row + 1] = away, np.eye(6) / float(away @ away)
     steps = estimate_steps(M, g, jumps)
     drift = find_drift(M * ~touched[:, None, None], g * ~touched[:, None])
     # what the free parameters do not follow is the mount's, however slow
@@ -255,18 +254,20 @@ def estimate_movement(
         slow[steady:] = np.maximum(slow[steady:], share * usual[steady:])
     # the directions are uncertain themselves, so that movements leak into all others
     white = np.maximum(white, np.count_nonzero(white + slow) / len(trajectory) - slow)
-    axes, first = back @ directions, [int(rows[row]) for row, _ in jumps]
-    lasting = len(first) - int(touched.sum())
-    courses = [slow_course(len(good), row) for row in first[:lasting]]
-    courses += [(np.arange(len(good)) == row).astype(float) for row in first[lasting:]]
-    moved = tuple(
-        (course, back @ step, back @ V @ back.T)
-        for course, (step, V) in zip(courses, steps, strict=True)
-    )
+    axes, first = back @ directions, tuple(int(rows[row]) for row in jumps)
+    moved = [
+        (slow_course(len(good), row), back @ step, back @ V @ back.T)
+        for row, (step, V) in zip(first, steps, strict=True)
+    ]
+    away = without_jumps - trajectory
+    for row in np.flatnonzero(touched):  # all of it the mount's, as of what trembles
+        there = (np.arange(len(good)) == rows[row]).astype(float)
+        variance = _FILLED * scale[row] ** 2 + (_AMISS * np.linalg.norm(away[row])) ** 2
+        moved.append((there, back @ away[row], variance * (back @ back.T)))
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
-        tuple(first[:lasting]), moved, back @ hidden @ back.T,
-        back @ drift @ back.T, tuple(first[lasting:]),
+        first, tuple(moved), back @ hidden @ back.T,
+        back @ drift @ back.T, tuple(rows[touched].tolist()),
     )  # fmt: skip
 
 

@@ -111,7 +111,7 @@ def main() -> int:
 
     def alone(epoch: Observations) -> Callable[[], object]:
         def run() -> object:
-            problem = Problem.build(SENSOR, field, epoch, unknowns)
+            problem = Problem.build(SENSOR, field, epoch, unknowns, start, np.zeros((16, 16)))
             solution = solve(problem, start, np.ones(len(epoch), dtype=bool))
             return solution.values, solution.root @ solution.root.T
 

@@ -107,7 +107,7 @@ def weaknesses(
         return []
     sd = np.sqrt(covariance.diagonal())
     reasons = uncertain(sensor, values, sd, free)
-    if "c" in free:
+    if "c" in free and not _has_depth(points):
         _, axes, flat = plane_fit(points)
         angle = obliqueness_deg(values[EOP], axes[2])
         if flat and angle < _MIN_OBLIQUENESS_DEG:
@@ -157,6 +157,14 @@ def uncertain(sensor: Sensor, values: Array, sd: Array, free: Collection[str]) -
             known = f"is known to {size:.0f} px only" if inside else "is not determined"
             reasons.append(f"{name} {known} (bound {MAX_SD_POINT_PX:.0f} px)")
     return reasons
+
+
+def _has_depth(points: Array) -> bool:
+    """Return whether points are certainly not in one plane: a quick test before `plane_fit`."""
+    reduced = points - np.full(len(points), 1.0 / len(points)) @ points
+    (a, b, c), (_, d, e), (_, _, f) = (points.T @ reduced).tolist()
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return bool(determinant > 1e-4 * (a + d + f) ** 3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,23 +60,27 @@ class Whitening:
     """Multiplication by the inverse Cholesky factors of the points' covariances.
 
     factor (2, n) px⁻¹: one over the diagonal of the Cholesky factors; slope (n,): regression of y
-    on x.
+    on x, None if x and y are uncorrelated in all points.
     """
 
     factor: Array
-    slope: Array
+    slope: Array | None
 
     @classmethod
     def build(cls, covariance: Array) -> Whitening:
         """Build the whitening of points with covariances (n, 3) px²: xx, yy, xy."""
-        slope = covariance[:, 2] / covariance[:, 0]
-        variances = covariance.T[:2].copy()
-        variances[1] -= slope * covariance[:, 2]
+        xy = covariance[:, 2]
+        variances, slope = covariance.T[:2], None
+        if xy.any():
+            slope = xy / covariance[:, 0]
+            variances = variances.copy()
+            variances[1] -= slope * xy
         return cls(1.0 / np.sqrt(variances), slope)
 
     def whiten(self, pairs: Array) -> Array:
         """Whiten x and y (..., 2, n) in place."""
-        pairs[..., 1, :] -= self.slope * pairs[..., 0, :]
+        if self.slope is not None:
+            pairs[..., 1, :] -= self.slope * pairs[..., 0, :]
         pairs *= self.factor
         return pairs
 
@@ -182,7 +186,8 @@ class Solution:
     def residuals(self) -> Array:
         """Residuals (2, n) px."""
         coloured: Array = self.whitened[-1] / self.whitening.factor
-        coloured[1] += self.whitening.slope * coloured[0]
+        if self.whitening.slope is not None:
+            coloured[1] += self.whitening.slope * coloured[0]
         return coloured
 
 

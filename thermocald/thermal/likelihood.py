@@ -328,8 +328,23 @@ def whiten(factor: Array, right: Array, transposed: bool = False) -> Array:
 
 
 def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> None:
-    """Add JᵀN J of movement and readings' errors to the upper half of M."""
-    for operator, here, _, dN in errors:
-        for other, there, d, _ in errors:
-            if here.start <= there.start:
-                M[here, there] += (operator * (dN @ d)[:, None]).T @ other
+    """Add JᵀN J of movement and readings' errors to the upper half of M.
+
+    Operators on the same states are combined, epoch by epoch, by the root of their joint weights,
+    as the product of a matrix with itself takes half the work.
+    """
+    groups: dict[int, list[tuple[Array, slice, Array, Array]]] = {}
+    for error in errors:
+        groups.setdefault(error[1].start, []).append(error)
+    own = list(groups.values())
+    for g, group in enumerate(own):
+        weights = np.stack([[dN @ d for _, _, d, _ in group] for _, _, _, dN in group])  # (k, k, E)
+        size, turn = np.linalg.eigh(np.moveaxis(weights, 2, 0))  # not Cholesky: it may be singular
+        root = turn * np.sqrt(np.maximum(size, 0.0))[:, None, :]
+        here = group[0][1]
+        for part in np.moveaxis(root, 2, 0):
+            half = sum(part[:, k, None] * operator for k, (operator, *_) in enumerate(group))
+            M[here, here] += half.T @ half
+        for operator, _, _, dN in group:
+            for far, there, d, _ in (error for others in own[g + 1 :] for error in others):
+                M[here, there] += (operator * (dN @ d)[:, None]).T @ far

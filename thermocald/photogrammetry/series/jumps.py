@@ -1,7 +1,7 @@
 """Jumps of a series: a knock of the mount, a slip of a lens, a touch, and what happened in a gap.
 
 The trajectory may have jumps, if the mount was knocked or a lens slipped; a mount that was touched
-is elsewhere for one epoch. A jump that the perspective attributes to the interior orientation is
+is elsewhere for a moment. A jump that the perspective attributes to the interior orientation is
 the camera's; every other one is a step of the mount's mean pose, estimated from the jump itself. In
 a gap the camera may drift: only the perspective shows whether the mount moved, and by how much.
 """
@@ -47,11 +47,12 @@ def _find_touches(trajectory: Array, scale: Array) -> Mask:
     trajectory, scale: as in `find_jumps`. An epoch next to an end is not examined.
     """
     before, after = _predictions(trajectory)
-    deviation = least_deviation(trajectory) / scale[:, None]
+    least = least_deviation(trajectory)
+    deviation = least / scale[:, None]
     inside = slice(_NEIGHBOURS, len(trajectory) - _NEIGHBOURS)
     usual = np.maximum(np.median(deviation[inside], axis=0), 1.0)
     # a camera that suddenly drifts does not return
-    returns = np.abs(after - before) < _LASTING * least_deviation(trajectory)
+    returns = np.abs(after - before) < _LASTING * least
     touched = np.zeros(len(trajectory), dtype=bool)
     touched[inside] = ((deviation > _TOUCHED * usual) & returns)[inside].any(axis=1)
     return touched

@@ -71,6 +71,12 @@ class HypothesisFitter:
         value: T = cache[key]
         return value
 
+    def _states(self, series: int, channel: str, operator: csr_array) -> Array:
+        """Return ∂ trajectory / ∂ independent errors (E, states); equal operators share one."""
+        operator.sort_indices()
+        key = (series, channel, operator.data.tobytes(), operator.indices.tobytes())
+        return self._once("states", key, lambda: self.series[series].states(channel, operator))
+
     # -- trajectories ---------------------------------------------------------------------------
 
     def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
@@ -81,7 +87,7 @@ class HypothesisFitter:
             reduced = self.series[series]
             operator = drive_matrix(reduced.history, drives)
             assert operator is not None
-            states = reduced.states(reduced.history.reference, operator)
+            states = self._states(series, reduced.history.reference, operator)
             return self.drive_trajectory(terms, series), states
 
         key = (series, tuple((name, tuple(values.items())) for name, values in drives))
@@ -127,7 +133,7 @@ class HypothesisFitter:
                 if sparse.nnz:
                     whole = sparse if before is None else sparse @ before
                     by_channel = {effect.channel(history, **values): whole, **by_channel}
-                found = [(evidence.states(c, m), c) for c, m in by_channel.items()]
+                found = [(self._states(series, c, m), c) for c, m in by_channel.items()]
             return trajectory, found
 
         return self._once("trajectory", key, compute, 600)
@@ -192,20 +198,20 @@ class HypothesisFitter:
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
         """Return the weighting of a series with the covariance for some coefficients."""
-        carried: list[tuple[Array, Array, str]] = []  # equal operators once, their directions added
+        carried: dict[int, tuple[Array, Array, str]] = {}  # each operator once, directions added
         unresolved: dict[int, tuple[Array, Array]] = {}
         for block, operator, channel in self.list_operators(terms, blocks, series):
             (d,) = block.directions(x)
             if d.any():
-                for k, (other, known, of) in enumerate(carried):
-                    if of == channel and np.array_equal(known, operator):
-                        carried[k] = (other + d, known, of)
-                        break
-                else:
-                    carried.append((d, operator, channel))
+                before, *_ = carried.get(id(operator), (0.0,))
+                carried[id(operator)] = (d + before, operator, channel)
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
-        bends = list(unresolved.values())
-        return prepare(self.series[series], carried, bends, self.thermometer_factor)
+        return prepare(
+            self.series[series],
+            list(carried.values()),
+            list(unresolved.values()),
+            self.thermometer_factor,
+        )
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array:
         """Return the sd (E,) of a trajectory beyond the readings' errors.

@@ -258,10 +258,9 @@ def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
         [np.mean(x[np.abs(x) <= 4 * s] ** 2) for x, s in zip(d.T, spread, strict=True)]
     )
     white = 6.0 / e.correlation
-    second = np.diff(np.eye(len(e.times)), 2, axis=0)
     carried = np.zeros((W.shape[1], W.shape[1]))
     for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
-        jump = (second @ operator) * e.state_sd(channel)
+        jump = np.diff(operator, 2, axis=0) * e.state_sd(channel)
         share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         carried += np.mean(np.sum(jump**2, axis=1)) * np.outer(share, share)
     usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)

@@ -235,8 +235,11 @@ def _slope_jumps(series: ReducedSeries, direction: Array) -> Array:
     return out
 
 
-def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
+def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
     """Return the series linearised at the temperature estimated from readings and images together.
+
+    None if that changes none: means of epochs have little noise, and a camera that moves measures
+    no temperature.
 
     The readings and their errors remain the data. Noise that is left in the smoothed readings would
     bias the rates towards 0, and in their slope would seem to determine a delay.
@@ -245,7 +248,7 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
     out = []
     for s, e in enumerate(fitter.series):
         if e.blocks is not None or e.movement is not None or e.tremble is not None:
-            out.append(e)  # means have little noise; a camera that moves measures no temperature
+            out.append(e)
             continue
         name = e.history.reference
         old = e.thermometers[name]
@@ -264,7 +267,7 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
         new = replace(old, trajectory=trajectory, deviation=old.deviation - state)
         history = replace(e.history, readings={**e.history.readings, name: trajectory})
         out.append(replace(e, history=history, thermometers={**e.thermometers, name: new}))
-    return out
+    return None if out == list(fitter.series) else out
 
 
 def find_poorly_read(fitter: HypothesisFitter, fit: Fit) -> list[str]:

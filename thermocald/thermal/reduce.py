@@ -123,6 +123,7 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
 _HALF = 2  # neighbours on either side
 _LAGS = 20  # epochs, of autocorrelations
 _ITERATIONS = 60  # of conjugate gradients
+_TURNS = 5  # of the search for outliers
 
 
 def running_median(values: Array, half: int, *, itself: bool = True) -> Array:
@@ -332,14 +333,16 @@ def _reduce(
     seen = source.grid.observed
     bad = find_spikes(misclosure, seen)
     offsets = np.zeros((len(X), 2))
-    for turn in range(6):
+    for turn in range(_TURNS):
         w = source.grid.reject(bad).weights
         N = normal_matrices(w, A)
         v = _solve_cameras(w, N, A, misclosure - offsets)[2]
         offsets = offsets + _solve_offsets(w[..., :2], np.nan_to_num(v), N, A)
         b, values, v = _solve_cameras(w, N, A, misclosure - offsets)
-        if 1 <= turn < 5:
-            bad = find_outliers(v, weights, seen, bad)
+        found = find_outliers(v, weights, seen, bad) if turn + 1 < _TURNS else bad
+        if np.array_equal(found, bad):
+            break
+        bad = found
     lPl = sums_of_squares(w, misclosure - offsets)
     yy = np.einsum("ek,ek->e", values, b)
     count = (seen & ~bad).sum(axis=1)

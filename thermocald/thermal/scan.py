@@ -223,8 +223,10 @@ def event_threshold(series: ReducedSeries, coefficients: int) -> float:
     return float((coefficients + 2) * np.log(n) + _MARGIN)
 
 
-def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
-    """Return an effect as a term to add to a fitted hypothesis.
+def make_term(
+    fitter: HypothesisFitter, terms: Sequence[Term], effect: ModelEffect, search: bool
+) -> Term:
+    """Return an effect as a term to add to a hypothesis, which is fitted only for a search.
 
     search: search its non-linear parameters over their whole range, except those in `fitter.held`;
     the time of an event is always searched, in each series.
@@ -241,7 +243,7 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
     held = {k: v for k, v in numbers.items() if f"{effect.name}.{k}" in fitter.held}
     candidate = make_candidate(kind, names, fitter.series, (*text.items(), *held.items()))
     if kind.is_event:
-        found = scan_candidate(fitter, candidate, fit)
+        found = scan_candidate(fitter, candidate, fitter.fit(terms))
         fresh: list[tuple[tuple[str, Any], ...] | None] = []
         for s, gains in enumerate(found.gains):
             best = int(np.argmax(gains))
@@ -250,7 +252,7 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
             fresh.append(((candidate.name, time),) if gains[best] > least else None)
         return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
     if search and candidate.name:
-        found = scan_candidate(fitter, candidate, fit)
+        found = scan_candidate(fitter, candidate, fitter.fit(terms))
         return candidate.term(float(candidate.grid[found.best]), len(fitter.series))
     return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
 

@@ -296,7 +296,7 @@ def smooth_channel(
     through its neighbours; noises (K,) K: of readings that are means of many, or coarse; passed
     (K,): whether a knot is a passage of a coarse thermometer, whose lines replace the smoothing.
     """
-    from scipy.sparse import csr_array, lil_array
+    from scipy.sparse import csr_array
 
     if noises is None:
         noise = estimate_reading_noise(times, readings, resolution)
@@ -315,58 +315,62 @@ def smooth_channel(
         # a gap is as uncertain as the change of the temperature across it
         missing = np.flatnonzero(own)[~there]
         sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~there]
-    mixing = lil_array((len(times), len(times)))
-    mixing.setdiag(np.ones(len(times)))
-    knot, rows = np.flatnonzero(own), np.flatnonzero(latent)
+    diagonal = np.flatnonzero(~curved)
+    entries = [(np.ones(len(diagonal)), diagonal, diagonal)]  # of the mixing: value, row, column
+    knot, rows, bent = np.flatnonzero(own), np.flatnonzero(latent), np.flatnonzero(curved)
     index = np.clip(np.searchsorted(t, times[rows]) - 1, 0, max(len(t) - 2, 0))
     if passed is not None:
         from thermocald.physics.operators import interpolation_matrix
 
-        between = np.flatnonzero(own & ~passed)
-        lines = interpolation_matrix(times[passed], times[between])
-        mixing[np.ix_(between, np.flatnonzero(passed))] = lines.toarray()
-    if curved.any():
-        sharp = np.isin(np.arange(len(t) - 1), index)
-        for row in np.flatnonzero(curved):
-            points, weights = _weigh_neighbours(t, times[row], sharp)
-            mixing.rows[row], mixing.data[row] = knot[points].tolist(), weights.tolist()
-            trajectory[row] = weights @ smooth[points]
-    bend, limit = _measure_bends(t, filled, noise)
-    for row, i in zip(rows, index, strict=True):
-        share = (times[row] - t[i]) / (t[i + 1] - t[i])
-        mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
-        bulge, sd[row] = _estimate_kink(bend, limit, i, noise)
-        trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1] - bulge
+        between, through = np.flatnonzero(own & ~passed), np.flatnonzero(passed)
+        lines = interpolation_matrix(times[passed], times[between]).tocoo()
+        entries.append((lines.data, between[lines.row], through[lines.col]))
+    if len(bent):
+        points, weights = _weigh_neighbours(t, times[bent], np.isin(np.arange(len(t) - 1), index))
+        trajectory[bent] = np.sum(weights * smooth[points], axis=1)
+        at, side = np.nonzero(weights)
+        entries.append((weights[at, side], bent[at], knot[points[at, side]]))
+    if len(rows):
+        share = (times[rows] - t[index]) / (t[index + 1] - t[index])
+        bulge, sd[rows] = _estimate_kinks(*_measure_bends(t, filled, noise), index, noise)
+        trajectory[rows] = (1 - share) * smooth[index] + share * smooth[index + 1] - bulge
+        entries += [(1 - share, rows, knot[index]), (share, rows, knot[index + 1])]
+    values, *places = map(np.concatenate, zip(*entries, strict=True))
+    mixing = csr_array((values, tuple(places)), shape=(len(times), len(times)))
     deviation = np.nan_to_num(readings - trajectory)
-    return Thermometer(times, trajectory, deviation, sd, csr_array(mixing), own, noise)
+    return Thermometer(times, trajectory, deviation, sd, mixing, own, noise)
 
 
-def _estimate_kink(bend: Array, limit: float, i: int, noise: float) -> tuple[float, float]:
-    """Return by how much a kink bulges in the middle of an interval, K, and its sd.
+def _estimate_kinks(bend: Array, limit: float, index: Index, noise: float) -> tuple[Array, Array]:
+    """Return by how much kinks bulge in the middle of some intervals (n,), K, and the sds.
 
     bend (K - 1,), limit: of `_measure_bends`.
     """
-    size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
+    size = np.where(np.abs(bend) > limit, np.abs(bend), 0.0)
     # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; intervals next to it
     # have a bend too, but no bulge
-    top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
-    return float(bend[i] / 8 * top), float(0.12 * size + 0.25 * noise)
+    padded = np.pad(size, 1)
+    top = (size > 0) & (size >= padded[:-2]) & (size >= padded[2:])
+    return (bend / 8 * top)[index], 0.12 * size[index] + 0.25 * noise
 
 
-def _weigh_neighbours(t: Array, at: float, sharp: NDArray[np.bool_]) -> tuple[Index, Array]:
-    """Return the readings, up to two on either side, and their weights in the curve through them.
+def _weigh_neighbours(t: Array, at: Array, sharp: NDArray[np.bool_]) -> tuple[Index, Array]:
+    """Return the two readings on either side of times (n,) and their weights in a curve, (n, 4).
 
-    sharp (K - 1,): intervals that no curve may cross.
+    sharp (K - 1,): intervals that no curve may cross; readings beyond them have no weight.
     """
-    i = int(np.searchsorted(t, at)) - 1
-    first = i - 1 if i > 0 and not sharp[i - 1] else i
-    last = i + 2 if i + 2 < len(t) and not sharp[i + 1] else i + 1
-    points = np.arange(first, last + 1)
-    apart = t[points, None] - t[None, points]
-    np.fill_diagonal(apart, 1.0)
-    ratio = (at - t[None, points]) / apart
-    np.fill_diagonal(ratio, 1.0)
-    return points, np.prod(ratio, axis=1)
+    i = np.searchsorted(t, at) - 1
+    points = i[:, None] + np.arange(-1, 3)
+    within = (points >= 0) & (points < len(t))
+    points, sharp = np.clip(points, 0, len(t) - 1), np.pad(sharp, 1)
+    within[:, 0] &= ~sharp[i]
+    within[:, 3] &= ~sharp[i + 2]
+    apart = t[points][:, :, None] - t[points][:, None, :]
+    others = within[:, None, :] & within[:, :, None] & ~np.eye(4, dtype=bool)
+    ratio = np.divide(
+        (at[:, None] - t[points])[:, None, :], apart, out=np.ones(apart.shape), where=others
+    )
+    return points, np.where(within, np.prod(ratio, axis=2), 0.0)
 
 
 def extend(channel: Thermometer) -> Thermometer:

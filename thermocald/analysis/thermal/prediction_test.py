@@ -229,11 +229,11 @@ def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     if not any(Term(e.name).is_separate for e in listed):
         return model
     fitter = HypothesisFitter([series])
-    fit = fitter.fit(())
+    terms: tuple[Term, ...] = ()
     # events last: what another effect moves would be taken for their step
     for effect in sorted(listed, key=lambda e: catalogue.get(e.name).is_event):
-        fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search=False)))
-    fit = fitter.fit(without_chance_events(fitter, fit))
+        terms = (*terms, make_term(fitter, terms, effect, search=False))
+    fit = fitter.fit(without_chance_events(fitter, fitter.fit(terms)))
     own: dict[str, dict[str, float]] = {}
     for number, term in enumerate(fit.terms):
         if not term.is_separate:

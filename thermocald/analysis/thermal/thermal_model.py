@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from thermocald.physics.model import Distortion, ModelEffect, ThermalModel
+    from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -87,11 +88,11 @@ def fit_thermal_model(
     ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(others)]
     fitter = HypothesisFitter(ready)
     fitter.held, fitter.priors = frozenset(fixed), dict(priors or {})
-    fit = fitter.fit(())
+    terms: tuple[Term, ...] = ()
     for effect in listed:
         if catalogue.get(effect.name).seen_in == "trajectory":
-            fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search)))
-    fit = fitter.refine(fit, 20, least_squares=True)
+            terms = (*terms, make_term(fitter, terms, effect, search))
+    fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:
         fit = fitter.refine(fitter.fit(terms), 20, least_squares=True)

@@ -62,9 +62,14 @@ def field_lines(x: Examination) -> list[str]:
 
 
 def mount_lines(x: Examination) -> list[str]:
-    """Return lines about the movement of the mount and its knocks."""
+    """Return lines about the movement of the mount, its knocks and touches."""
+    touches = [
+        f"the camera was elsewhere for a moment, as if touched, in {t['recording']}; left out: "
+        f"epoch{'s' if len(t['epochs']) > 1 else ''} {enumerated(list(map(str, t['epochs'])))}"
+        for t in _list_touches(x)
+    ]
     if x.mount is None and not x.knocks:
-        return []
+        return touches
     moves = "stands still but for knocks"
     if x.mount is not None:
         sizes = enumerated([f"{x.mount.size_px(e):.3f}" for e in x.fitter.series])
@@ -76,6 +81,7 @@ def mount_lines(x: Examination) -> list[str]:
             f"{k['recording']}" + ("; or a slip inside the camera" if k["not_excluded"] else "")
             for k in _list_knocks(x)
         ),
+        *touches,
     ]
 
 
@@ -94,6 +100,15 @@ def say_adequate(x: Examination) -> str:
     if x.knocks:
         return "the model and knocks of the mount reproduce the recording; no effect is missing"
     return "the model reproduces the recording; no effect that it can show is missing"
+
+
+def _list_touches(x: Examination) -> list[dict[str, Any]]:
+    """Return the epochs in which each series' camera was elsewhere for a moment."""
+    return [
+        {"recording": e.source.name, "epochs": e.source.numbers[e.touched].tolist()}
+        for e in x.unblocked
+        if e.touched.any()
+    ]
 
 
 def _list_knocks(x: Examination) -> list[dict[str, Any]]:
@@ -172,10 +187,12 @@ class Discovery:
             document["gap"]["verify_each"] = [
                 {"recording": name, **gap} for name, gap in zip(names, others, strict=True)
             ]
-        if x.mount is not None or x.knocks:  # RMS over image points and time
+        touches = _list_touches(x)
+        if x.mount is not None or x.knocks or touches:  # RMS over image points and time
             document["mount"] = {
                 "movement_px": [x.mount.size_px(e) if x.mount else 0.0 for e in x.fitter.series],
                 "knocks": _list_knocks(x),
+                **({"touches": touches} if touches else {}),
                 "note": "the movement of the mount is estimated with the effects and is not the "
                 "camera's",
             }

@@ -36,7 +36,11 @@ from thermocald.photogrammetry.field.testfield import (
     find_misplaced,
     plane_fit,
 )
-from thermocald.photogrammetry.linalg import MAD_TO_SD, median_known
+from thermocald.photogrammetry.linalg import (
+    MAD_TO_SD,
+    median_known,
+    orthonormal_combinations,
+)
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     Partials,
@@ -121,6 +125,7 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
 
 
 _HALF = 2  # neighbours on either side
+_AROUND = 4  # changes on either side of a touch that show how the camera moves otherwise
 _LAGS = 20  # epochs, of autocorrelations
 _ITERATIONS = 60  # of conjugate gradients
 _TURNS = 5  # of the search for outliers
@@ -188,6 +193,32 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
     level = MAD_TO_SD * float(np.median(kept[np.isfinite(kept)]))
     limit = criteria.GROSS * np.fmax(np.nan_to_num(own), level)
     return np.asarray(seen & (size > limit[:, None]))
+
+
+def find_touches(movement: Array) -> Mask:
+    """Find the epochs (E,) in which the camera was elsewhere, as a tripod is that someone touches.
+
+    movement (E, m): in units of its noise. The camera leaves and is back after at most
+    `criteria.BRIEF` epochs, both by far more than the epochs around move; what heat moves does not.
+    """
+    touched = np.zeros(len(movement), dtype=bool)
+    changes = np.diff(movement, axis=0)
+    for brief in range(1, criteria.BRIEF + 1):
+        length = 2 * _AROUND + brief + 1
+        if len(changes) < length:
+            break
+        window = np.lib.stride_tricks.sliding_window_view(changes, length, axis=0)
+        away = slice(_AROUND, _AROUND + brief + 1)
+        near = np.delete(window, away, axis=2)
+        drift = np.median(near, axis=2, keepdims=True)
+        usual = np.linalg.norm(near - drift, axis=1).max(axis=1)
+        inside = window[..., away] - drift
+        leaps = np.linalg.norm(inside[..., [0, -1]], axis=1).min(axis=1)
+        back = np.linalg.norm(inside.sum(axis=2), axis=1) < 0.5 * leaps
+        found = leaps > criteria.TOUCH * np.maximum(usual, np.sqrt(2.0 * movement.shape[1]))
+        for first in np.flatnonzero(found & back) + _AROUND + 1:
+            touched[first : first + brief] = True
+    return touched
 
 
 _MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image's points
@@ -358,7 +389,11 @@ def _reduce(
         )
     variance = float(np.median(sigma0[enough]) ** 2)
     v = np.where((seen & ~bad)[..., None], v, np.nan)
-    weak = ~enough
+    mean = N[enough].mean(axis=0) / variance
+    W, good = orthonormal_combinations(mean)
+    touched = np.zeros(len(N), dtype=bool)
+    touched[enough] = find_touches(values[enough] @ mean @ W[:, good])
+    weak = ~enough | touched
     N[weak], b[weak], yy[weak], count[weak], w[weak], v[weak] = 0.0, 0.0, 0.0, 0, 0.0, np.nan
     return ReducedSeries(
         source=source,
@@ -380,6 +415,7 @@ def _reduce(
         correlation=_measure_correlation(v),
         hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
         distortion=distortion,
+        touched=touched,
     )
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid, Partials
     from thermocald.thermal.thermometer import Thermometer
@@ -271,7 +271,8 @@ class ReducedSeries:
     each row of a long series, or None; hidden, movement: random effects, or None; tremble (P, t):
     directions of each epoch's random movement, of unit variance, or None; bend (E, T, 2) px:
     curvature of the projection that was subtracted from the observations, or None; slope_jumps (E,)
-    K/s: jumps of the temperature's slope as measured by the images, or None.
+    K/s: jumps of the temperature's slope as measured by the images, or None; touched (E,): the
+    epochs without weight because the camera was elsewhere for a moment.
     """
 
     source: SeriesInput
@@ -299,6 +300,7 @@ class ReducedSeries:
     bend: Array | None = None
     distortion: Distortion = "angle"
     slope_jumps: Array | None = None
+    touched: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def readings_history(self) -> History:

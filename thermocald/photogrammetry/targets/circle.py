@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 
 _PIXEL_VARIANCE = 1 / 12
+_QUANTISATION_SD = np.sqrt(1 / 12)
 _NORM = float(1 / np.sqrt(2 * np.pi))
 # Φ(z) = (1 + tanh(z·polynomial(z²)))/2 to 2e-5, fitted by minimax on 0 ≤ z ≤ 6.
 _CDF = (-3.171207e-4, 3.680406e-2, 0.79771415)
@@ -244,7 +245,9 @@ def fit_circles(
         cut[w.rows] = w.cut
     saturation /= np.maximum(pixels, 1)
     variance = square / np.maximum(pixels - 10, 1)
-    shown = np.abs(parameters[:, 7]) > _LEAST_CONTRAST * _noise_sd(parameters, noise)
+    # the noise is too large so far if outlines were predicted some pixels off
+    own_sd = _noise_sd(parameters, noise) * np.sqrt(np.minimum(variance, 1))
+    shown = np.abs(parameters[:, 7]) > _LEAST_CONTRAST * np.maximum(own_sd, _QUANTISATION_SD)
     if given is None and np.count_nonzero(shown) >= _FEWEST_FOR_LEVEL:
         # Its level is that of all residuals, since paper and compression cause noise at edges too;
         # but a hand or a glare of one grey value has no noise.

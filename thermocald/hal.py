@@ -292,8 +292,10 @@ class Camera(Device):
         raise NotImplementedError
 
     def frame_size(self) -> tuple[int, int] | None:
-        """Return the frames' (width, height), px, if the driver has these options; else None."""
-        size: Any = (getattr(self.options, "width", None), getattr(self.options, "height", None))
+        """Return the frames' (width, height), px, before the camera is opened; None if unknown."""
+        scene = self.known_scene()
+        given = self.options if scene is None else scene[0]
+        size: Any = (getattr(given, "width", None), getattr(given, "height", None))
         return None if None in size else size
 
     def known_scene(self) -> tuple[Any, Any] | None:

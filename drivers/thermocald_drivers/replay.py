@@ -17,7 +17,7 @@ and no image.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,6 +103,14 @@ class _Replay(Device):
 
 class ReplayCamera(_Replay, Camera):
     """A camera that delivers the frames or observations of a recording."""
+
+    def frame_size(self) -> tuple[int, int] | None:
+        from thermocald.store.recording.head import read_head
+
+        with suppress(DataError):  # `open` reports it
+            sensor = read_head(self._path).camera.sensor
+            return sensor.width, sensor.height
+        return None
 
     def capture(self) -> Frame:
         epoch = self._next()

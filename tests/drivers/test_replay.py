@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
+from tests.commands import answer
 from thermocald.epoch import Epoch
 from thermocald.errors import (
     BadReading,
@@ -92,6 +95,26 @@ def test_readings_keep_their_own_instants(write):
         third = device.read()
     assert [dict(r.values) for r in (first, third)] == [{"lens": 21.0}, {"lens": 23.0}]
     assert [r.utc - BEGIN for r in (first, third)] == [11.5, 31.5]
+
+
+@pytest.mark.parametrize("driver", ["replay", "mock"])
+def test_a_sensor_of_another_size_than_its_frames_is_an_error_before_the_start(
+    write, tmp_path, driver
+):
+    """Regression: frames had no result, one by one; recorded image points had a wrong x0, y0."""
+    path = write((epoch(1), IMAGE))
+    options = {"recording": path} if driver == "replay" else {}
+    camera = {"name": "c", "driver": driver, "testfield": f"{path}/testfield.csv", **options}
+    sensor, size = {"pixel_pitch_mm": 0.001}, [(64, 48), (3280, 2464)][driver == "mock"]
+    text = {}
+    for width, height in (size, (65, 48)):
+        sensor |= {"width_px": width, "height_px": height}
+        config = tmp_path / "config.yaml"
+        config.write_text(json.dumps({"cameras": [{**camera, "sensor": sensor}]}))
+        text[width] = answer("check", config)
+    assert text[size[0]].exit_code == 0
+    assert text[65].exit_code == 1
+    assert f"sensor has 65×48 px, but the driver's frames have {size[0]}" in str(text[65])
 
 
 def test_loop_goes_on_in_time(write):

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import GeometryError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     CameraSpec,
@@ -252,8 +253,7 @@ class _Frame:
             fit = fit_circles(image, maps, coded, blur)
         good = fit.good
         if good.sum() + len(corners) < _FEWEST:
-            missed = dict(zip(rows.tolist(), fit.reasons, strict=True))
-            return Observations.none(), missed, orientation
+            return fit.observations(rows, good), fit.missed(rows), orientation
         pairs = np.concatenate([corners.targets, rows[good]])
         better = refine(
             self._camera.sensor, orientation.camera.interior, orientation.exterior,
@@ -293,27 +293,28 @@ class _Frame:
         if n < _FEWEST and foreign:
             why = "the ring codes in the frame are not those of this test field"
             status = FrameStatus("other_field", why)
-        elif 0 < n < _FEWEST:
-            status = FrameStatus("too_few", f"only {n} targets are found in the frame")
-        elif n == 0:
-            status = FrameStatus("nothing_found", self._why_nothing())
+        elif n < _FEWEST:
+            status = FrameStatus("too_few" if n else "nothing_found", self._why_few(n))
         return Measurement(observations, status, self._missed, orientation, self._places)
 
-    def _why_nothing(self) -> str:
-        """Return why no target can be measured, by the most frequent reason."""
+    def _why_few(self, measured: int) -> str:
+        """Return why only some targets, or none, can be measured, by the most frequent reason."""
         if not any(self._field.codes):
             return (
                 "the test field has no coded target and the camera's orientation is unknown: "
                 "plain circles alone cannot be identified"
             )
         reasons = [why for why in self._missed.values() if why != "not found"]
+        if not reasons and measured:
+            return f"the frame shows only {counted(measured, 'target')} of the test field"
         if not reasons:
             whole = any(code.startswith("CHESS") for code in self._field.codes)
             remedy = "; a chessboard must be whole in the frame, with its margin" if whole else ""
             return f"no target of the test field is found in the frame{remedy}"
         word, count = Counter(reasons).most_common(1)[0]
         remedy = f"; {_REMEDIES[word]}" if word in _REMEDIES else ""
-        return f"{len(reasons)} targets are seen and none can be measured: {word} ({count}){remedy}"
+        seen = counted(measured + len(reasons), "target")
+        return f"of {seen} seen, {measured or 'none'} can be measured: {word} ({count}){remedy}"
 
     def _other_field(self, why: str) -> Measurement:
         status = FrameStatus("other_field", why)

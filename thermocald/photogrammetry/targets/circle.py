@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 
 _PIXEL_VARIANCE = 1 / 12
+_QUANTISATION_SD = np.sqrt(1 / 12)
 _NORM = float(1 / np.sqrt(2 * np.pi))
 # Φ(z) = (1 + tanh(z·polynomial(z²)))/2 to 2e-5, fitted by minimax on 0 ≤ z ≤ 6.
 _CDF = (-3.171207e-4, 3.680406e-2, 0.79771415)
@@ -244,7 +245,9 @@ def fit_circles(
         cut[w.rows] = w.cut
     saturation /= np.maximum(pixels, 1)
     variance = square / np.maximum(pixels - 10, 1)
-    shown = np.abs(parameters[:, 7]) > _LEAST_CONTRAST * _noise_sd(parameters, noise)
+    # the noise is too large so far if outlines were predicted some pixels off
+    own_sd = _noise_sd(parameters, noise) * np.sqrt(np.minimum(variance, 1))
+    shown = np.abs(parameters[:, 7]) > _LEAST_CONTRAST * np.maximum(own_sd, _QUANTISATION_SD)
     if given is None and np.count_nonzero(shown) >= _FEWEST_FOR_LEVEL:
         # Its level is that of all residuals, since paper and compression cause noise at edges too;
         # but a hand or a glare of one grey value has no noise.
@@ -274,9 +277,12 @@ def _first_step(
     greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
     for w in parts:
         begin = w.begin if start is None else start[w.rows]
-        parameters[w.rows], value, residual, *_, flat = _step(
-            w.thinned(), maps.select(w.rows), begin, noise, work
-        )
+        thin = w.thinned()
+        p, value, residual, *_ = _step(thin, maps.select(w.rows), begin, noise, work)
+        parameters[w.rows] = p
+        # where a movement of a px hardly changes the grey value
+        slope = np.abs(work[0, : 2 * thin.x.size]).reshape(2, *thin.x.shape).max(axis=0)
+        flat = (thin.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
         greys.append(value[flat])
         residuals.append(residual[flat])
     return parameters, noise or estimate_noise(
@@ -290,13 +296,12 @@ def _step(
     begin: Array,
     noise: NoiseModel | None,
     work: Single,
-) -> tuple[Array, Single, Single, Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Array, Single, Single, Array, Array, NDArray[np.bool_]]:
     """Take one step of Gauss-Newton.
 
     Returns the parameters (n, 10), values and residuals (n, k) after it, the normal matrices
-    (n, 10, 10), the steps (n,) px, which fits have converged (n,), and which pixels (n, k) are in
-    flat parts of the image. work (2, m): memory for the partials, which would
-    take longer to allocate than to fill.
+    (n, 10, 10), the steps (n,) px, and which fits have converged (n,). work (2, m): memory, for the
+    partials (10, n, k) first, which would take longer to allocate than to fill.
     """
     p = begin.copy()
     p[:, :2] -= w.origin
@@ -315,12 +320,9 @@ def _step(
     p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
     p[:, :2] += w.origin
     change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
-    # where a movement of a px hardly changes the grey value
-    slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
-    flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
     step = np.abs(delta[:, :2]).max(axis=1)
     settled = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
-    return p, value + change, residual - change, N, step, settled, flat
+    return p, value + change, residual - change, N, step, settled
 
 
 def _noise_sd(parameters: Array, noise: NoiseModel) -> Array:

@@ -42,6 +42,7 @@ _LARGEST_MOVE_SHARE = 0.015  # of the side, in addition: reduced images cut outl
 _BLUR_LIMITS_PX = (0.3, 4.0)
 _SADDLE_REACH = 0.25  # of the marker's side
 _FAR = 40.0  # standard deviations of the blur; the series would overflow where a fit runs away
+_LARGEST_SATURATION = 0.3  # where paper is cut at full scale; sharpened edges alone reach a tenth
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
 
@@ -299,9 +300,12 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     variance = chi / np.maximum(m - 7, 1)
     residual_sd = np.sqrt(variance)
     move = np.hypot(*(p[:, :2] - found.places).T)
+    saturated = pixels.use & (pixels.grey >= np.iinfo(image.dtype).max)
+    saturation = np.sum(saturated, axis=1) / np.maximum(m, 1)
     tests = (
         (cut_off, "cut off by the image's edge"),
         (m < 20, "too small"),
+        (saturation > _LARGEST_SATURATION, "saturated"),  # edges are pixels off
         (
             ~np.isfinite(p).all(axis=1) | ~(np.abs(step[:, :2]).max(axis=1) < 0.02),
             "the fit does not converge",
@@ -315,14 +319,13 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     )
     reasons = first_reasons(tests)
     good = reasons == ""
-    saturated = pixels.use & (pixels.grey >= np.iinfo(image.dtype).max)
     quality = {
         # without the width of the pixel
         "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),
         "contrast": p[:, 6],
         "grey": p[:, 5],
         "noise": residual_sd,
-        "saturation": np.sum(saturated, axis=1) / np.maximum(m, 1),
+        "saturation": saturation,
     }
     observations = Observations.build(
         found.rows[good], p[good, :2], (cofactors * variance[:, None, None])[good],

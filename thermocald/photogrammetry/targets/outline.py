@@ -183,17 +183,20 @@ def windows(
         centre = maps.centre[rows] - origin
         x, y = lx.astype(np.float32), ly.astype(np.float32)
         powers = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)])
-        ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
-        inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
-        cut = np.any(~inside & (_squared_radius(near[rows], centre, powers) < 1.0), axis=1)
-        use = inside & (_squared_radius(outer[rows], centre, powers) <= 1.0)
+        use = _squared_radius(outer[rows], centre, powers) <= 1.0
         use &= _squared_radius(inner[rows], centre, powers) >= 1.0
+        cut, edge = np.zeros(len(rows), dtype=bool), np.array([hx, hy])
+        if (origin < edge).any() or (origin + edge >= (width, height)).any():
+            ix, iy = lx + origin[:, :1], ly + origin[:, 1:]
+            inside = (ix >= 0) & (ix < width) & (iy >= 0) & (iy < height)
+            cut = np.any(~inside & (_squared_radius(near[rows], centre, powers) < 1.0), axis=1)
+            use &= inside
         count = np.count_nonzero(use, axis=1)
         # the pixels used, moved to the front of each row
         filled = np.arange(max(int(count.max()), 1)) < count[:, None]
         at = np.zeros(filled.shape, dtype=np.int64)
         at[filled] = np.flatnonzero(use) - np.repeat(np.arange(len(rows)) * use.shape[1], count)
-        pixel = (np.take_along_axis(iy, at, 1) * width + np.take_along_axis(ix, at, 1)) * filled
+        pixel = ((ly * width + lx).take(at) + (origin @ (1, width))[:, None]) * filled
         grey = flat.take(pixel).astype(np.float32)
         begin = np.zeros((len(rows), 10))
         begin[:, :2] = maps.centre[rows]

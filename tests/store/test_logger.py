@@ -301,6 +301,11 @@ def test_columns_are_called_as_their_owner_calls_them(tmp_path):
     assert list(logged(tmp_path, TWO).channels) == ["housing", "Temp"]
     given = log_options(name=["Temp, °C (LGR S/N: 1, SEN S/N: 2)=相机"]).names
     assert list(logged(tmp_path, TWO, names=given).channels) == ["housing", "相机"]
+    # as the notes call it, also twice
+    one = logged(tmp_path, GERMAN, temperatures=("Temperatur", "Temperatur °C"))
+    assert one.channels["Temperatur"].tolist() == [21.5, 21.75]
+    given = log_options(name=["Temperatur=box"]).names
+    assert list(logged(tmp_path, GERMAN, names=given).channels) == ["box"]
 
 
 @pytest.mark.parametrize(
@@ -460,6 +465,44 @@ def test_what_is_doubtful_is_told(tmp_path, name):
         found = read(tmp_path, [f"time,{head}"], row, "degF")
         assert not [note for note in found.notes if "doubtful" in note]
         assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)
+
+
+WARM, ROOM, COLD = (np.linspace(*ends, 20) for ends in ((27, 35.9), (20.1, 22.3), (4.0, 6.2)))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "hours", "change"),
+    [
+        (WARM, COLD, 14, None),  # 35.9 °F would be 2.2 °C
+        (ROOM, WARM + 21, 14, None),  # 22.3 °C would be 72 °F
+        (10 * COLD // 1, COLD, 14, "from tenths"),
+        (COLD + 21, COLD / 2, 14, None),  # 27.2 are no tenths
+        (1.8 * ROOM + 32, ROOM, 14, "from °F to °C"),
+        (ROOM, 1.8 * ROOM + 35, 14, "from °C to °F"),
+        (1.8 * COLD + 32, COLD[::-1], 0, "from °F to °C"),
+        (ROOM, ROOM + 273.15, 0, "from °C to K"),
+    ],
+)
+def test_a_night_changes_the_temperature_and_a_setting_the_unit(
+    tmp_path, first, second, hours, change
+):
+    times = JUNE + np.arange(40) * 60.0 + np.repeat([0.0, 3600.0 * hours], 20)
+    rows = zip(times, [*first, *second], strict=True)
+    data = "time,T °C\n" + "".join(f"{time:.0f},{value:.1f}\n" for time, value in rows)
+    if change is None:
+        assert len(logged(tmp_path, data).times) == 40
+        return
+    with pytest.raises(DataError, match=f"line 22, .* the unit seems to change {change} here"):
+        logged(tmp_path, data)
+
+
+def test_no_two_days_of_a_real_log_have_two_units(shared, tmp_path):
+    lines = (shared / "data/temperature_logs/six_ds18b20_15min_excerpt.tsv").read_text()
+    head, *rows = lines.splitlines()[:-1]
+    wanted = tuple(head.split("\t")[2:])
+    for first in range(0, len(rows) - 300, 41):
+        days = rows[first : first + 40] + rows[first + 250 : first + 290]
+        assert len(logged(tmp_path, "\n".join([head, *days]), temperatures=wanted).channels) == 6
 
 
 @pytest.mark.parametrize("head", ["Temp housing", "T1", "Settle tank T", "spot temp"])

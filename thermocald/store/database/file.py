@@ -425,8 +425,8 @@ def read_wal_tail(path: Path) -> tuple[int, bool]:
     """Return (lost, unfinished) of a -wal file with the -shm file beside it.
 
     lost: number of committed transactions that cannot be read, -1 for all; unfinished: the last one
-    is incomplete and may not have been committed. Its writer was killed, or the file was cut off in
-    copying, and more may have followed. The files may be written meanwhile.
+    is incomplete and may not have been committed. Its disk was full, its writer was killed, or the
+    file was cut off in copying, and more may have followed. The files may be written meanwhile.
     """
     for _ in range(_TRIES):
         tail = _read_tail(path)

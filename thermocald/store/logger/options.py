@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
+from thermocald.numbers import column_label
 from thermocald.store.logger.clock import (
     ORDERS,
     DeviceClock,
@@ -28,6 +29,7 @@ from thermocald.store.logger.dialect import (
     TEMPERATURE_NAME,
     TIME_NAME,
     UNITS,
+    without_unit,
 )
 
 if TYPE_CHECKING:
@@ -108,13 +110,24 @@ def log_options(
 
 
 def require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
+    """Return columns of a file, given as its head or as the notes call them. Raises DataError."""
+    known = {channel_name(name): name for name in reversed(file.names)}
+    known |= {name: name for name in file.names}
     for name in names:
-        if name not in file.names:
+        if name not in known:
             raise DataError(
                 f"{file.path}: there is no column {name!r} ({option}); the columns are "
                 f"{quoted(file.names)}"
             )
-    return names
+    return tuple(dict.fromkeys(known[name] for name in names))
+
+
+def channel_name(name: str) -> str:
+    """Return a recording's name for a column, without the unit, which is °C there."""
+    quantity = without_unit(column_label(name))
+    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
+    plain = plain[:48]
+    return f"{plain} of the log" if channel_fault(plain) else plain
 
 
 def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:

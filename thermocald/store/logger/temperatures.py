@@ -11,15 +11,14 @@ import re
 from array import array
 from collections import Counter
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.names import channel_fault
-from thermocald.numbers import column_label, counted
+from thermocald.numbers import counted
 from thermocald.store.logger.clock import (
     DeviceClock,
     are_serials,
@@ -37,10 +36,10 @@ from thermocald.store.logger.dialect import (
     open_log,
     stated_unit,
     to_celsius,
-    without_unit,
 )
 from thermocald.store.logger.options import (
     LogOptions,
+    channel_name,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
@@ -48,7 +47,14 @@ from thermocald.store.logger.options import (
     require_columns,
 )
 from thermocald.store.recording.reader import TemperatureLog as TemperatureLog
-from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts, time_fault
+from thermocald.store.recording.sense import (
+    PAUSE,
+    TOO_HOT_C,
+    find_spikes,
+    find_unit_change,
+    stuck_doubts,
+    time_fault,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,14 +70,13 @@ _LABEL = "entity_id"
 """Home Assistant's column with the sensor of each row: one table has all sensors."""
 _CHANGES = "last_changed"
 """Home Assistant's column of times: it writes a row when the value changes, and only then."""
-_PAUSE, _LONGEST_PAUSE_S = 5.0, 86400.0  # of the usual interval: a longer one is a pause
+_LONGEST_PAUSE_S = 86400.0
 _NO_READING = {
     -127.0, -196.6, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 3276.7, 9999.0, 9999.99,
 }  # fmt: skip
 """Numbers that stand for none: -196.6 is the -127 of the DS18B20 in °F, 3276.7 a full register."""
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
-_FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
 _SECONDS = re.compile(r"(.*):([0-5]\d)(\D*)", re.ASCII)
 """A time with its last two digits, probably the seconds."""
@@ -92,10 +97,10 @@ def read_log(
     clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
-    table = _Table(file, time_names, names, order)
+    table = _Table(file, time_names, names, order, clock)
     if table.are_serials:
         notes.append(f"log: {time_names[0]!r} holds days since 1899-12-30, as of a spreadsheet")
-    times = table.times(clock)
+    times = table.times
     if len(times) < 2:
         raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
     if fault := time_fault(times):
@@ -133,13 +138,16 @@ def read_log(
 
 def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array], list[str]]:
     """Return the channels {name: (n,) °C} of a table, and notes on their units and readings."""
-    require_columns(table.file, tuple(options.names), "--name")
+    given = {
+        column: new
+        for old, new in options.names.items()
+        for column in require_columns(table.file, (old,), "--name")
+    }
     channels: dict[str, Array] = {}
     notes: list[str] = []
     for name in table.values:
         values, found = _to_celsius_column(table, name, options)
-        given = name if name in options.wanted else None
-        channel = options.names.get(name) or given or _channel_name(name)
+        channel = given.get(name) or (name if name in options.wanted else channel_name(name))
         while channel in channels:  # `T (1)` and `T [1]` are two columns
             channel += "_"
         channels[channel] = values
@@ -165,7 +173,7 @@ def _hold_readings(
         t, v = times[sensor][order], values[sensor][order]
         steps = np.diff(t)
         usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
-        long = (steps > _PAUSE * usual) & (steps <= _LONGEST_PAUSE_S) & np.isfinite(v[:-1])
+        long = (steps > PAUSE * usual) & (steps <= _LONGEST_PAUSE_S) & np.isfinite(v[:-1])
         for k in np.flatnonzero(long).tolist():
             held = np.arange(t[k] + usual, t[k + 1] - 0.5 * usual, usual)
             more.append(held)
@@ -200,7 +208,12 @@ class _Table:
     """
 
     def __init__(
-        self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], order: str | None
+        self,
+        file: LoggerFile,
+        times: tuple[str, ...],
+        names: tuple[str, ...],
+        order: str | None,
+        clock: DeviceClock,
     ) -> None:
         self.file, self._order = file, order
         self._time_names = times
@@ -239,6 +252,12 @@ class _Table:
                 self.values[name].append(self._value(line, name, row[place]))
             if label is not None:
                 self.labels.append(row[label])
+        of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
+        rows = np.flatnonzero(of >= 0)
+        seconds[rows] = clock.utc(
+            self._moments, lambda k: self.where(rows[k]), of[rows], seconds[rows]
+        )
+        self.times = seconds  # s since 1970 UTC
 
     def _is_other_head(self, row: list[str]) -> bool:
         """Return whether a row without a time names columns, but not those of the head."""
@@ -251,15 +270,6 @@ class _Table:
     def where(self, row: int) -> str:
         """Return a row's place in the file for messages."""
         return f"{self.file.path}, line {self._lines[row]}"
-
-    def times(self, clock: DeviceClock) -> Array:
-        """Return the time of each row, s since 1970 UTC."""
-        of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
-        rows = np.flatnonzero(of >= 0)
-        seconds[rows] = clock.utc(
-            self._moments, lambda k: self.where(rows[k]), of[rows], seconds[rows]
-        )
-        return seconds
 
     def left_out(self) -> list[str]:
         """Return notes for the user on rows and readings that were left out."""
@@ -296,15 +306,13 @@ class _Table:
         Parsing the time of each reading would take longer than all else.
         """
         try:
-            begin, later = (
-                parse_moment(f"{before}:{seconds}{after}", self._order) for seconds in ("00", "30")
-            )
+            half = parse_moment(f"{before}:30{after}", self._order)
         except ValueError:
             return -1
         # in some forms the last digits are minutes or a fraction
-        if not isinstance(begin, datetime) or later != begin + timedelta(seconds=30):
+        if not isinstance(half, datetime) or half.second != 30 or half.microsecond:
             return -1
-        self._moments.append(begin)
+        self._moments.append(half.replace(second=0))
         return len(self._moments) - 1
 
     def _moment(self, line: int, text: str) -> datetime | None:
@@ -389,15 +397,7 @@ def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[s
             f"{table.file.path}: no sensor in column {_LABEL!r} has temperatures: "
             f"{quoted(every[:6])}; export one that has"
         )
-    return {_channel_name(name): np.where(labels == name, values, np.nan) for name in names}
-
-
-def _channel_name(name: str) -> str:
-    """Return a recording's name for a column, without the unit, which is °C there."""
-    quantity = without_unit(column_label(name))
-    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
-    plain = plain[:48]
-    return f"{plain} of the log" if channel_fault(plain) else plain
+    return {channel_name(name): np.where(labels == name, values, np.nan) for name in names}
 
 
 def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:
@@ -412,7 +412,7 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
             raise DataError(
                 f"{path}, column {name!r}: {known[0]:g} looks like kelvin: give --unit K to convert"
             )
-        if len(known) and known.min() > _FAHRENHEIT:
+        if len(known) and known.min() > TOO_HOT_C:
             notes.append(
                 f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it "
                 f"is {(known[0] - 32) / 1.8:.1f} °C: give --unit degF, or degC"
@@ -441,7 +441,7 @@ def _drop_unmeasured(
 
     Raises DataError if the unit changes midway and was not given.
     """
-    if changed := find_unit_change(celsius):
+    if changed := find_unit_change(table.times, celsius):
         row, words = changed
         last = celsius[:row][np.isfinite(celsius[:row])][-1]
         where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"

@@ -53,6 +53,9 @@ DIALECTS = {
     "milliseconds": f"time,temp\n{JUNE:.0f}000,21.5\n{JUNE + 60:.0f}000,21.75\n".encode(),
     "no header": PLAIN.partition("\n")[2].encode(),
     "HOBO": HOBO.encode("utf-8-sig"),
+    "spaces, as a shell writes vcgencmd": (
+        b"2026-06-14 12:00:00  temp=21.5'C\n2026-06-14 12:01:00 temp=21.75'C\n"
+    ),
     "units in a second line": PLAIN.replace("ature\n", "ature\n,deg C\n").encode(),
     "quoted decimal commas": PLAIN.replace(",21.5", ',"21,5"')
     .replace(",21.75", ',"21,75"')
@@ -151,6 +154,16 @@ def test_sensors_below_one_another_are_channels(tmp_path):
     box, air = found.channels.values()
     assert box[np.isfinite(box)].tolist() == [21.5, 21.75]
     assert air[np.isfinite(air)].tolist() == [19.5]
+    with pytest.raises(DataError, match=r"no column 'sensor.air'.* are 'sensor.box_temperature'"):
+        logged(tmp_path, data, temperatures=("sensor.air",))
+    # a processor at 70 °C is no room in °F
+    data = data.partition("\n")[0] + "".join(
+        f"\nsensor.{name},{value + k / 10},2026-06-14T10:0{k}:00.000Z"
+        for name, value in (("air", 21.1), ("cpu", 70.0)) for k in range(9)
+    ) + "\n"  # fmt: skip
+    assert list(logged(tmp_path, data).channels) == ["sensor.air", "sensor.cpu"]
+    given = {"temperatures": ("sensor.cpu",), "names": {"sensor.cpu": "processor"}}
+    assert list(logged(tmp_path, data, **given).channels) == ["processor"]
 
 
 def test_a_log_of_changes_holds_its_value_in_a_pause_but_not_while_unavailable(tmp_path):
@@ -246,6 +259,8 @@ def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head,
         (PLAIN.replace("21.75", "2_5.0"), {"temperatures": ("temperature",)}, "is not a number"),
         (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
         (b"a,b\n1,2\n3,4\n", {}, "no separator"),
+        (b"2026-06-14 4:50:00 PM 21.5\n2026-06-14 4:51:00 PM 21.5\n", {}, "no separator"),
+        (b"time,T\n" + 3 * b"2026-06-14 12:00,20\n", {}, "holds 1 time; at least two"),
         (b"", {}, "is empty"),
         (b"\xef\xbb\xbf\n\n", {}, "is empty"),
         (b"\xff\xfe", {}, "is empty"),

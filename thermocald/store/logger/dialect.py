@@ -81,7 +81,7 @@ TIME_NAME = re.compile(
     re.IGNORECASE,
 )
 """Words in the head of a column of times."""
-SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma"}
+SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma", " ": "space"}
 _LARGEST_BYTES = 2_000_000_000
 _CHUNK = 1 << 20
 _MOST_COLUMNS = 1000
@@ -228,7 +228,7 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
     plain = (line.replace("−", "-").replace("temp=", "") for line in lines)  # as vcgencmd writes it
-    reader = csv.reader(plain, delimiter=mark)
+    reader = csv.reader(plain, delimiter=mark, skipinitialspace=True)
     try:
         for row in reader:
             fields = [field.strip() for field in row]
@@ -304,7 +304,11 @@ def _detect_separator(path: Path, lines: list[str]) -> str:
         if not rows:
             continue
         width = Counter(len(row) for row in rows).most_common(1)[0][0]
-        data = sum(len(row) >= width and _is_data(row) for row in rows)
+        # between spaces may be a part of the time, such as PM or UTC
+        data = sum(
+            len(row) >= width and _is_data(row) and (mark != " " or all(map(_is_value, row)))
+            for row in rows
+        )
         if width > 1 and data >= max(1, _CONSISTENT * (len(rows) - _PREAMBLE)):
             return mark
     raise DataError(
@@ -317,6 +321,10 @@ def _detect_separator(path: Path, lines: list[str]) -> str:
 def _is_data(row: list[str]) -> bool:
     """Return whether a row holds a time and a reading or a word for a missing one."""
     return any(map(_is_time, row)) and any(map(_READING.fullmatch, row))
+
+
+def _is_value(field: str) -> bool:
+    return bool(_is_time(field) or _READING.fullmatch(field))
 
 
 def _is_time(field: str) -> bool:

@@ -34,10 +34,13 @@ from thermocald.store.logger.dialect import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from thermocald.store.logger.dialect import LoggerFile
 
 
+LABEL = "entity_id"
+"""Home Assistant's column with the sensor of each row: one table has all sensors."""
 _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
 
@@ -109,17 +112,21 @@ def log_options(
     )  # fmt: skip
 
 
-def require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
-    """Return columns of a file, given as its head or as the notes call them. Raises DataError."""
-    known = {channel_name(name): name for name in reversed(file.names)}
-    known |= {name: name for name in file.names}
-    for name in names:
+def require_columns(
+    path: Path, columns: Sequence[str], given: Sequence[str], option: str
+) -> tuple[str, ...]:
+    """Return those of a file's columns that are given by the head or as the notes call them.
+
+    Raises DataError for one that the file does not have.
+    """
+    known = {channel_name(column): column for column in columns[::-1]}
+    known |= {column: column for column in columns}
+    for name in given:
         if name not in known:
             raise DataError(
-                f"{file.path}: there is no column {name!r} ({option}); the columns are "
-                f"{quoted(file.names)}"
+                f"{path}: there is no column {name!r} ({option}); the columns are {quoted(columns)}"
             )
-    return tuple(dict.fromkeys(known[name] for name in names))
+    return tuple(dict.fromkeys(known[name] for name in given))
 
 
 def channel_name(name: str) -> str:
@@ -132,7 +139,7 @@ def channel_name(name: str) -> str:
 
 def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if options.times:
-        return require_columns(file, options.times, "--time-column")
+        return require_columns(file.path, file.names, options.times, "--time-column")
     numeric, seconds = file.of_kind("number", "seconds"), file.of_kind("seconds")
     serial = [n for n in numeric if TIME_NAME.search(n) and are_serials(file.column(n))]
     found = serial or [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
@@ -236,8 +243,8 @@ def _read_in_orders(
 def find_temperature_columns(
     file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
-    if options.temperatures:
-        return require_columns(file, options.temperatures, "--temperature-column")
+    if options.temperatures and LABEL not in file.names:
+        return require_columns(file.path, file.names, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
     numeric = [n for n in file.of_kind("number", "seconds") if n not in times]
     of_name = [n for n in numeric if TEMPERATURE_NAME.search(n)]

@@ -38,6 +38,7 @@ from thermocald.store.logger.dialect import (
     to_celsius,
 )
 from thermocald.store.logger.options import (
+    LABEL,
     LogOptions,
     channel_name,
     find_date_order,
@@ -59,6 +60,8 @@ from thermocald.store.recording.sense import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from thermocald.arrays import Array
 
 _ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNORECASE)
@@ -66,8 +69,6 @@ _ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNOR
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
 """Lines above a table that state °F."""
-_LABEL = "entity_id"
-"""Home Assistant's column with the sensor of each row: one table has all sensors."""
 _CHANGES = "last_changed"
 """Home Assistant's column of times: it writes a row when the value changes, and only then."""
 _LONGEST_PAUSE_S = 86400.0
@@ -101,8 +102,8 @@ def read_log(
     if table.are_serials:
         notes.append(f"log: {time_names[0]!r} holds days since 1899-12-30, as of a spreadsheet")
     times = table.times
-    if len(times) < 2:
-        raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
+    if (different := len(np.unique(times))) < 2:
+        raise DataError(f"{path}: holds {counted(different, 'time')}; at least two are needed")
     if fault := time_fault(times):
         raise DataError(f"{table.where(fault[0])}, column {time_names[0]!r}: {fault[1]}")
     steps = np.diff(times)
@@ -138,10 +139,11 @@ def read_log(
 
 def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array], list[str]]:
     """Return the channels {name: (n,) °C} of a table, and notes on their units and readings."""
+    path, sensors = table.file.path, list(dict.fromkeys(table.labels))
     given = {
         column: new
         for old, new in options.names.items()
-        for column in require_columns(table.file, (old,), "--name")
+        for column in require_columns(path, [*table.file.names, *sensors], [old], "--name")
     }
     channels: dict[str, Array] = {}
     notes: list[str] = []
@@ -152,9 +154,28 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
             channel += "_"
         channels[channel] = values
         notes += found
-    if table.labels:
-        channels = _split_by_label(table, next(iter(channels.values())), options)
-    return channels, notes
+    if not sensors:
+        return channels, notes
+    asked = [name for name in options.temperatures if name not in table.file.names]
+    names = require_columns(path, sensors, asked, "--temperature-column")
+    values, labels = next(iter(channels.values())), np.array(table.labels)
+    names = (
+        names
+        or tuple(filter(options.wanted.__contains__, sensors))
+        or tuple(
+            n
+            for n in sensors
+            if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
+        )
+    )
+    if not names:
+        raise DataError(
+            f"{path}: no sensor in column {LABEL!r} has temperatures: {quoted(sensors[:6])}; "
+            "export one that has"
+        )
+    return {
+        given.get(n) or channel_name(n): np.where(labels == n, values, np.nan) for n in names
+    }, notes
 
 
 def _hold_readings(
@@ -228,7 +249,7 @@ class _Table:
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
         self.labels: list[str] = []
         columns = [(name, file.names.index(name)) for name in names]
-        label = file.names.index(_LABEL) if _LABEL in file.names else None
+        label = file.names.index(LABEL) if LABEL in file.names else None
         self.are_serials = len(times) == 1 and are_serials(file.column(times[0]))
         bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
         head = 0
@@ -252,12 +273,7 @@ class _Table:
                 self.values[name].append(self._value(line, name, row[place]))
             if label is not None:
                 self.labels.append(row[label])
-        of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
-        rows = np.flatnonzero(of >= 0)
-        seconds[rows] = clock.utc(
-            self._moments, lambda k: self.where(rows[k]), of[rows], seconds[rows]
-        )
-        self.times = seconds  # s since 1970 UTC
+        self.times = self._utc(clock)
 
     def _is_other_head(self, row: list[str]) -> bool:
         """Return whether a row without a time names columns, but not those of the head."""
@@ -270,6 +286,15 @@ class _Table:
     def where(self, row: int) -> str:
         """Return a row's place in the file for messages."""
         return f"{self.file.path}, line {self._lines[row]}"
+
+    def _utc(self, clock: DeviceClock) -> Array:
+        """Return the time of each row, s since 1970 UTC."""
+        of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
+        rows = np.flatnonzero(of >= 0)
+        seconds[rows] = clock.utc(
+            self._moments, lambda k: self.where(rows[k]), of[rows], seconds[rows]
+        )
+        return seconds
 
     def left_out(self) -> list[str]:
         """Return notes for the user on rows and readings that were left out."""
@@ -385,21 +410,6 @@ def _apply_header_zone(clock: DeviceClock, header: str) -> tuple[DeviceClock, li
     return clock, [note]
 
 
-def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[str, Array]:
-    """Return one channel per sensor from a file that has all of them in one column."""
-    labels = np.array(table.labels)
-    every = list(dict.fromkeys(table.labels))
-    names = [n for n in every if n in options.wanted] or [
-        n for n in every if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
-    ]
-    if not names:
-        raise DataError(
-            f"{table.file.path}: no sensor in column {_LABEL!r} has temperatures: "
-            f"{quoted(every[:6])}; export one that has"
-        )
-    return {channel_name(name): np.where(labels == name, values, np.nan) for name in names}
-
-
 def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:
     """Return a column (n,) in °C, and notes on its unit and readings."""
     path = table.file.path
@@ -421,8 +431,11 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
     elif unit != "degC" and options.unit is None:
         notes.append(f"log: {name!r} is converted from {unit}, the unit in {source}")
     celsius = to_celsius(values, unit)
-    celsius, doubts = _drop_unmeasured(table, name, celsius, options)
-    notes += doubts
+    labels = np.array(table.labels or np.zeros(len(celsius)))
+    for sensor in np.unique(labels):
+        rows = np.flatnonzero(labels == sensor)
+        celsius[rows], doubts = _drop_unmeasured(table, name, rows, celsius[rows], options)
+        notes += doubts
     wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -435,16 +448,16 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
 
 
 def _drop_unmeasured(
-    table: _Table, name: str, celsius: Array, options: LogOptions
+    table: _Table, name: str, rows: NDArray[np.int64], celsius: Array, options: LogOptions
 ) -> tuple[Array, list[str]]:
-    """Return a column (n,) °C, NaN for values given without a measurement, and notes.
+    """Return one sensor's rows (n,) °C, NaN for values given without a measurement, and notes.
 
     Raises DataError if the unit changes midway and was not given.
     """
-    if changed := find_unit_change(table.times, celsius):
+    if changed := find_unit_change(table.times[rows], celsius):
         row, words = changed
         last = celsius[:row][np.isfinite(celsius[:row])][-1]
-        where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"
+        where = f"{table.where(rows[row])}, column {name!r}: the unit seems to change {words} here"
         if options.unit is None:
             raise DataError(
                 f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts "
@@ -462,7 +475,7 @@ def _drop_unmeasured(
         why = "leaping away and back" if sort else "given without a measurement"
         notes.append(
             f"doubtful: {counted(sum(s.stop - s.first for s in found), 'reading')} of {name!r} "
-            f"{why} (the first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
+            f"{why} (the first {celsius[first]:.4g} °C, {table.where(rows[first])}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:

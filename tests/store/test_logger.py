@@ -53,6 +53,9 @@ DIALECTS = {
     "milliseconds": f"time,temp\n{JUNE:.0f}000,21.5\n{JUNE + 60:.0f}000,21.75\n".encode(),
     "no header": PLAIN.partition("\n")[2].encode(),
     "HOBO": HOBO.encode("utf-8-sig"),
+    "spaces, as a shell writes vcgencmd": (
+        b"2026-06-14 12:00:00  temp=21.5'C\n2026-06-14 12:01:00 temp=21.75'C\n"
+    ),
     "units in a second line": PLAIN.replace("ature\n", "ature\n,deg C\n").encode(),
     "quoted decimal commas": PLAIN.replace(",21.5", ',"21,5"')
     .replace(",21.75", ',"21,75"')
@@ -151,6 +154,16 @@ def test_sensors_below_one_another_are_channels(tmp_path):
     box, air = found.channels.values()
     assert box[np.isfinite(box)].tolist() == [21.5, 21.75]
     assert air[np.isfinite(air)].tolist() == [19.5]
+    with pytest.raises(DataError, match=r"no column 'sensor.air'.* are 'sensor.box_temperature'"):
+        logged(tmp_path, data, temperatures=("sensor.air",))
+    # a processor at 70 °C is no room in °F
+    data = data.partition("\n")[0] + "".join(
+        f"\nsensor.{name},{value + k / 10},2026-06-14T10:0{k}:00.000Z"
+        for name, value in (("air", 21.1), ("cpu", 70.0)) for k in range(9)
+    ) + "\n"  # fmt: skip
+    assert list(logged(tmp_path, data).channels) == ["sensor.air", "sensor.cpu"]
+    given = {"temperatures": ("sensor.cpu",), "names": {"sensor.cpu": "processor"}}
+    assert list(logged(tmp_path, data, **given).channels) == ["processor"]
 
 
 def test_a_log_of_changes_holds_its_value_in_a_pause_but_not_while_unavailable(tmp_path):
@@ -246,6 +259,8 @@ def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head,
         (PLAIN.replace("21.75", "2_5.0"), {"temperatures": ("temperature",)}, "is not a number"),
         (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
         (b"a,b\n1,2\n3,4\n", {}, "no separator"),
+        (b"2026-06-14 4:50:00 PM 21.5\n2026-06-14 4:51:00 PM 21.5\n", {}, "no separator"),
+        (b"time,T\n" + 3 * b"2026-06-14 12:00,20\n", {}, "holds 1 time; at least two"),
         (b"", {}, "is empty"),
         (b"\xef\xbb\xbf\n\n", {}, "is empty"),
         (b"\xff\xfe", {}, "is empty"),
@@ -301,6 +316,11 @@ def test_columns_are_called_as_their_owner_calls_them(tmp_path):
     assert list(logged(tmp_path, TWO).channels) == ["housing", "Temp"]
     given = log_options(name=["Temp, °C (LGR S/N: 1, SEN S/N: 2)=相机"]).names
     assert list(logged(tmp_path, TWO, names=given).channels) == ["housing", "相机"]
+    # as the notes call it, also twice
+    one = logged(tmp_path, GERMAN, temperatures=("Temperatur", "Temperatur °C"))
+    assert one.channels["Temperatur"].tolist() == [21.5, 21.75]
+    given = log_options(name=["Temperatur=box"]).names
+    assert list(logged(tmp_path, GERMAN, names=given).channels) == ["box"]
 
 
 @pytest.mark.parametrize(
@@ -460,6 +480,44 @@ def test_what_is_doubtful_is_told(tmp_path, name):
         found = read(tmp_path, [f"time,{head}"], row, "degF")
         assert not [note for note in found.notes if "doubtful" in note]
         assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)
+
+
+WARM, ROOM, COLD = (np.linspace(*ends, 20) for ends in ((27, 35.9), (20.1, 22.3), (4.0, 6.2)))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "hours", "change"),
+    [
+        (WARM, COLD, 14, None),  # 35.9 °F would be 2.2 °C
+        (ROOM, WARM + 21, 14, None),  # 22.3 °C would be 72 °F
+        (10 * COLD // 1, COLD, 14, "from tenths"),
+        (COLD + 21, COLD / 2, 14, None),  # 27.2 are no tenths
+        (1.8 * ROOM + 32, ROOM, 14, "from °F to °C"),
+        (ROOM, 1.8 * ROOM + 35, 14, "from °C to °F"),
+        (1.8 * COLD + 32, COLD[::-1], 0, "from °F to °C"),
+        (ROOM, ROOM + 273.15, 0, "from °C to K"),
+    ],
+)
+def test_a_night_changes_the_temperature_and_a_setting_the_unit(
+    tmp_path, first, second, hours, change
+):
+    times = JUNE + np.arange(40) * 60.0 + np.repeat([0.0, 3600.0 * hours], 20)
+    rows = zip(times, [*first, *second], strict=True)
+    data = "time,T °C\n" + "".join(f"{time:.0f},{value:.1f}\n" for time, value in rows)
+    if change is None:
+        assert len(logged(tmp_path, data).times) == 40
+        return
+    with pytest.raises(DataError, match=f"line 22, .* the unit seems to change {change} here"):
+        logged(tmp_path, data)
+
+
+def test_no_two_days_of_a_real_log_have_two_units(shared, tmp_path):
+    lines = (shared / "data/temperature_logs/six_ds18b20_15min_excerpt.tsv").read_text()
+    head, *rows = lines.splitlines()[:-1]
+    wanted = tuple(head.split("\t")[2:])
+    for first in range(0, len(rows) - 300, 41):
+        days = rows[first : first + 40] + rows[first + 250 : first + 290]
+        assert len(logged(tmp_path, "\n".join([head, *days]), temperatures=wanted).channels) == 6
 
 
 @pytest.mark.parametrize("head", ["Temp housing", "T1", "Settle tank T", "spot temp"])

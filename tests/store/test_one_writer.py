@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import socket
@@ -175,3 +176,13 @@ def test_an_empty_file_that_was_there_stays_where_no_store_can_be_made(tmp_path)
     with pytest.raises(StoreError):
         StoreGuard(path)
     assert path.exists()
+
+
+def test_a_folder_without_locks_is_named_and_gets_no_file(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises(StoreError, match=r"t\.db: its folder cannot lock files \(No locks avail"):
+        Store.open(tmp_path / "t.db", "append")
+    assert list(tmp_path.iterdir()) == []

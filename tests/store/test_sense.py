@@ -225,11 +225,15 @@ def test_what_was_measured_is_no_spike(values):
     assert find_spikes(values) == []
 
 
+def unit_change(values: np.ndarray) -> tuple[int, str] | None:
+    return find_unit_change(np.arange(len(values)) * 60.0, values)
+
+
 @pytest.mark.parametrize("rise", [9.0, 15.0, 25.0, 35.0, 60.0])
 def test_a_camera_that_is_carried_changes_no_unit(rise):
-    assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise]) is None
+    assert unit_change(np.r_[wave(30), wave(60)[30:] + rise]) is None
     settling = 0.6 * rise * np.exp(-np.arange(30) / 2.0)
-    assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise - settling]) is None
+    assert unit_change(np.r_[wave(30), wave(60)[30:] + rise - settling]) is None
 
 
 def test_lenses_near_what_is_stated_are_not_doubted(recording):
@@ -251,7 +255,7 @@ def test_a_clock_that_was_not_set_is_refused(recording, column, rows):
 def test_a_spike_beside_a_change_of_the_unit_hides_neither():
     values = np.r_[wave(30), 1.8 * wave(60)[30:] + 32]
     values[[27, 33]] = 85.0, 185.0
-    assert find_unit_change(values) == (30, "from °C to °F")
+    assert unit_change(values) == (30, "from °C to °F")
     assert find_spikes(values)[0][:2] == (27, 28)
 
 

@@ -259,8 +259,8 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
     lines += [f"  damaged: {text}" for text in found.damaged[:_SHOWN]]
     if found.unfinished:
         lines.append(
-            "  the last write was cut off and is ignored: its writer was killed before the commit, "
-            "or the -wal file was cut off in copying, and more may be missing"
+            "  the last write was cut off before its commit and is ignored: the disk was full or "
+            "its writer was killed, or the -wal file was cut off in copying, and more may be missing"
         )
     return {
         "series": series,

@@ -98,14 +98,21 @@ class StoreFile:
             self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise StoreError(str(cannot_write(path, error))) from error
-        try:
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._handle)
-            raise _taken(path) from error
         status = os.fstat(self._handle)
         self.names = status.st_nlink
         self.identity = (status.st_dev, status.st_ino)
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(self._handle)
+            raise _taken(path) from error
+        except OSError as error:
+            self.discard_empty()
+            os.close(self._handle)
+            raise StoreError(
+                f"{path}: its folder cannot lock files ({error.strerror}), as some network folders "
+                "cannot; choose a store on a disk of this machine"
+            ) from error
         _CLAIMED.add(self.identity)
 
     def release(self) -> None:
@@ -115,8 +122,7 @@ class StoreFile:
 
     def discard_empty(self) -> None:
         """Remove the file if it was created for the lock and is still empty."""
-        empty = os.fstat(self._handle).st_size == 0
-        if self._made and empty and _identity(self.path) == self.identity:
+        if self._made and os.fstat(self._handle).st_size == 0 and self.there:
             self.path.unlink(missing_ok=True)
 
     @property
@@ -425,8 +431,8 @@ def read_wal_tail(path: Path) -> tuple[int, bool]:
     """Return (lost, unfinished) of a -wal file with the -shm file beside it.
 
     lost: number of committed transactions that cannot be read, -1 for all; unfinished: the last one
-    is incomplete and may not have been committed. Its writer was killed, or the file was cut off in
-    copying, and more may have followed. The files may be written meanwhile.
+    is incomplete and may not have been committed. Its disk was full, its writer was killed, or the
+    file was cut off in copying, and more may have followed. The files may be written meanwhile.
     """
     for _ in range(_TRIES):
         tail = _read_tail(path)

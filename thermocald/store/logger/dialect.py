@@ -81,7 +81,7 @@ TIME_NAME = re.compile(
     re.IGNORECASE,
 )
 """Words in the head of a column of times."""
-SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma"}
+SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma", " ": "space"}
 _LARGEST_BYTES = 2_000_000_000
 _CHUNK = 1 << 20
 _MOST_COLUMNS = 1000
@@ -110,9 +110,9 @@ _READING = re.compile(
 class LoggerFile:
     """A table in a file: the names of its columns, and its detected form.
 
-    first_line: line of the first row; sample: some rows from the beginning and the end; above: the
-    lines above the first row; is_cut: whether the last row is incomplete; is_assumed: whether other
-    encodings would do as well.
+    first_line: line of the first row; sample: some rows from the beginning and the end; kinds: of
+    each column's values, see `_kind`; above: the lines above the first row; is_cut: whether the
+    last row is incomplete; is_assumed: whether other encodings would do as well.
     """
 
     path: Path
@@ -122,6 +122,7 @@ class LoggerFile:
     separator: str
     decimal: str
     sample: tuple[tuple[str, ...], ...]
+    kinds: tuple[str, ...]
     above: tuple[str, ...] = ()
     is_cut: bool = False
     is_assumed: bool = False
@@ -142,8 +143,8 @@ class LoggerFile:
         return [row[place] for row in self.sample]
 
     def of_kind(self, *kinds: str) -> list[str]:
-        """Return the names of the columns that hold one of some kinds of values, see `_kind`."""
-        return [name for name in self.names if _kind(self.column(name)) in kinds]
+        """Return the names of the columns that hold one of some kinds of values."""
+        return [name for name, kind in zip(self.names, self.kinds, strict=True) if kind in kinds]
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield each row with its line, with one field per name; missing ones are empty."""
@@ -184,22 +185,12 @@ def open_log(
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; at most {_MOST_COLUMNS} are read")
-    first = next((i for i, (_, row) in enumerate(start) if len(row) >= width and _is_data(row)), -1)
-    if first < 0 and ours and len(start) > 1:
-        first = 1
+    head, first = _find_head(start, width, ours)
     if first < 0 or width < 2:
         raise DataError(
             f"{path}: no row holds a time and a number; is it a log of temperatures? Give its "
             "separator and decimal mark (--separator ';' --decimal ',')"
         )
-    head = [row for _, row in start[:first]]
-    # if another head follows, the rows so far were statistics
-    for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
-        row, next_row = start[i][1], start[i + 1][1]
-        named = row not in head and not _is_data(row) and any(map(TIME_NAME.search, row))
-        # a remark (`# battery changed`) fills one field
-        if named and sum(map(bool, row)) > 1 and _is_data(next_row):
-            head, first = [row], i + 1
     names = _column_names(head, width)
     rows = tuple(tuple(_fit_width(row, len(names))) for _, row in start[first:] + last)
     found = decimal or _detect_decimal(rows, mark)
@@ -211,9 +202,30 @@ def open_log(
         )
     above = tuple(" ".join(row) for _, row in start[:first])
     is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
+    kinds = tuple(_kind(column) for column in zip(*rows, strict=True))
     return LoggerFile(
-        path, names, start[first][0], encoding, mark, found, rows, above, is_cut, is_assumed
+        path, names, start[first][0], encoding, mark, found, rows, kinds, above, is_cut, is_assumed
     )
+
+
+def _find_head(
+    start: list[tuple[int, list[str]]], width: int, ours: bool
+) -> tuple[list[list[str]], int]:
+    """Return the rows above a table and the place of its first row, -1 if there is none."""
+    first = next((i for i, (_, row) in enumerate(start) if len(row) >= width and _is_data(row)), -1)
+    if first < 0 and ours and len(start) > 1:
+        first = 1
+    if first < 0:
+        return [], first
+    head = [row for _, row in start[:first]]
+    # if another head follows, the rows so far were statistics
+    for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
+        row, next_row = start[i][1], start[i + 1][1]
+        named = row not in head and not _is_data(row) and any(map(TIME_NAME.search, row))
+        # a remark (`# battery changed`) fills one field
+        if named and sum(map(bool, row)) > 1 and _is_data(next_row):
+            head, first = [row], i + 1
+    return head, first
 
 
 def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
@@ -228,7 +240,7 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
     plain = (line.replace("−", "-").replace("temp=", "") for line in lines)  # as vcgencmd writes it
-    reader = csv.reader(plain, delimiter=mark)
+    reader = csv.reader(plain, delimiter=mark, skipinitialspace=True)
     try:
         for row in reader:
             fields = [field.strip() for field in row]
@@ -304,7 +316,13 @@ def _detect_separator(path: Path, lines: list[str]) -> str:
         if not rows:
             continue
         width = Counter(len(row) for row in rows).most_common(1)[0][0]
-        data = sum(len(row) >= width and _is_data(row) for row in rows)
+        # between spaces may be a part of the time, such as PM or UTC
+        data = sum(
+            len(row) >= width
+            and _is_data(row)
+            and (mark != " " or all(_is_time(f) or _READING.fullmatch(f) for f in row))
+            for row in rows
+        )
         if width > 1 and data >= max(1, _CONSISTENT * (len(rows) - _PREAMBLE)):
             return mark
     raise DataError(
@@ -391,7 +409,7 @@ _GOOD_SHARE = 0.8
 _ANNOTATIONS = ("#group", "#datatype", "#default")  # of InfluxDB
 
 
-def _kind(values: list[str]) -> str:
+def _kind(values: Iterable[str]) -> str:
     """Return the kind of most of a column's values: moment, seconds, date, time, number, text."""
     kinds: Counter[str] = Counter(_kind_of(value) for value in values if re.search(r"\d", value))
     if not kinds:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
+from thermocald.numbers import column_label
 from thermocald.store.logger.clock import (
     ORDERS,
     DeviceClock,
@@ -28,14 +29,18 @@ from thermocald.store.logger.dialect import (
     TEMPERATURE_NAME,
     TIME_NAME,
     UNITS,
+    without_unit,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from thermocald.store.logger.dialect import LoggerFile
 
 
+LABEL = "entity_id"
+"""Home Assistant's column with the sensor of each row: one table has all sensors."""
 _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
 
@@ -107,19 +112,34 @@ def log_options(
     )  # fmt: skip
 
 
-def require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
-    for name in names:
-        if name not in file.names:
+def require_columns(
+    path: Path, columns: Sequence[str], given: Sequence[str], option: str
+) -> tuple[str, ...]:
+    """Return those of a file's columns that are given by the head or as the notes call them.
+
+    Raises DataError for one that the file does not have.
+    """
+    known = {channel_name(column): column for column in columns[::-1]}
+    known |= {column: column for column in columns}
+    for name in given:
+        if name not in known:
             raise DataError(
-                f"{file.path}: there is no column {name!r} ({option}); the columns are "
-                f"{quoted(file.names)}"
+                f"{path}: there is no column {name!r} ({option}); the columns are {quoted(columns)}"
             )
-    return names
+    return tuple(dict.fromkeys(known[name] for name in given))
+
+
+def channel_name(name: str) -> str:
+    """Return a recording's name for a column, without the unit, which is °C there."""
+    quantity = without_unit(column_label(name))
+    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
+    plain = plain[:48]
+    return f"{plain} of the log" if channel_fault(plain) else plain
 
 
 def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if options.times:
-        return require_columns(file, options.times, "--time-column")
+        return require_columns(file.path, file.names, options.times, "--time-column")
     numeric, seconds = file.of_kind("number", "seconds"), file.of_kind("seconds")
     serial = [n for n in numeric if TIME_NAME.search(n) and are_serials(file.column(n))]
     found = serial or [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
@@ -223,8 +243,8 @@ def _read_in_orders(
 def find_temperature_columns(
     file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
-    if options.temperatures:
-        return require_columns(file, options.temperatures, "--temperature-column")
+    if options.temperatures and LABEL not in file.names:
+        return require_columns(file.path, file.names, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
     numeric = [n for n in file.of_kind("number", "seconds") if n not in times]
     of_name = [n for n in numeric if TEMPERATURE_NAME.search(n)]

@@ -11,15 +11,14 @@ import re
 from array import array
 from collections import Counter
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.names import channel_fault
-from thermocald.numbers import column_label, counted
+from thermocald.numbers import counted
 from thermocald.store.logger.clock import (
     DeviceClock,
     are_serials,
@@ -37,10 +36,11 @@ from thermocald.store.logger.dialect import (
     open_log,
     stated_unit,
     to_celsius,
-    without_unit,
 )
 from thermocald.store.logger.options import (
+    LABEL,
     LogOptions,
+    channel_name,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
@@ -48,10 +48,19 @@ from thermocald.store.logger.options import (
     require_columns,
 )
 from thermocald.store.recording.reader import TemperatureLog as TemperatureLog
-from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts, time_fault
+from thermocald.store.recording.sense import (
+    PAUSE,
+    TOO_HOT_C,
+    find_spikes,
+    find_unit_change,
+    stuck_doubts,
+    time_fault,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
@@ -60,18 +69,15 @@ _ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNOR
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
 """Lines above a table that state °F."""
-_LABEL = "entity_id"
-"""Home Assistant's column with the sensor of each row: one table has all sensors."""
 _CHANGES = "last_changed"
 """Home Assistant's column of times: it writes a row when the value changes, and only then."""
-_PAUSE, _LONGEST_PAUSE_S = 5.0, 86400.0  # of the usual interval: a longer one is a pause
+_LONGEST_PAUSE_S = 86400.0
 _NO_READING = {
     -127.0, -196.6, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 3276.7, 9999.0, 9999.99,
 }  # fmt: skip
 """Numbers that stand for none: -196.6 is the -127 of the DS18B20 in °F, 3276.7 a full register."""
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
-_FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
 _SECONDS = re.compile(r"(.*):([0-5]\d)(\D*)", re.ASCII)
 """A time with its last two digits, probably the seconds."""
@@ -92,12 +98,12 @@ def read_log(
     clock, notes = _apply_header_zone(options.clock, " ".join([*time_names, *lines]))
     names = find_temperature_columns(file, time_names, options)
     order, order_notes = find_date_order(file, time_names, options, clock, near)
-    table = _Table(file, time_names, names, order)
+    table = _Table(file, time_names, names, order, clock)
     if table.are_serials:
         notes.append(f"log: {time_names[0]!r} holds days since 1899-12-30, as of a spreadsheet")
-    times = table.times(clock)
-    if len(times) < 2:
-        raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
+    times = table.times
+    if (different := len(np.unique(times))) < 2:
+        raise DataError(f"{path}: holds {counted(different, 'time')}; at least two are needed")
     if fault := time_fault(times):
         raise DataError(f"{table.where(fault[0])}, column {time_names[0]!r}: {fault[1]}")
     steps = np.diff(times)
@@ -133,20 +139,43 @@ def read_log(
 
 def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array], list[str]]:
     """Return the channels {name: (n,) °C} of a table, and notes on their units and readings."""
-    require_columns(table.file, tuple(options.names), "--name")
+    path, sensors = table.file.path, list(dict.fromkeys(table.labels))
+    given = {
+        column: new
+        for old, new in options.names.items()
+        for column in require_columns(path, [*table.file.names, *sensors], [old], "--name")
+    }
     channels: dict[str, Array] = {}
     notes: list[str] = []
     for name in table.values:
         values, found = _to_celsius_column(table, name, options)
-        given = name if name in options.wanted else None
-        channel = options.names.get(name) or given or _channel_name(name)
+        channel = given.get(name) or (name if name in options.wanted else channel_name(name))
         while channel in channels:  # `T (1)` and `T [1]` are two columns
             channel += "_"
         channels[channel] = values
         notes += found
-    if table.labels:
-        channels = _split_by_label(table, next(iter(channels.values())), options)
-    return channels, notes
+    if not sensors:
+        return channels, notes
+    asked = [name for name in options.temperatures if name not in table.file.names]
+    names = require_columns(path, sensors, asked, "--temperature-column")
+    values, labels = next(iter(channels.values())), np.array(table.labels)
+    names = (
+        names
+        or tuple(filter(options.wanted.__contains__, sensors))
+        or tuple(
+            n
+            for n in sensors
+            if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
+        )
+    )
+    if not names:
+        raise DataError(
+            f"{path}: no sensor in column {LABEL!r} has temperatures: {quoted(sensors[:6])}; "
+            "export one that has"
+        )
+    return {
+        given.get(n) or channel_name(n): np.where(labels == n, values, np.nan) for n in names
+    }, notes
 
 
 def _hold_readings(
@@ -165,7 +194,7 @@ def _hold_readings(
         t, v = times[sensor][order], values[sensor][order]
         steps = np.diff(t)
         usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
-        long = (steps > _PAUSE * usual) & (steps <= _LONGEST_PAUSE_S) & np.isfinite(v[:-1])
+        long = (steps > PAUSE * usual) & (steps <= _LONGEST_PAUSE_S) & np.isfinite(v[:-1])
         for k in np.flatnonzero(long).tolist():
             held = np.arange(t[k] + usual, t[k + 1] - 0.5 * usual, usual)
             more.append(held)
@@ -200,7 +229,12 @@ class _Table:
     """
 
     def __init__(
-        self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], order: str | None
+        self,
+        file: LoggerFile,
+        times: tuple[str, ...],
+        names: tuple[str, ...],
+        order: str | None,
+        clock: DeviceClock,
     ) -> None:
         self.file, self._order = file, order
         self._time_names = times
@@ -215,7 +249,7 @@ class _Table:
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
         self.labels: list[str] = []
         columns = [(name, file.names.index(name)) for name in names]
-        label = file.names.index(_LABEL) if _LABEL in file.names else None
+        label = file.names.index(LABEL) if LABEL in file.names else None
         self.are_serials = len(times) == 1 and are_serials(file.column(times[0]))
         bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
         head = 0
@@ -239,6 +273,7 @@ class _Table:
                 self.values[name].append(self._value(line, name, row[place]))
             if label is not None:
                 self.labels.append(row[label])
+        self.times = self._utc(clock)
 
     def _is_other_head(self, row: list[str]) -> bool:
         """Return whether a row without a time names columns, but not those of the head."""
@@ -252,7 +287,7 @@ class _Table:
         """Return a row's place in the file for messages."""
         return f"{self.file.path}, line {self._lines[row]}"
 
-    def times(self, clock: DeviceClock) -> Array:
+    def _utc(self, clock: DeviceClock) -> Array:
         """Return the time of each row, s since 1970 UTC."""
         of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
         rows = np.flatnonzero(of >= 0)
@@ -296,15 +331,13 @@ class _Table:
         Parsing the time of each reading would take longer than all else.
         """
         try:
-            begin, later = (
-                parse_moment(f"{before}:{seconds}{after}", self._order) for seconds in ("00", "30")
-            )
+            half = parse_moment(f"{before}:30{after}", self._order)
         except ValueError:
             return -1
         # in some forms the last digits are minutes or a fraction
-        if not isinstance(begin, datetime) or later != begin + timedelta(seconds=30):
+        if not isinstance(half, datetime) or half.second != 30 or half.microsecond:
             return -1
-        self._moments.append(begin)
+        self._moments.append(half.replace(second=0))
         return len(self._moments) - 1
 
     def _moment(self, line: int, text: str) -> datetime | None:
@@ -377,29 +410,6 @@ def _apply_header_zone(clock: DeviceClock, header: str) -> tuple[DeviceClock, li
     return clock, [note]
 
 
-def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[str, Array]:
-    """Return one channel per sensor from a file that has all of them in one column."""
-    labels = np.array(table.labels)
-    every = list(dict.fromkeys(table.labels))
-    names = [n for n in every if n in options.wanted] or [
-        n for n in every if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
-    ]
-    if not names:
-        raise DataError(
-            f"{table.file.path}: no sensor in column {_LABEL!r} has temperatures: "
-            f"{quoted(every[:6])}; export one that has"
-        )
-    return {_channel_name(name): np.where(labels == name, values, np.nan) for name in names}
-
-
-def _channel_name(name: str) -> str:
-    """Return a recording's name for a column, without the unit, which is °C there."""
-    quantity = without_unit(column_label(name))
-    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
-    plain = plain[:48]
-    return f"{plain} of the log" if channel_fault(plain) else plain
-
-
 def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:
     """Return a column (n,) in °C, and notes on its unit and readings."""
     path = table.file.path
@@ -412,7 +422,7 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
             raise DataError(
                 f"{path}, column {name!r}: {known[0]:g} looks like kelvin: give --unit K to convert"
             )
-        if len(known) and known.min() > _FAHRENHEIT:
+        if len(known) and known.min() > TOO_HOT_C:
             notes.append(
                 f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it "
                 f"is {(known[0] - 32) / 1.8:.1f} °C: give --unit degF, or degC"
@@ -421,8 +431,11 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
     elif unit != "degC" and options.unit is None:
         notes.append(f"log: {name!r} is converted from {unit}, the unit in {source}")
     celsius = to_celsius(values, unit)
-    celsius, doubts = _drop_unmeasured(table, name, celsius, options)
-    notes += doubts
+    labels = np.array(table.labels or np.zeros(len(celsius)))
+    for sensor in np.unique(labels):
+        rows = np.flatnonzero(labels == sensor)
+        celsius[rows], doubts = _drop_unmeasured(table, name, rows, celsius[rows], options)
+        notes += doubts
     wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -435,16 +448,16 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
 
 
 def _drop_unmeasured(
-    table: _Table, name: str, celsius: Array, options: LogOptions
+    table: _Table, name: str, rows: NDArray[np.int64], celsius: Array, options: LogOptions
 ) -> tuple[Array, list[str]]:
-    """Return a column (n,) °C, NaN for values given without a measurement, and notes.
+    """Return one sensor's rows (n,) °C, NaN for values given without a measurement, and notes.
 
     Raises DataError if the unit changes midway and was not given.
     """
-    if changed := find_unit_change(celsius):
+    if changed := find_unit_change(table.times[rows], celsius):
         row, words = changed
         last = celsius[:row][np.isfinite(celsius[:row])][-1]
-        where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"
+        where = f"{table.where(rows[row])}, column {name!r}: the unit seems to change {words} here"
         if options.unit is None:
             raise DataError(
                 f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts "
@@ -462,7 +475,7 @@ def _drop_unmeasured(
         why = "leaping away and back" if sort else "given without a measurement"
         notes.append(
             f"doubtful: {counted(sum(s.stop - s.first for s in found), 'reading')} of {name!r} "
-            f"{why} (the first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
+            f"{why} (the first {celsius[first]:.4g} °C, {table.where(rows[first])}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:

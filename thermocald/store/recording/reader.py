@@ -183,10 +183,10 @@ class Recording:
         found = list(time_doubts(columns.numbers, columns.frame_time, self.head.interval))
         found += pairing_doubts(columns.frame_time, columns.temperature_time, self.head.interval)
         for name, values in columns.temperatures.items():
-            found += reading_doubts(values, name)
-        if columns.readings is not None:
-            for name, values in columns.readings.channels.items():
-                found += reading_doubts(values, f"{name} of {READINGS}")
+            found += reading_doubts(columns.temperature_time, values, name)
+        if (every := columns.readings) is not None:
+            for name, values in every.channels.items():
+                found += reading_doubts(every.times, values, f"{name} of {READINGS}")
         if repeated := [f for f, n in Counter(columns.frames).items() if f and n > 1]:
             found.append(
                 f"{counted(len(repeated), 'frame')} listed in several epochs, the first "

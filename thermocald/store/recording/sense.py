@@ -42,6 +42,8 @@ _SIGMAS_PX = (1e-6, 1e4)
 _RHYTHM = 5.0  # largest ratio of the frames' interval to the stated one, or its inverse
 _APART, _APART_S = 5.0, 60.0  # largest offset of a reading from its frame: intervals, s
 _HOT_C = 65.0  # no lens is made for more
+TOO_HOT_C = 45.0  # °F of rooms and cameras, or °C of a hot camera
+PAUSE = 5.0  # of the usual interval: a longer one is a pause
 _DISTANCES = (0.8, 1.25)  # ratio of principal distances, estimated to stated, or of pitches
 _CENTRE = 0.1  # of the image's diagonal: largest offset of the principal point
 _MOST_NAMED = 6  # targets in a message
@@ -180,44 +182,51 @@ def find_spikes(values: Array) -> list[Spike]:
     return found
 
 
-def find_unit_change(values: Array) -> tuple[int, str] | None:
-    """Return the first of readings (n,) that is in another unit, and a phrase for the change.
+def find_unit_change(times: Array, values: Array) -> tuple[int, str] | None:
+    """Return the first of readings (n,) °C at times (n,) s in another unit, and its phrase.
 
-    The unit has changed if the readings step to the value that those before have in another unit.
-    Spikes are ignored.
+    The unit has changed if the readings leap to the value that those before have in another unit.
+    In a pause the temperature may have changed as well, so that °F must then be too hot for °C.
+    Tenths are whole numbers, what they are tenths of is not. Spikes are ignored.
     """
     values = values.copy()
     for spike in find_spikes(values):
         values[spike.first : spike.stop] = np.nan
     known = np.flatnonzero(np.isfinite(values))
-    v = values[known]
+    v, pauses = values[known], np.abs(np.diff(times[known]))
     steps = np.abs(np.diff(v))
     usual = float(np.median(steps)) if len(steps) else 0.0
-    for i in (np.flatnonzero(steps > max(_LEAP_K, 10.0 * usual)) + 1).tolist():
-        before, after = v[max(i - _AROUND, 0) : i], v[i : i + _AROUND]
-        if len(before) < _AROUND or len(after) < _AROUND:
+    leaps = (np.flatnonzero(steps > max(_LEAP_K, 10.0 * usual)) + 1).tolist()
+    for begin, i, end in zip([0, *leaps], leaps, [*leaps[1:], len(v)], strict=False):
+        around, leap = (v[max(i - _AROUND, 0) : i], v[i : i + _AROUND]), float(steps[i - 1])
+        drift = max(map(np.ptp, around))
+        if min(map(len, around)) < _AROUND or drift > 0.25 * leap:
             continue
-        level, now = float(before[-1]), float(after[0])
-        if max(np.ptp(before), np.ptp(after)) > 0.25 * abs(now - level):
-            continue
-        others = {
-            "from °C to °F": 1.8 * level + 32.0,
-            "from °F to °C": (level - 32.0) / 1.8,
-            "from °C to K": level + 273.15,
-            "from K to °C": level - 273.15,
-            "to tenths": 10.0 * level,
-            "from tenths": 0.1 * level,
-        }
-        for words, value in others.items():
-            allowed = 1.0 + 4.0 * usual + 0.05 * abs(now - level)
-            if abs(now - value) < allowed:
+        before, after = v[begin:i], v[i:end]
+        paused = pauses[i - 1] > PAUSE * np.median(pauses)
+        far = 1.0 + 4.0 * usual + (0.1 if paused else 0.05) * leap
+        near = min(far, 1.0 + 4.0 * max(usual, drift))
+        for words, factor, zero, low, high in (
+            ("from °C to °F", 1.8, 32.0, before, after),
+            ("from °F to °C", 1 / 1.8, -32.0 / 1.8, after, before),
+            ("from °C to K", 1.0, 273.15, before, after),
+            ("from K to °C", 1.0, -273.15, after, before),
+            ("to tenths", 10.0, 0.0, before, after),
+            ("from tenths", 0.1, 0.0, after, before),
+        ):
+            allowed, possible = far, True
+            if "F" in words:
+                allowed, possible = (far, high.min() > TOO_HOT_C) if paused else (near, True)
+            elif "tenths" in words:
+                possible = bool(np.any(low % 1) and not np.any(high % 1))
+            if possible and abs(after[0] - factor * before[-1] - zero) < allowed:
                 return int(known[i]), words
     return None
 
 
-def reading_doubts(values: Array, label: str) -> Iterator[str]:
-    """Yield doubts about a thermometer's readings (n,) °C."""
-    if changed := find_unit_change(values):
+def reading_doubts(times: Array, values: Array, label: str) -> Iterator[str]:
+    """Yield doubts about a thermometer's readings (n,) °C at times (n,) s."""
+    if changed := find_unit_change(times, values):
         row, words = changed
         yield (
             f"{label}: the unit seems to change {words} at reading {row + 1}: "

@@ -78,7 +78,7 @@ def start(
     try:
         if folder is None:
             make_folder(output)
-            read = desk.take_on_the_desk(read, session, say, watch)
+            desk.take_on_the_desk(read, session, say, watch)
         else:
             desk.take_in_the_daemon(folder, session, wait or watch is not None, say, watch)
             if not wait and watch is None:

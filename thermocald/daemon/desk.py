@@ -18,7 +18,6 @@ from pydantic import ValidationError
 
 from thermocald.config import in_words
 from thermocald.daemon.control import DaemonBusy, ask
-from thermocald.daemon.live_state import find_state
 from thermocald.daemon.plan import heating_outputs
 from thermocald.daemon.session import Session
 from thermocald.daemon.systemd import set_up_logging
@@ -168,12 +167,6 @@ def session_of(
         return Session.model_validate(request)
     except ValidationError as error:
         raise UsageError(f"--{in_words('', error)}") from error
-
-
-def listening_daemon(config: Config) -> Path | None:
-    """Return the live folder of the daemon that writes this store; None if none listens."""
-    folder = find_state(config.store.path)
-    return None if ask(folder, "session status") is None else folder
 
 
 @dataclass(eq=False)

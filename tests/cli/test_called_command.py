@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 
@@ -77,3 +78,40 @@ def test_every_help_has_an_example_and_breaks_no_option_in_two():
         text = call(*name.split(), "--help").stdout
         assert "Example" in text, name
         assert not re.search(r"--[a-z-]+-$", text, re.MULTILINE)
+
+
+_INTERRUPTED = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Finder())
+import thermocald.cli
+"""
+_ENDED = """
+import os, signal, sys, time
+import thermocald.cli
+class Last:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+def invoke(*_):
+    Last()
+    time.sleep(60)
+thermocald.cli.commands.Command.invoke = invoke
+sys.argv = ["thermocald", "devices"]
+thermocald.cli.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("script", "status"), [(_INTERRUPTED, -signal.SIGINT), (_ENDED, 128 + signal.SIGTERM)]
+)
+def test_a_signal_ends_a_command_silently_while_it_is_imported_and_in_a_destructor(script, status):
+    """A traceback; and a page that was stopped while pydantic built a model served on."""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=50, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", "")

@@ -11,7 +11,8 @@ import pytest
 import thermocald as tc
 from tests.commands import succeed as run
 from thermocald.cli import common
-from thermocald.daemon.desk import Progress
+from thermocald.daemon.desk import Follower
+from thermocald.daemon.session import Session
 from thermocald.errors import ThermocaldError, UsageError
 from thermocald.numbers import duration, with_sd
 from thermocald.physics.testfields import corner_field
@@ -64,10 +65,12 @@ def test_the_line_of_a_session_stays_one_line(monkeypatch):
     monkeypatch.setattr("sys.stderr", terminal)
     monkeypatch.setenv("COLUMNS", "80")
     sentence = "drifting 1.1085 ± 0.0015 px/min, ready in about 12.5667 ± 0.0067 min"
-    Progress(150, print).show({
+    last = {
         "epoch": 1, "temperature": 25.0, "status": "ok", "c": 3.04, "sd_c": 0.000031,
         "sigma0": 1.0, "online": {"sentence": sentence},
-    }, "")  # fmt: skip
+    }  # fmt: skip
+    one = {"found": [], "last": last, "state": "running", "why": "", "taken": 1}
+    Follower(Session(camera="a", series="M1", epochs=150), print).follow(one)
     line = terminal.getvalue().removeprefix("\r\x1b[K")
     assert len(line) == 79
     assert "c 3.040000 ± 0.000031 mm" in line

@@ -70,6 +70,7 @@ def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
         ),
         (("run", "--config", "idle.yaml", "--epochs", "2"), "--epochs: no camera of the config"),
         (("doctor", "--root", "/nowhere"), "--root /nowhere: there is no such folder"),
+        (("doctor", "--root", "/y" * 300), "--root (/y){100}…y(/y){99}: there is no such folder"),
         (("camera", "foo"), "error: no such command 'foo'; see 'thermocald camera --help'"),
         (("replay", "M1", "--exteriorr", "series"), "no such option: --exteriorr"),
         (("import", "p", "--log", "l"), "error: --testfield is missing: give it, or --dry-run"),

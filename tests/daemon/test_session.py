@@ -59,12 +59,19 @@ def test_it_ends_with_the_report(session, tmp_path):
     assert "<svg" in (tmp_path / "phone-1-M1.html").read_text()
 
 
-def test_a_camera_that_sees_nothing_is_told_before_it_begins(session, tmp_path):
-    process = session("--epochs", "5", exposure_s=0.01, camera=[{"kind": "timeout", "at": 1}])
+@pytest.mark.parametrize(
+    ("device", "faults"),
+    [("camera phone-1", {"camera": [{"kind": "timeout", "at": 1}]}),
+     ("thermometer housing", {"thermometer": [{"kind": "timeout", "at": 1, "count": 100}]})],
+)  # fmt: skip
+def test_a_device_that_gives_nothing_is_told_before_it_begins(session, daemon, device, faults):
+    process = session("--epochs", "5", exposure_s=0.01, **faults)
     told = process.said()
     assert process.returncode == 3
+    assert f"error: {device}: " in told
     assert "no answer" in told
-    assert not (tmp_path / "thermocald.db").exists()
+    with Store.open(daemon.store) as store:
+        assert store.all_series() == []
 
 
 def test_wrong_usage_is_one_line(session):

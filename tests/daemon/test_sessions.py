@@ -182,17 +182,22 @@ def test_what_cannot_be_taken_is_refused_with_the_reason(live, daemon):
     assert daemon.stop() == 0
 
 
-def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon):
-    """The camera sees another test field than the configured one."""
-    other = daemon.folder / "other.csv"
-    other.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
-        f"t{k},{100 * (k % 4)},{100 * (k // 4)},{10 * k},10,0.1,0.1,0.1\n" for k in range(12)
-    ))  # fmt: skip
-    sensor = {"width_px": 820, "height_px": 616, "pixel_pitch_mm": 0.00448}
-    live(series=None, sensor=sensor, testfield=str(other))
+@pytest.mark.parametrize("what", ["another field", "thermometer housing"])
+def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon, what):
+    """The camera sees another test field than the configured one; a thermometer is dead."""
+    wrong = {"thermometer": [{"kind": "timeout", "at": 1, "count": 10_000}]}
+    if what == "another field":
+        other = daemon.folder / "other.csv"
+        other.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
+            f"t{k},{100 * (k % 4)},{100 * (k // 4)},{10 * k},10,0.1,0.1,0.1\n" for k in range(12)
+        ))  # fmt: skip
+        sensor = {"width_px": 820, "height_px": 616, "pixel_pitch_mm": 0.00448}
+        wrong, what = {"sensor": sensor, "testfield": str(other)}, "test field"
+    live(series=None, **wrong)
     daemon.ask("session start", session=SESSION)
     daemon.until(lambda: daemon.session()["state"] == "refused")
     assert "the check failed" in daemon.session()["why"]
+    assert what in daemon.session()["why"]
     assert daemon.stop() == 0
     assert series_of(daemon.store) == {}
 

@@ -117,3 +117,5 @@ def test_the_page_shares_neither_memory_nor_processor_with_the_daemon():
         assert int(page["CPUWeight"]) < 100 < int(daemon["CPUWeight"])
         assert "MemoryMax" in daemon
         assert page["RestartPreventExitStatus"] == "2"
+        # a page, and a daemon that is not up yet, end by SIGTERM with this status: no failure
+        assert page["SuccessExitStatus"] == daemon["SuccessExitStatus"] == "143"

@@ -167,3 +167,14 @@ def _all_of(k: int) -> dict:
         "selected": _name(k), "figure": k, "curve": k, "note": _name(k), "csv": _name(k),
         "targets": k,
     }  # fmt: skip
+
+
+def test_without_javascript_the_page_says_only_that_it_needs_it(page_with, page_of):
+    """It said "connecting …" and "no epoch yet" for ever."""
+    url, _ = page_with(1)
+    page = page_of(url, 390, java_script_enabled=False)
+    shown = page.locator("body").inner_text().split("\n")
+    assert [line for line in shown if line.strip()] == [
+        "thermocald",
+        "The page needs JavaScript; thermocald status shows the status in a terminal.",
+    ]

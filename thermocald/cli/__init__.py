@@ -18,6 +18,9 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if "run" in sys.argv[1:3]:  # a reload must not end a daemon that is still being imported
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
+_interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+if _interruptible:  # Ctrl-C during the imports ends the process, without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import typer
 
@@ -26,6 +29,9 @@ from thermocald.cli.commands import COMMANDS, Group, add_commands
 from thermocald.cli.common import log_to_stderr, say
 from thermocald.errors import ThermocaldError
 from thermocald.files import cannot_write
+
+if _interruptible:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _INTERRUPTED = 130
 _USAGE_ERROR: Any = typer.BadParameter.__base__  # click's, which Typer depends on
@@ -82,8 +88,10 @@ def _options(
 def main() -> None:
     """Run the command line; print every foreseen error in one line, without a traceback."""
     with contextlib.suppress(ValueError):  # raised outside the main thread
-        # an exception, so that half-written files are removed
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        # an exception, so that half-written files are removed; an alarm raises it again
+        for number in (signal.SIGTERM, signal.SIGALRM):
+            signal.signal(number, lambda *_: sys.exit(128 + signal.SIGTERM))
+    sys.unraisablehook = _keep_exit
     _prepare_process()
     try:
         status = application(_command_name())(prog_name="thermocald", standalone_mode=False)
@@ -123,6 +131,14 @@ def main() -> None:
         with contextlib.suppress(OSError):
             sys.stdout.close()  # otherwise Python flushes it at exit, and fails again
         sys.exit(failed.exit_status)
+
+
+def _keep_exit(lost: Any) -> None:
+    """Exit soon, if Python ignored that: in a destructor, or where pydantic builds a model."""
+    if isinstance(lost.exc_value, SystemExit):
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _print_usage_error(error: Any) -> int:

@@ -30,10 +30,11 @@ _LINES = 10  # progress lines without a terminal
 def say(text: str) -> None:
     """Print a line on standard error; standard output is for results.
 
-    Secrets are removed. Control characters, which a file name may contain and a terminal would
-    obey, are shown as codes.
+    Secrets are removed, an absurdly long path is shortened. Control characters, which a file name
+    may contain and a terminal would obey, are shown as codes.
     """
-    sys.stderr.write(printable(without_secrets(text)) + "\n")
+    text = re.sub(r"\S+", lambda word: files.shown(word[0]), printable(without_secrets(text)))
+    sys.stderr.write(f"{text}\n")
     sys.stderr.flush()
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from thermocald.arrays import Array
-    from thermocald.daemon.station import Station
+    from thermocald.daemon.service import Service
 
 
 def demo(
@@ -155,16 +155,21 @@ def _acquire(
     taken = 0
     set_up_logging("warning")
 
-    def show_progress(station: Station) -> bool:
+    def show_progress(service: Service) -> bool:
         nonlocal taken
-        run = station.cameras[0].run
+        run = service.station.cameras[0].run
         now = 0 if run is None else run.taken
         advance(now - taken)
         taken = now
         return False
 
-    Service(config, epochs=epochs, until_finished=True, on_turn=show_progress, clock=clock).run()
-    advance(epochs - taken)
+    service = Service(
+        config, epochs=epochs, until_finished=True, on_turn=show_progress, clock=clock
+    )
+    service.run()
+    show_progress(service)
+    if taken < epochs:  # Ctrl-C, which ends the daemon without an exception
+        raise typer.Abort
     with Store.open(config.store.path) as store:
         archive_series(store, store.find_series(), out / "M1")
     series = tc.open(config.store.path)

@@ -59,6 +59,8 @@ def start(
     Example: thermocald session start --camera phone-1 --series M1 --start cold --epochs 150
     """
     from thermocald.daemon import desk
+    from thermocald.daemon.control import ask
+    from thermocald.daemon.live_state import find_state
 
     read = _configuration(config, mock)
     session = desk.session_of(read, camera, series, condition, epochs, programme, check)
@@ -74,14 +76,14 @@ def start(
     path = output / f"{session.camera}-{series}"
     if path.exists():
         raise DataError(f"{path}: the recording exists already; choose another --series")
-    folder = desk.listening_daemon(read)
+    folder, wait = find_state(read.store.path), wait or watch is not None
     try:
-        if folder is None:
+        if ask(folder, "session status") is None:
             make_folder(output)
-            read = desk.take_on_the_desk(read, session, say, watch)
+            desk.take_on_the_desk(read, session, say, watch)
         else:
-            desk.take_in_the_daemon(folder, session, wait or watch is not None, say, watch)
-            if not wait and watch is None:
+            desk.take_in_the_daemon(folder, session, wait, say, watch)
+            if not wait:
                 return
             make_folder(output)
     finally:

@@ -11,16 +11,14 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from thermocald.config import in_words, parse_config
+from thermocald.config import in_words
 from thermocald.daemon.control import DaemonBusy, ask
-from thermocald.daemon.live_state import find_state
-from thermocald.daemon.plan import heating_outputs, plan_cameras
+from thermocald.daemon.plan import heating_outputs
 from thermocald.daemon.session import Session
 from thermocald.daemon.systemd import set_up_logging
 from thermocald.errors import (
@@ -31,15 +29,14 @@ from thermocald.errors import (
     UsageError,
 )
 from thermocald.files import read_yaml
-from thermocald.hal import SystemClock, open_device
 from thermocald.numbers import percent, with_sd
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from concurrent.futures import Future
+    from pathlib import Path
 
     from thermocald.config import Config
-    from thermocald.daemon.station import Station
     from thermocald.discovery.experiment import Experiment, Separation
     from thermocald.thermal.series import SeriesInput
 
@@ -53,60 +50,44 @@ _BELOW_LIMIT_K = 1.0  # the thermostat overshoots
 
 def take_on_the_desk(
     config: Config, session: Session, say: Callable[[str], None], watch: Watch | None = None
-) -> Config:
-    """Check, then take the missing epochs in this process; return the configuration used.
+) -> None:
+    """Take the missing epochs by a daemon in this process, which stops afterwards.
 
-    watch: ends the session when its effects are separated. Raises DataError if epochs are missing.
+    watch: ends the session when its effects are separated. Raises DeviceError if the camera or,
+    at the check, a thermometer fails; DataError if epochs are missing.
     """
     from thermocald.daemon.service import Service
 
     done, epochs = _stored(config, session), session.epochs
-    read = _prepare(config, session, done)
+    if done >= epochs:
+        return
+    if done:
+        say(f"series {session.series} has {done} epochs; {epochs - done} are still to be taken")
     set_up_logging("warning")
-    if done < epochs:
-        if session.check:
-            _check(read, say)
-        if done:
-            say(f"series {session.series} has {done} epochs; {epochs - done} are still to be taken")
-        progress = Progress(epochs, say, done)
-        service = Service(
-            read,
-            epochs=epochs - done,
-            until_finished=True,
-            start_condition=session.start,
-            on_turn=lambda station: _turn(station, progress, watch),
-        )
-        service.run()
-        done = _stored(config, session)
+    # the session's devices alone; the camera has no other series to return to
+    camera = next(c for c in config.cameras if c.name == session.camera)
+    used = [t for t in config.thermometers if t.name in camera.thermometers]
+    chosen = camera.model_copy(update={"series": None})
+    config = config.model_copy(update={"cameras": (chosen,), "thermometers": tuple(used)})
+    follower = Follower(session, say, watch, done)
+
+    def turn(service: Service) -> bool:
+        one = service.sessions.status()[session.camera]
+        station = service.station
+        links = [line.link for line in station.cameras]
+        if one["state"] in ("checking", "refused"):
+            links += station.thermometers.links.values()
+        for link in links:
+            if link.state == "failed" or (link.state == "out" and one["state"] != "running"):
+                raise DeviceError(f"{link.called}: {link.why}")
+        return follower.follow(one)
+
+    Service(config, session=session, on_turn=turn).run()
+    done = _stored(config, session)
     if done < epochs and not (watch and watch.ended):
         raise DataError(
             f"series {session.series} has {done} of {epochs} epochs; repeat the command to continue"
         )
-    return read
-
-
-def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
-    camera = station.cameras[0]
-    if camera.link.state == "failed":
-        raise DeviceError(f"camera {camera.plan.name}: {camera.link.why}")
-    last = {} if camera.run is None else camera.run.last
-    progress.show(last, camera.link.why if camera.link.state == "out" else "")
-    return watch is not None and watch.look(last.get("epoch", 0))
-
-
-def _prepare(config: Config, session: Session, done: int) -> Config:
-    """Return the configuration with the session's camera and series and its thermometers."""
-    document = config.model_dump(mode="python", by_alias=True)
-    chosen = next(c for c in document["cameras"] if c["name"] == session.camera)
-    chosen["series"] = session.series
-    document["cameras"] = [chosen]
-    document["thermometers"] = [
-        t for t in document["thermometers"] if t["name"] in chosen["thermometers"]
-    ]
-    if session.programme:
-        for i in heating_outputs(config, "--programme"):
-            document["outputs"][i]["programme"] = session.steps(done * chosen["period_s"])
-    return parse_config(document, Path("config.yaml"))
 
 
 def _stored(config: Config, session: Session) -> int:
@@ -117,26 +98,6 @@ def _stored(config: Config, session: Session) -> int:
     with Store.open(config.store.path) as store:
         found = store.series_of(session.camera, session.series)
         return 0 if found is None else store.last_epoch(found) or 0
-
-
-def _check(config: Config, say: Callable[[str], None]) -> None:
-    """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
-    from thermocald.acquisition.pipeline import check_frame
-
-    clock = SystemClock()
-    for one in config.thermometers:
-        with open_device("thermometer", one.driver, one.options, clock) as thermometer:
-            values = thermometer.read().values
-        say(f"{one.name}: " + ", ".join(f"{k} {v:.2f} °C" for k, v in values.items()))
-    plan = plan_cameras(config, clock)[0]
-    calibrator = plan.calibrator_of_check()
-    with plan.camera as camera:
-        frame = camera.capture()
-    found, why = check_frame(plan.name, calibrator, frame)
-    for sentence in found:
-        say(sentence)
-    if why:
-        raise DataError(f"the check failed: {why}")
 
 
 def take_in_the_daemon(
@@ -150,7 +111,7 @@ def take_in_the_daemon(
     say(f"{session.camera}/{session.series}: taken by the daemon, also after Ctrl-C")
     if not wait:
         return
-    progress, seen, away_since = Progress(session.epochs, say), 0, 0.0
+    follower, away_since = Follower(session, say, watch), 0.0
     while True:
         time.sleep(_LOOK_EVERY_S)
         try:
@@ -168,17 +129,10 @@ def take_in_the_daemon(
         one = answer["sessions"].get(session.camera, {})
         if one.get("series") != session.series:
             raise DataError("the daemon stopped before the session began; repeat the command")
-        for sentence in one["found"][seen:]:
-            say(sentence)
-        seen = max(seen, len(one["found"]))
-        progress.show(one.get("last", {}), one["why"] if one["state"] == "paused" else "")
-        if watch is not None and watch.look(one["taken"]):
-            ask(folder, "session stop", camera=session.camera)
+        if follower.follow(one):
+            if one["state"] != "done":
+                ask(folder, "session stop", camera=session.camera)
             return
-        if one["state"] == "done":
-            return
-        if one["state"] in ("refused", "stopped"):
-            raise DataError(f"{one['taken']} of {one['epochs']} epochs: {one['why']}")
 
 
 def only_camera(config: Config, camera: str | None = None) -> str:
@@ -215,29 +169,36 @@ def session_of(
         raise UsageError(f"--{in_words('', error)}") from error
 
 
-def listening_daemon(config: Config) -> Path | None:
-    """Return the live folder of the daemon that writes this store; None if none listens."""
-    folder = find_state(config.store.path)
-    return None if ask(folder, "session status") is None else folder
-
-
 @dataclass(eq=False)
-class Progress:
-    """Prints a session's progress; total: its epochs; shown: the last one printed or stored."""
+class Follower:
+    """Prints a session's progress; shown: the last epoch printed or stored before."""
 
-    total: int
+    session: Session
     say: Callable[[str], None]
+    watch: Watch | None = None
     shown: int = 0
 
     def __post_init__(self) -> None:
+        self._found = 0
         self._printed_at = float("-inf")
         self._paused = False
 
-    def show(self, last: Mapping[str, Any], paused: str = "") -> None:
-        """Print the progress, if there is any; called a few times a second.
+    def follow(self, one: Mapping[str, Any]) -> bool:
+        """Print what is new in the session's status; return whether it has come to its end.
 
-        last: the last epoch's row, as outputs receive it; paused: why the session is paused, or "".
+        Called a few times a second; DataError if the session was refused or stopped.
         """
+        for sentence in one["found"][self._found :]:
+            self.say(sentence)
+        self._found = max(self._found, len(one["found"]))
+        self._show(one["last"], one["why"] if one["state"] == "paused" else "")
+        if self.watch is not None and self.watch.look(one["taken"]):
+            return True
+        if one["state"] in ("refused", "stopped"):
+            raise DataError(f"{one['taken']} of {one['epochs']} epochs: {one['why']}")
+        return bool(one["state"] == "done")
+
+    def _show(self, last: Mapping[str, Any], paused: str) -> None:
         if paused and not self._paused:
             self.say(f"paused: {paused}")
         if self._paused and not paused:
@@ -247,7 +208,7 @@ class Progress:
             return
         self.shown = last["epoch"]
         temperature = last.get("temperature")
-        line = f"epoch {last['epoch']} of {self.total}: "
+        line = f"epoch {last['epoch']} of {self.session.epochs}: "
         line += "" if temperature is None else f"{temperature:.2f} °C, "
         if last["status"] == "ok":
             line += f"c {with_sd(last['c'], last['sd_c'], 'mm')}, sigma0 {last['sigma0']:.2f}"
@@ -260,7 +221,7 @@ class Progress:
             room = shutil.get_terminal_size().columns - 1
             sys.stderr.write(f"\r\x1b[K{line[:room]}")
             sys.stderr.flush()
-        elif now - self._printed_at >= _LINE_EVERY_S or self.shown == self.total:
+        elif now - self._printed_at >= _LINE_EVERY_S or self.shown == self.session.epochs:
             self._printed_at = now
             self.say(line)
 

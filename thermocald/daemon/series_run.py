@@ -70,7 +70,7 @@ class Runtime:
 
     fast: take epochs as fast as they can be calibrated, at the ticks of a virtual clock, or
     free_running: of a recording, without ticks and pauses; epochs: the number of new epochs after
-    which a camera stops, 0 for never; start_condition: stored with a new series.
+    which a camera stops, 0 for never.
     """
 
     guard: StoreGuard
@@ -80,7 +80,6 @@ class Runtime:
     free_running: bool = False
     epochs: int = 0
     hang_after_s: float = 60.0
-    start_condition: str = ""
 
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from thermocald.config import Config, DashboardConfig
     from thermocald.daemon.control import Request
+    from thermocald.daemon.session import Session
     from thermocald.hal import Clock
 
 
@@ -123,9 +124,9 @@ class Service:
 
     path: the configuration file, which SIGHUP reloads; with_options: changes what is read there as
     the command line demands; until_finished: stop when all recordings have been played or all
-    epochs taken, instead of serving requests at the control socket; on_turn: called in every turn,
-    stops the service by returning True; clock: a virtual clock, on which rendered devices take no
-    time. For the other arguments see `Runtime`.
+    epochs taken, instead of serving requests at the control socket; session: take only this one;
+    on_turn: called in every turn, stops the service by returning True; clock: a virtual clock, on
+    which rendered devices take no time. For the other arguments see `Runtime`.
     """
 
     def __init__(
@@ -138,8 +139,8 @@ class Service:
         epochs: int = 0,
         until_finished: bool = False,
         hang_after_s: float = 60.0,
-        start_condition: str = "",
-        on_turn: Callable[[Station], bool] | None = None,
+        session: Session | None = None,
+        on_turn: Callable[[Service], bool] | None = None,
         clock: Clock | None = None,
     ) -> None:
         self.config = config
@@ -151,9 +152,9 @@ class Service:
         self._runtime_of = partial(
             Runtime, clock=self.clock, live=self.live, fast=fast or clock is not None,
             free_running=fast and clock is None, epochs=epochs, hang_after_s=hang_after_s,
-            start_condition=start_condition,
         )  # fmt: skip
-        self._until_finished = until_finished
+        self._session = session
+        self._until_finished = until_finished or session is not None
         self._on_turn = on_turn
         self._started = self.clock.monotonic()
         self._wake = threading.Event()
@@ -181,11 +182,14 @@ class Service:
         done = False
         self._control = ControlSocket(self.live.folder, self._ask)
         try:
-            self._station = Station(self.config, self._runtime)
-            self._sessions = Sessions(self._station)
-            if not self._until_finished:
-                self._sessions.resume(self._station)
-            self._station.start()
+            self.station = Station(self.config, self._runtime)
+            self.sessions = Sessions(self.station)
+            if self._session is not None:
+                self.sessions.start(self._session)
+            elif not self._until_finished:
+                self.sessions.recall()
+                self.sessions.resume(self.station)
+            self.station.start()
             if not self._until_finished:
                 self._control.ensure_open()
             log.info("thermocald %s runs", __version__, extra={"event": "started"})
@@ -196,7 +200,10 @@ class Service:
             finally:
                 notify("STOPPING=1")
                 self._control.close()
-                done = self._station.stop(_GRACE_S)
+                if self._session is not None:
+                    with suppress(DataError):  # it has come to its end
+                        self.sessions.stop(self._session.camera)
+                done = self.station.stop(_GRACE_S)
                 self._record("stopped", "thermocald stopped")
                 self._guard.flush()
                 self.live.remove()  # while the page still runs and can report it
@@ -210,7 +217,7 @@ class Service:
     def faults(self) -> list[str]:
         """Sentences on epochs that were lost, and on cameras that were not read to their end."""
         store = self._guard.status()
-        links = [line.link for line in self._station.cameras if self._until_finished]
+        links = [line.link for line in self.station.cameras if self._until_finished]
         faults = [f"{one.name}: {one.why}" for one in links if one.state == "failed"]
         if store["lost"]:
             faults.insert(0, f"{counted(store['lost'], 'epoch')} lost: {store['lost_why']}")
@@ -225,15 +232,15 @@ class Service:
             if self._reload:
                 self._reload = False
                 self._reload_configuration()
-            self._sessions.turn()
+            self.sessions.turn()
             if (step := self.clock.check()) is not None:
                 seconds, adopted, text = step
                 data = {"seconds": seconds, "adopted": adopted}
                 self._guard.event(self.clock.utc(), "clock_step", text, data=data)
                 if adopted:
-                    self._station.frames.restamp(seconds)
+                    self.station.frames.restamp(seconds)
             self._dashboard.ensure_running(self.config.dashboard)
-            stalled = self._station.stalled()
+            stalled = self.station.stalled()
             self._report_stalled(stalled)
             if interval is not None and not stalled and now - fed >= min(interval, 1.0):
                 fed = now
@@ -245,9 +252,9 @@ class Service:
                 if not self._until_finished:
                     self._control.ensure_open()
                 notify(f"STATUS={self._line()}")
-            if self._on_turn is not None and self._on_turn(self._station):
+            if self._on_turn is not None and self._on_turn(self):
                 break
-            if self._until_finished and self._station.finished:
+            if self._until_finished and self.station.finished:
                 break
             self._turn.release()
             if self._wake.wait(turn_s):
@@ -264,10 +271,10 @@ class Service:
             "configuration": None if self._path is None else str(self._path.absolute()),
             "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},
             "store": {**self._guard.status(), "path": self.config.store.path.absolute()},
-            "stalled": self._station.stalled(),
-            "sessions": self._sessions.status(),
+            "stalled": self.station.stalled(),
+            "sessions": self.sessions.status(),
             "dashboard": {"enabled": self.config.dashboard.enabled, "why": self._dashboard.why},
-            **self._station.status(),
+            **self.station.status(),
         }
         return {**document, "warnings": status_warnings(document)}
 
@@ -277,12 +284,12 @@ class Service:
             raise DataError("the daemon is busy; look at its status and try again")
         try:
             if request.session is not None:
-                return {"session": self._sessions.start(request.session)}
+                return {"session": self.sessions.start(request.session)}
             if request.camera is not None:
-                return {"session": self._sessions.stop(request.camera)}
+                return {"session": self.sessions.stop(request.camera)}
             if request.do == "retention":
-                return {"deleted": self._station.retain()}
-            return {"sessions": self._sessions.status()}
+                return {"deleted": self.station.retain()}
+            return {"sessions": self.sessions.status()}
         except ThermocaldError:
             raise
         except Exception as error:
@@ -295,7 +302,7 @@ class Service:
     def _line(self) -> str:
         """Return the status line for `systemctl status`."""
         parts = []
-        for camera in self._station.cameras:
+        for camera in self.station.cameras:
             last = {} if camera.run is None else camera.run.last
             if not camera.taking:
                 text = "idle"
@@ -308,7 +315,7 @@ class Service:
                 text = f"epoch {last['epoch']}, {last['temperature']:.1f} °C, {found}"
             parts.append(f"{camera.plan.name}: {text}")
         if not parts:
-            thermometers = self._station.thermometers
+            thermometers = self.station.thermometers
             parts = [
                 f"{name}: " + ", ".join(f"{celsius:.1f} °C" for celsius in values.values())
                 for name in thermometers.links
@@ -324,7 +331,7 @@ class Service:
         try:
             text = self._apply_configuration()
         except ThermocaldError as error:
-            if self._station.stopping.is_set():
+            if self.station.stopping.is_set():
                 raise  # a daemon that takes nothing would look healthy: a restart may help
             text = f"the configuration cannot be reloaded, the old one stays in force: {error}"
             log.error("%s", text, extra={"event": "reload_failed"})
@@ -341,16 +348,16 @@ class Service:
         if config.store != self.config.store:
             log.warning("store: a change takes effect after a restart; the old store is still used")
             config = config.model_copy(update={"store": self.config.store})
-        if config == self.config and not self._station.failed:
+        if config == self.config and not self.station.failed:
             return "the configuration has not changed"
         Station(config, self._runtime)  # raises for a fault before the old one is stopped
-        if not self._station.stop(_GRACE_S):
+        if not self.station.stop(_GRACE_S):
             log.error("a device does not close; it may be unavailable for a while")
         # built only now: epoch numbers continue after the last one that the old station stored
         new = Station(config, self._runtime)
-        self._sessions.resume(new)
+        self.sessions.resume(new)
         logging.getLogger().setLevel(config.logging.level.upper())
-        self.config, self._station = config, new
+        self.config, self.station = config, new
         gc.collect()  # the old station refers to itself: 50 MB would stay for a while
         new.start()
         text = "the configuration was read again"

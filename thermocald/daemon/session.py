@@ -58,19 +58,20 @@ class Session(BaseModel):
 
 @dataclass
 class _Progress:
-    """A session and its progress; taken: the number of its last epoch when it ended."""
+    """A session and its progress; taken, last: the number and row of its last epoch at its end."""
 
     session: Session
     state: State
     why: str = ""
     found: list[str] = field(default_factory=list)
     taken: int = 0
+    last: dict[str, Any] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         request = self.session.model_dump(mode="json", exclude={"programme", "check"})
         return {
             **request, "state": self.state, "why": self.why, "found": self.found,
-            "taken": self.taken,
+            "taken": self.taken, "last": self.last,
         }  # fmt: skip
 
 
@@ -82,6 +83,9 @@ class Sessions:
         self._guard = station.runtime.guard
         self._active: dict[str, _Progress] = {}
         self._ended: dict[str, _Progress] = {}
+
+    def recall(self) -> None:
+        """Read the sessions of earlier daemons from the store's events."""
         for event in self._guard.store.events():
             if event.kind not in ("session_begun", "session_ended"):
                 continue
@@ -190,7 +194,15 @@ class Sessions:
     def _finish_check(self, line: CameraLine, active: _Progress) -> None:
         why = line.link.why
         if line.checked is not None:
-            active.found, why = line.checked
+            (found, why), thermometers = line.checked, self.station.thermometers
+            active.found = list(found)
+            for name in line.plan.config.thermometers:
+                link, values = thermometers.links[name], thermometers.last(name)[0]
+                if not (link.why or values):
+                    return  # it is being read
+                read = ", ".join(f"{channel} {c:.2f} °C" for channel, c in values.items())
+                active.found.append(f"{name}: {link.why or read}")
+                why = why or (link.why and f"{link.called}: {link.why}")
         elif not line.link.ended:
             return
         try:
@@ -225,7 +237,7 @@ class Sessions:
         session, line = active.session, self.station.line(active.session.camera)
         self._active.pop(session.camera, None)
         if active.state == "running" and line is not None and line.run is not None:
-            active.taken = line.run.taken
+            active.taken, active.last = line.run.taken, line.run.last
         active.state, active.why = state, why
         self._ended[session.camera] = active
         try:

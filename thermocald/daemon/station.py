@@ -66,7 +66,7 @@ class CameraLine:
         self.loop = DeviceLoop(
             self.link, self._capture, self.begin, runtime.free_running, lambda: not self.taking
         )
-        self.take(plan.config.series, runtime.start_condition)
+        self.take(plan.config.series)
 
     def identity(self) -> dict[str, Any]:
         """Return the identities that the camera and its thermometers report."""

@@ -3,9 +3,9 @@
 feed.py DEVICE FRAMES.npy TEMPERATURES.npy LOG --fps F [--hold N] [--format GREY|YUYV|MJPG]
         [--bus B] [--go FILE]
 
-Frame n is written at n/F s, with the image and temperature number n // hold (counted from the
-appearance of FILE), and the bars of n in its top rows. Each line of LOG is: n, CLOCK_MONOTONIC
-before and after the write, temperature.
+Frame n is written at n/F s, or 1/F s after the frame before if that one was late, with the image
+and temperature number n // hold (counted from the appearance of FILE), and the bars of n in its top
+rows. Each line of LOG is: n, CLOCK_MONOTONIC before and after the write, temperature.
 """
 
 from __future__ import annotations
@@ -74,14 +74,17 @@ def main():
         opened(given.device, width, height, given.format) as out,
         open(given.log, "w", buffering=1) as log,
     ):
-        begin, last, first = time.monotonic(), None, 0
+        due, last, first = time.monotonic(), None, 0
         for n in itertools.count():
             if given.go and not os.path.exists(given.go):
                 first = n
             k = min((n - first) // given.hold, len(frames) - 1)
             celsius = round(float(temperatures[k]) * 16) / 16
             data = encode(stamp(np.asarray(frames[k]), n), given.format)
-            time.sleep(max(0.0, begin + n / given.fps - time.monotonic()))
+            # no frames are made up for: the loopback has two buffers, and a burst would put the
+            # next frame into the one that a reader has just got, with the time of the former
+            time.sleep(max(0.0, due - time.monotonic()))
+            due = max(due, time.monotonic()) + 1.0 / given.fps
             if bus is not None and celsius != last:
                 raw = round(celsius * 16) << 4
                 bus.write_word_data(SENSOR, 0, (raw & 0xFF) << 8 | raw >> 8)

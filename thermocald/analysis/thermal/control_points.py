@@ -170,7 +170,7 @@ class ControlPoints:
 
     def find_doubts(self, camera: Camera, pose: Adjustment) -> list[str]:
         """Return what is doubtful in a pose although the control points fit, a sentence each."""
-        return [s for s in (self._find_twin(camera, pose), self._doubt_lens(camera, pose)) if s]
+        return [s for s in (self._find_twin(camera, pose), self._doubt_lens(camera)) if s]
 
     def _find_twin(self, camera: Camera, pose: Adjustment) -> str:
         """Return the exchange of names with which another pose fits, as a sentence; "" without one.
@@ -208,7 +208,7 @@ class ControlPoints:
                 )
         return ""
 
-    def _doubt_lens(self, camera: Camera, pose: Adjustment) -> str:
+    def _doubt_lens(self, camera: Camera) -> str:
         """Return by how much another principal distance fits better, as a sentence; "" if none.
 
         Few points let a wrong one pass: the pose follows, and what does not fit is left out.
@@ -217,11 +217,9 @@ class ControlPoints:
         c, sd = trial.values[0], float(np.hypot(trial.sd[0], camera.sd["c"]))
         if not trial.ok or abs(c - camera.values[0]) < _OTHER_LENS * sd:
             return ""
-        away = float(np.linalg.norm(trial.values[EOP][3:] - pose.values[EOP][3:])) / 1000
         return (
             f"the control points fit better with a principal distance of {c:.4f} ± {sd:.4f} mm "
-            f"than with the model's {camera.values[0]:.4f} mm, and the camera {away:.2f} m "
-            "elsewhere: is the model of this camera and lens?"
+            f"than with the model's {camera.values[0]:.4f} mm: is it of this camera and lens?"
         )
 
     def centre(self, pose: Adjustment) -> Array:

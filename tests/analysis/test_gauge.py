@@ -21,6 +21,7 @@ from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.epoch.measuring import Plane, place_on
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.store.recording.reader import read_recording
@@ -226,6 +227,22 @@ def test_the_last_pose_is_kept_with_growing_covariance_while_points_are_hidden()
     assert "control points are seen" in events[0][1]
 
 
+def test_places_from_the_last_pose_have_true_sds():
+    """Camera and pose were uncorrelated in such a row: the sds were 1.7 times too large."""
+    ratio, level = [], Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    on_water = np.array([[300.0, 9e3, 0.0], [-2e3, 2e4, 0.0], [2_500.0, 14e3, 0.0]])
+    for seed in range(60):
+        world = World(800 + seed)
+        gauge = GaugeCalibrator(thermal_camera(), world.field, snooping_alpha=0.0)
+        gauge.calibrate(world.epoch(1, 20.0))
+        result = gauge.calibrate(world.epoch(2, 30.0, [], 600.0)).adjustment
+        assert result.status == "last_pose"
+        seen = project(on_water, POSE, **world.interior(30.0)) + world.rng.normal(0, 0.1, (3, 2))
+        places, C = place_on(gauge.sensor, result.values, result.covariance, seen, 0.1, level)
+        ratio.append((places - on_water)[:, :2] / np.sqrt(C.diagonal()).reshape(3, 3)[:, :2])
+    assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.15)
+
+
 def test_a_moved_camera_is_reported_with_time_turn_and_shift():
     turn = np.array([0.0, np.deg2rad(0.05), 0.0, 0.0, 0.0, 0.0])
     found = 0
@@ -282,9 +299,9 @@ def test_four_points_nearly_on_a_line_have_a_true_pose_or_none():
     assert np.max(ratio) < 3.0
 
 
-@pytest.mark.parametrize(("seen", "most"), [(1, 18), (2, 18), (3, 1)])
-def test_a_knock_in_fog_leaves_no_false_pose(seen, most):
-    """The last pose was given whatever one or two points showed; three gave 13 sds unknocked."""
+@pytest.mark.parametrize("seen", [1, 2, 3])
+def test_a_knock_in_fog_leaves_no_false_pose(seen):
+    """One or two points left 13 and 15 of 60 false poses, as their survey's errors hid a knock."""
     for knocked in (False, True):
         ratio = []
         for seed in range(40):
@@ -299,7 +316,7 @@ def test_a_knock_in_fog_leaves_no_false_pose(seen, most):
             assert result.exterior is not None or "was the camera moved?" in result.reason
             if result.exterior is not None:
                 ratio.append(pose_error(result, world))
-        assert np.sum(np.array(ratio) > 3.0) <= most * knocked
+        assert np.max(ratio, initial=0.0) < 3.0
         assert len(ratio) == 40 or knocked
 
 

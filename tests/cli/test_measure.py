@@ -349,9 +349,33 @@ def moved(world: World, point: int, mm: tuple[float, float, float], survey: bool
     return world
 
 
+def claimed(world: World, share: float) -> World:
+    """Return a gauge whose survey states a share of its standard deviations."""
+    world.field = replace(world.field, sigmas=share * world.field.sigmas)
+    return world
+
+
+def test_a_lens_that_is_not_the_model_s_is_doubted():
+    """A specimen with a c smaller by 1.5 %: places were 2 to 5 sds off without a word."""
+    doubted = {0.0: 0, 0.045: 0}
+    for off in doubted:
+        wrong = 0
+        for seed in range(30):
+            world = few(seed, 8)
+            world.off["c"] -= off
+            image = project(PLACES, POSE, **world.interior(20.0))
+            with contextlib.suppress(DataError):
+                doubts = places(world, world.seen(20.0), image).doubts
+                wrong += 1
+                doubted[off] += any("of this camera and lens?" in doubt for doubt in doubts)
+        assert wrong > 5
+        assert doubted[off] >= wrong / 2 if off else not doubted[off]
+
+
 @pytest.mark.parametrize(
     ("world", "order", "scale", "words"),
     [
+        (claimed(World(5), 1 / 6), None, 1.0, "errors are .* times the standard deviations given"),
         (World(0, n=6), [1, 0, 2, 3, 4, 5], 1.0, "with g0 and g1 exchanged they fit"),
         (moved(World(0, n=5), 2, (0, 0, 1500)), None, 1.0, "without g2 they fit"),
         # one outside the image: in ten of 24 such gauges, a good point or the lens was accused

@@ -129,12 +129,11 @@ class RenewedConfiguration:
         write_text(path, json.dumps(self.document, indent=4) + "\n")
         sd = self.pose.sd[EOP]
         rejected = ", ".join(self.control.field.names[row] for row in self.pose.rejected)
-        twin = self.control.find_twin(self.camera, self.pose)
         return (
             f"pose from {self.pose.n_observations} control points, sigma0 {self.pose.sigma0:.2f}, "
             f"± {np.degrees(np.linalg.norm(sd[:3])):.4f}°, ± {np.linalg.norm(sd[3:]):.0f} mm"
             + (f"; left out: {rejected}" if rejected else "")
-            + (f"; doubtful: {twin}" if twin else "")
+            + "".join(f"; doubtful: {d}" for d in self.control.find_doubts(self.camera, self.pose))
         )
 
 

@@ -35,8 +35,10 @@ _LEAST_EXTENT_MM = 50.0  # of a gauge's points; it is smaller for metres read as
 _LEAST_OF_A_GRID_MM = 1000.0  # of points more than a hundred times as far from the origin
 _LARGEST_EXTENT_MM = 2e6  # it is larger for mm read as metres
 _FITS = 3.0  # largest sigma0 of a pose that fits after mirroring
+_POOR = 15.0  # largest sigma0 that standard deviations of a poor survey explain
 _BETTER = 0.5  # largest fraction of sigma0 that a change has to leave
 _OTHER_LENSES = (1.0, 1.3, 0.77, 1.7, 0.6)  # principal distances to try, over the model's
+_OTHER_LENS = 3.3  # standard deviations of the principal distance that show another lens
 _OTHER_SIZES = (2.0, 4.0, 0.5)  # of the camera's images over those of the image points
 _EXCHANGED = 20  # points of which each two are exchanged, in search of a mistake
 _ON_EACH_OTHER = 0.05  # of the extent: points that an exchange of names may confuse
@@ -166,7 +168,11 @@ class ControlPoints:
         remedy = "" if fits else self._remedy(camera)
         raise DataError(why + ("; correct the click or leave it out" if pose.ok else remedy))
 
-    def find_twin(self, camera: Camera, pose: Adjustment) -> str:
+    def find_doubts(self, camera: Camera, pose: Adjustment) -> list[str]:
+        """Return what is doubtful in a pose although the control points fit, a sentence each."""
+        return [s for s in (self._find_twin(camera, pose), self._doubt_lens(camera)) if s]
+
+    def _find_twin(self, camera: Camera, pose: Adjustment) -> str:
         """Return the exchange of names with which another pose fits, as a sentence; "" without one.
 
         Points that a turn about their middle puts on each other give a pose with all names
@@ -202,6 +208,20 @@ class ControlPoints:
                 )
         return ""
 
+    def _doubt_lens(self, camera: Camera) -> str:
+        """Return by how much another principal distance fits better, as a sentence; "" if none.
+
+        Few points let a wrong one pass: the pose follows, and what does not fit is left out.
+        """
+        trial = _with_free_distance(camera).resect(self.field, self.seen)
+        c, sd = trial.values[0], float(np.hypot(trial.sd[0], camera.sd["c"]))
+        if not trial.ok or abs(c - camera.values[0]) < _OTHER_LENS * sd:
+            return ""
+        return (
+            f"the control points fit better with a principal distance of {c:.4f} ± {sd:.4f} mm "
+            f"than with the model's {camera.values[0]:.4f} mm: is it of this camera and lens?"
+        )
+
     def centre(self, pose: Adjustment) -> Array:
         """Return the projection centre (3,) in the unit and the coordinates of the file."""
         centre: Array = (pose.values[EOP][3:] + self.origin) / UNITS[self.unit]
@@ -235,12 +255,8 @@ class ControlPoints:
             text = f"without {names[i]} they fit: has it moved, or is its unit another?"
             changes.append((text, camera, field, seen.select(np.arange(n) != i)))
         text = "with another principal distance they fit: is the model of this camera and lens?"
-        for factor in _OTHER_LENSES:
-            values, covariance = camera.values.copy(), camera.covariance.copy()
-            values[0] *= factor
-            covariance[0, 0] = (0.2 * values[0]) ** 2
-            other = replace(camera, values=values, covariance=covariance)
-            changes.append((text, other, field, seen))
+        others = [_with_free_distance(camera, factor) for factor in _OTHER_LENSES]
+        changes += [(text, other, field, seen) for other in others]
         now = camera.resect(field, seen, 0.0)
         least = min(_FITS, _BETTER * now.sigma0) if now.ok else _FITS
         for text, trial, points, image in changes:
@@ -248,7 +264,20 @@ class ControlPoints:
             spare = 0 if trial is camera else n // 4  # a wrong start misses some points
             if pose.ok and len(pose.rejected) <= spare and pose.sigma0 < least:
                 return f"; {text}"
+        if now.ok and not now.rejected and now.sigma0 < _POOR:
+            return (
+                f"; if nothing is wrong, errors are {now.sigma0:.1f} times the standard deviations "
+                "given: state larger sX, sY, sZ, or sx, sy"
+            )
         return ""
+
+
+def _with_free_distance(camera: Camera, factor: float = 1.0) -> Camera:
+    """Return a camera with a multiple of the principal distance, known to a fifth."""
+    values, covariance = camera.values.copy(), camera.covariance.copy()
+    values[0] *= factor
+    covariance[0, 0] = (0.2 * values[0]) ** 2
+    return replace(camera, values=values, covariance=covariance)
 
 
 def _from_table(path: Path, unit: str) -> ControlPoints:

@@ -39,6 +39,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     IOP,
     CameraSpec,
     ExteriorOrientation,
+    InteriorOrientation,
     partials,
     project,
 )
@@ -205,12 +206,13 @@ class Predictor:
 class Pose:
     """A resected pose, with which later frames are compared.
 
-    time s; predicted: the camera then; eop (6,) with covariance (6, 6); seen: control points used.
+    time s; predicted: the camera then; values (16,) and covariance (16, 16) of camera and pose;
+    seen: control points used.
     """
 
     time: float
     predicted: PredictedCamera
-    eop: ExteriorOrientation
+    values: Array
     covariance: Array
     seen: Observations
 
@@ -220,10 +222,8 @@ def _pose_of(
 ) -> Pose:
     """Return the pose of an epoch's result; its rejected points are left out."""
     assert result.covariance is not None
-    return Pose(
-        epoch.frame_time, predicted, ExteriorOrientation.from_array(result.values[EOP]),
-        result.covariance[EOP, EOP], seen.select(~np.isin(seen.targets, result.rejected)),
-    )  # fmt: skip
+    used = seen.select(~np.isin(seen.targets, result.rejected))
+    return Pose(epoch.frame_time, predicted, result.values, result.covariance, used)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,8 +313,8 @@ class GaugeCalibrator(EpochCalibrator):
         rejected = ", ".join(self.testfield.names[row] for row in pose.rejected)
         text += f", sigma0 of their pose {pose.sigma0:.2f}"
         text += f"; left out: {rejected}" if rejected else ""
-        twin = known.find_twin(self.predictor.settled(), pose)
-        return f"{text}; doubtful: {twin}" if twin else text
+        doubts = known.find_doubts(self.predictor.settled(), pose)
+        return text + "".join(f"; doubtful: {doubt}" for doubt in doubts)
 
     def reset(self) -> None:
         """Forget the last frame and where its control points were: they are searched for anew."""
@@ -402,9 +402,10 @@ class GaugeCalibrator(EpochCalibrator):
         if not len(self.testfield):
             return self._unposed("predicted", "", now)
         if seen is None or len(seen) < _FEWEST:
-            count = 0 if seen is None else len(seen)
-            return self._without_pose(epoch, now, seen, f"{count} control points are seen ({why})")
-        start = None if self.pose is None else self.pose.eop
+            if seen is not None and len(seen):
+                why = f"only {len(seen)} control point{'s are' if len(seen) > 1 else ' is'} seen"
+            return self._without_pose(epoch, now, seen, why)
+        start = None if self.pose is None else ExteriorOrientation.from_array(self.pose.values[EOP])
         result = now.camera.resect(self.testfield, seen, self._alpha, start)
         if not result.ok and start is not None and len(seen) > _FEWEST:
             # the last pose is a bad start if the camera was turned by a large angle
@@ -428,7 +429,10 @@ class GaugeCalibrator(EpochCalibrator):
     def _without_pose(
         self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str
     ) -> Adjustment:
-        """Return the last pose, widened by what the mount may have moved; without one, no pose."""
+        """Return the last pose, widened by what the mount may have moved; without one, no pose.
+
+        The camera is the one of that pose, changed as predicted since: both errors are correlated.
+        """
         last = self.pose
         if last is None:
             return self._unposed("predicted", f"no pose so far: {why}", now)
@@ -436,28 +440,67 @@ class GaugeCalibrator(EpochCalibrator):
         still = f"; the mount may have moved for {hours:.2f} h"
         if self._mount is None:
             still = "; the mount is taken not to have moved since, as its movement is not known"
-        result = self._unposed("last_pose", why + still, now, seen)
-        result.covariance[EOP, EOP] = last.covariance
-        turned = math.radians(self._mount or 0.0) ** 2 * hours
-        result.covariance[range(10, 13), range(10, 13)] += turned
-        if seen is not None and len(seen) and self._most_are_elsewhere(result, last.eop, seen):
+        since = np.zeros((16, 16))  # the covariance of what may have changed
+        since[IOP, IOP] = self._change(last.predicted, now)
+        since[range(10, 13), range(10, 13)] = math.radians(self._mount or 0.0) ** 2 * hours
+        if seen is not None and len(seen) and self._most_are_elsewhere(last, now, seen, since):
             why = f"{why}; most are not where the last pose puts them: was the camera moved?"
             return self._unposed("predicted", why, now, seen)
-        return replace(result, exterior=last.eop)
+        result = self._unposed("last_pose", why + still, now, seen)
+        iop = last.values[IOP] + now.camera.values - last.predicted.camera.values
+        return replace(
+            result,
+            interior=InteriorOrientation.from_array(iop),
+            covariance=last.covariance + since,
+            exterior=ExteriorOrientation.from_array(last.values[EOP]),
+        )
 
     def _most_are_elsewhere(
-        self, last: Adjustment, eop: ExteriorOrientation, seen: Observations
+        self, last: Pose, now: PredictedCamera, seen: Observations, since: Array
     ) -> bool:
-        """Test whether more than half of the control points contradict the last pose."""
-        assert last.interior is not None
-        iop, points = last.interior.as_array(), self.testfield.points[seen.targets]
-        at, A, B = partials(self.sensor, iop, eop.as_array(), points)
-        C = A @ last.covariance @ A.swapaxes(1, 2)
-        C += (B * self.testfield.sigmas[seen.targets, None] ** 2) @ B.swapaxes(1, 2)
-        C[:, range(2), range(2)] += seen.sigmas**2
-        left = (seen.points - at)[..., None]
-        chi2 = (left.swapaxes(1, 2) @ np.linalg.solve(C, left)).ravel()
+        """Test whether more than half of the control points contradict the last pose.
+
+        Those that it used are compared with their image then, others with their coordinates; since
+        (16, 16): the covariance of what may have changed.
+        """
+        moved, A, noise = self._moved_since(last, now, seen)
+        C = [A @ since @ A.swapaxes(1, 2) + noise[:, :, None] * np.eye(2)]
+        new = seen.select(~np.isin(seen.targets, last.seen.targets))
+        points, sigmas = (v[new.targets] for v in (self.testfield.points, self.testfield.sigmas))
+        at, A, B = partials(self.sensor, now.camera.values, last.values[EOP], points)
+        C.append(A @ (last.covariance + since) @ A.swapaxes(1, 2))
+        C[1] += B * sigmas[:, None] ** 2 @ B.swapaxes(1, 2)
+        C[1][:, range(2), range(2)] += new.sigmas**2
+        left = np.concatenate([moved, new.points - at])
+        chi2 = np.einsum("ni,nij,nj->n", left, np.linalg.inv(np.concatenate(C)), left)
         return bool(np.mean(chi2 > _ELSEWHERE_CHI2) > 0.5)
+
+    def _moved_since(
+        self, then: Pose, now: PredictedCamera, seen: Observations
+    ) -> tuple[Array, Array, Array]:
+        """Return how the control points of a pose have moved in the image beyond the prediction.
+
+        The same points are used, so the errors of their coordinates cancel. Returns the movement
+        (n, 2) px, its derivatives (n, 2, 16), and the variances (n, 2) of the image points.
+        """
+        both, *rows = np.intersect1d(then.seen.targets, seen.targets, return_indices=True)
+        a, b = then.seen.select(rows[0]), seen.select(rows[1])
+        points, before = self.testfield.points[both], then.predicted.camera.values
+        at, A, _ = partials(self.sensor, before, then.values[EOP], points)
+        warmer = project(self.sensor, now.camera.values, then.values[EOP], points) - at
+        noise = _matching(a) ** 2 + _matching(b) ** 2 + _UNMODELLED_PX**2
+        return b.points - a.points - warmer, A, noise
+
+    def _change(self, then: PredictedCamera, now: PredictedCamera) -> Array:
+        """Return the covariance (10, 10) of the camera's predicted change.
+
+        Errors that the model has at both times cancel; those of the rates, of the readings, and of
+        an unknown past remain.
+        """
+        _, covariance = self.thermal.steady_change(then.camera.temperature, now.camera.temperature)
+        unsure_k = math.hypot(then.temperature_sd, now.temperature_sd)
+        rates, unknown = self.thermal.model.rate_vector, now.unknown - then.unknown
+        return covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
 
     def _watch(self, pose: Pose) -> None:
         """Compare a pose with the reference; two different poses in a row are a movement."""
@@ -476,33 +519,17 @@ class GaugeCalibrator(EpochCalibrator):
             self._reference, self._still, self._moved = pose, pose, None
 
     def compare(self, then: Pose, now: Pose) -> Movement | None:
-        """Return the camera's movement between two poses; None if they share too few points.
-
-        The same points are used, so the errors of their coordinates cancel, as do errors that the
-        model has at both times. Image noise, the rates' errors and an unknown past remain.
-        """
-        both, *rows = np.intersect1d(then.seen.targets, now.seen.targets, return_indices=True)
-        if len(both) < _FEWEST:
+        """Return the camera's movement between two poses; None if they share too few points."""
+        moved, A, noise = self._moved_since(then, now.predicted, now.seen)
+        if len(moved) < _FEWEST:
             return None
-        a, b = then.seen.select(rows[0]), now.seen.select(rows[1])
-        points, eop = self.testfield.points[both], then.eop.as_array()
-        before, after = then.predicted, now.predicted
-        seen = [project(self.sensor, p.camera.values, eop, points) for p in (before, after)]
-        moved = (b.points - a.points - (seen[1] - seen[0])).ravel()
-        _, A, _ = partials(self.sensor, before.camera.values, eop, points)
+        weighted = (A[..., EOP] / noise[..., None]).reshape(-1, 6)
         A = A.reshape(-1, 16)
-        noise = (_matching(a) ** 2 + _matching(b) ** 2 + _UNMODELLED_PX**2).ravel()
-        N = A[:, EOP].T @ (A[:, EOP] / noise[:, None])
-        inverse = inverse_of_determined(N)
-        gain = inverse @ (A[:, EOP] / noise[:, None]).T
+        inverse = inverse_of_determined(A[:, EOP].T @ weighted)
+        gain = inverse @ weighted.T
         lever = gain @ A[:, IOP]
-        # the covariance of the camera's predicted change
-        T = before.camera.temperature, after.camera.temperature
-        _, covariance = self.thermal.steady_change(*T)
-        unsure_k = math.hypot(before.temperature_sd, after.temperature_sd)
-        rates, unknown = self.thermal.model.rate_vector, after.unknown - before.unknown
-        covariance = covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
-        return Movement(now.time, gain @ moved, inverse + lever @ covariance @ lever.T)
+        change = self._change(then.predicted, now.predicted)
+        return Movement(now.time, gain @ moved.ravel(), inverse + lever @ change @ lever.T)
 
     def observe(self, calibrated: CalibratedEpoch, *_: object) -> dict[str, float]:
         """Report changes of the rows' status, and movements.

@@ -358,15 +358,15 @@ def _warn_of_points_beside(
 def _doubt_pose(
     control: ControlPoints, camera: Camera, pose: Adjustment, surface: Plane | Line | Profile
 ) -> tuple[str, ...]:
-    """Return what is doubtful in a pose although the control points fit, a sentence each."""
-    doubts = [control.find_twin(camera, pose)]
+    """Return the doubts of the control points, and one of a camera that hangs upside down."""
+    doubts = control.find_doubts(camera, pose)
     vertical = not isinstance(surface, Plane) or surface.normal.tolist() == [0.0, 0.0, 1.0]
     if vertical and rotation(pose.values[EOP][:3])[2, 1] < _UPSIDE_DOWN:
         doubts.append(
             "the camera hangs upside down in this pose: does it, or were x, y of the control "
             "points read in an image turned by 180°?"
         )
-    return tuple(filter(None, doubts))
+    return tuple(doubts)
 
 
 def _reliability(

@@ -260,7 +260,7 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
     if found.unfinished:
         lines.append(
             "  the last write was cut off before its commit and is ignored: the disk was full or "
-            "its writer was killed, or the -wal file was cut off in copying, and more may be missing"
+            "its writer killed, or the -wal file was cut off in copying, and more may be missing"
         )
     return {
         "series": series,

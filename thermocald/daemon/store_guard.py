@@ -90,7 +90,7 @@ class FollowedStore:
             text = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
             self._note("wal_damaged", text)
         elif unfinished:
-            text = "the last write was cut off before its commit: the disk was full or its writer killed"
+            text = "the last write was cut off before its commit: a full disk, or a killed writer"
             log.info("%s: %s", self.path, text, extra={"event": "wal_unfinished"})
             self._events.append(Event(time.time(), "wal_unfinished", text))
 

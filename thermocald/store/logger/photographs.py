@@ -324,8 +324,7 @@ def read_series(
     thermometers = dict.fromkeys(columns.temperatures, Channel())
     series = file_name(series, "series", UsageError)
     head = Head(f"{spec.name}-{series}", series, max(interval, 0.001), spec, thermometers)
-    none = np.empty((0, 3))
-    field = TestField.build((), none, none, (), (), ()) if testfield is None else testfield
+    field = testfield or TestField.build((), np.empty((0, 3)), np.empty((0, 3)), (), (), ())
     recording = Recording(Path(), head, field, columns, has_observations=False)
     return recording, [*notes, *about_camera]
 

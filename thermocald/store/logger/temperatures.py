@@ -104,8 +104,6 @@ def read_log(
     times = table.times
     if (different := len(np.unique(times))) < 2:
         raise DataError(f"{path}: holds {counted(different, 'time')}; at least two are needed")
-    if fault := time_fault(times):
-        raise DataError(f"{table.where(fault[0])}, column {time_names[0]!r}: {fault[1]}")
     steps = np.diff(times)
     if not table.labels and steps.max() > 0 and (back := np.flatnonzero(steps < 0) + 1).size:
         row = int(back[0])
@@ -288,12 +286,14 @@ class _Table:
         return f"{self.file.path}, line {self._lines[row]}"
 
     def _utc(self, clock: DeviceClock) -> Array:
-        """Return the time of each row, s since 1970 UTC."""
+        """Return the time of each row, s since 1970 UTC. Raises DataError for impossible ones."""
         of, seconds = np.array(self._of, dtype=np.int64), np.array(self._seconds)
         rows = np.flatnonzero(of >= 0)
         seconds[rows] = clock.utc(
             self._moments, lambda k: self.where(rows[k]), of[rows], seconds[rows]
         )
+        if fault := time_fault(seconds):
+            raise DataError(f"{self.where(fault[0])}, column {self._time_names[0]!r}: {fault[1]}")
         return seconds
 
     def left_out(self) -> list[str]:

@@ -31,6 +31,7 @@ from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
 from thermocald.errors import DriverMissing
+from thermocald.figures import Curve, Panel, draw_panel
 from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
@@ -376,7 +377,7 @@ def test_photographs_without_targets_are_one_line(open_page):
     steps = page.locator(".answer li").all_text_contents()
     assert [s.split(":")[0] for s in steps if ".jpg" in s] == ["5.jpg, 6.jpg, 7.jpg and 87 more"]
     assert re.search(
-        r"σ₀ \d\.\d+, redundancy \d+; it can be the noise", page.text_content(".answer")
+        r"σ₀ \d\.\d+, redundancy \d+; above 1 if the image", page.text_content(".answer")
     )
 
 
@@ -486,6 +487,15 @@ def test_the_page_is_whole_and_holds_the_numbers_of_the_study(page_text, warm_st
     for figure in figures:
         texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
         assert texts.count("x₀") == texts.count("B2") == 2
+
+
+@pytest.mark.parametrize("names", [[f"M{k}" for k in range(1, 8)], list("abcdefghij"), [LONG, "M"]])
+def test_a_legend_stays_in_its_drawing(names):
+    """The seventh series of a study was cut off."""
+    x = np.arange(3.0)
+    drawing = draw_panel(Panel("c", "x in px", "y in px", tuple(Curve(n, x, x) for n in names)))
+    drawing.draw_without_rendering()
+    assert drawing.axes[0].get_legend().get_window_extent().x1 <= drawing.bbox.x1
 
 
 def test_a_study_of_nearly_nothing_says_why(empty_study):

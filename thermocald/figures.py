@@ -359,10 +359,16 @@ def legend_above(axis: Any) -> int:
 def _draw_curve(axis: Any, curve: Curve) -> None:
     label = curve.name or None
     if curve.kind == "points" or len(curve.x) == 1:
-        # zero-length strokes with round caps take a tenth of the bytes of markers
-        x = np.column_stack([curve.x, curve.x, np.full(len(curve.x), np.nan)]).ravel()
+        # very short strokes with round caps take a tenth of the bytes of markers; in a PNG those
+        # that are, or snap to, length zero are dropped
+        known = curve.x[np.isfinite(curve.x)]
+        short = 1e-7 * float(np.ptp(known)) if len(known) > 1 else 0.0
+        ends = curve.x + (short or 1e-9)
+        x = np.column_stack([curve.x, ends, np.full(len(curve.x), np.nan)]).ravel()
         y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()
-        axis.plot(x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label)
+        axis.plot(
+            x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label, snap=False
+        )
         return
     style = "--" if curve.dashed else "-"
     axis.plot(curve.x, curve.y, style, color=curve.colour, linewidth=1.1, label=label)

@@ -39,7 +39,8 @@ PALE, GREY = "#9fb4c1", "#555555"
 BAND = 1.96  # standard deviations: 95 % on every page
 _MOST_POINTS = 800
 _PANEL_INCHES = (3.4, 2.5)
-_LEGEND_LETTERS = 43  # per line above a panel
+_LEGEND_LETTERS = 46  # per line above a panel
+_KEY_LETTERS = 5.4  # width of a legend's line and spaces
 _MATRIX_LETTERS = 13  # per name of a row
 _TITLE_LETTERS = 11  # per inch
 _FEW_ARROWS = 25
@@ -347,7 +348,7 @@ def legend_above(axis: Any) -> int:
     """Put the legend above the axes, clear of the data; return its number of rows."""
     handles, names = axis.get_legend_handles_labels()
     first = {shortened(name, 18): handle for name, handle in zip(names, handles, strict=True)}
-    columns = max(1, min(len(first), _LEGEND_LETTERS // (max(map(len, first)) + 4)))
+    columns = max(1, min(len(first), int(_LEGEND_LETTERS / (max(map(len, first)) + _KEY_LETTERS))))
     axis.legend(
         first.values(), first.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
         handlelength=1.2, columnspacing=1.0, labelspacing=0.2, borderaxespad=0.1, borderpad=0.2,
@@ -358,10 +359,16 @@ def legend_above(axis: Any) -> int:
 def _draw_curve(axis: Any, curve: Curve) -> None:
     label = curve.name or None
     if curve.kind == "points" or len(curve.x) == 1:
-        # zero-length strokes with round caps take a tenth of the bytes of markers
-        x = np.column_stack([curve.x, curve.x, np.full(len(curve.x), np.nan)]).ravel()
+        # very short strokes with round caps take a tenth of the bytes of markers; in a PNG those
+        # that are, or snap to, length zero are dropped
+        known = curve.x[np.isfinite(curve.x)]
+        short = 1e-7 * float(np.ptp(known)) if len(known) > 1 else 0.0
+        ends = curve.x + (short or 1e-9)
+        x = np.column_stack([curve.x, ends, np.full(len(curve.x), np.nan)]).ravel()
         y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()
-        axis.plot(x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label)
+        axis.plot(
+            x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label, snap=False
+        )
         return
     style = "--" if curve.dashed else "-"
     axis.plot(curve.x, curve.y, style, color=curve.colour, linewidth=1.1, label=label)

@@ -120,6 +120,7 @@ def assert_like_replay(columns, table, values=0.05, sds=0.02):
         assert columns[f"level_sd_{name}"] == pytest.approx(table.level_sd[k], rel=sds)
 
 
+@pytest.mark.slow
 def test_growing_noise_costs_few_epochs_with_few_targets():
     """Neighbouring epochs show whether one of 15 targets is wrong or all are noisier.
 

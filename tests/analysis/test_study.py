@@ -73,7 +73,7 @@ def test_a_single_epoch_has_notes_and_no_results(warm_up):
     [
         (np.full(150, 25.0), "stayed at 25.00 °C"),
         (25 + 0.05 * np.random.default_rng(1).standard_normal(150), "which its noise of 0.050 K"),
-        (np.full(150, np.nan), "has too few readings (0)"),
+        (np.full(150, np.nan), "is known in 0 of 150 epochs"),
     ],
     ids=["constant", "noise only", "never read"],
 )
@@ -107,6 +107,8 @@ def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
         replace(series, thermometers=(Thermometer("temperature", values, 0.05),)), SETTINGS
     )
     assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
+    text = " ".join(answer_sentences(study_camera("c", [found.series], SETTINGS)))
+    assert "while temperature (known in 140 of 150 epochs) changed by" in text
     # a constant parameter has no dependence
     assert "A1" not in found.channels[0].dependences
     assert found.deviations["A1"].change == 0
@@ -130,7 +132,7 @@ def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
 
 def test_first_order_agrees_where_errors_are_small(warm_up):
     camera = study([warm_up()()], StudySettings(sets=50_000)).cameras[0]
-    first, drawn = camera.first_order, camera.montecarlo
+    first, drawn = camera.montecarlo.first_order, camera.montecarlo
     np.testing.assert_allclose(first.mean, drawn.mean, rtol=0.02)
     np.testing.assert_allclose(first.fractions, drawn.fractions, atol=0.01)
     # maxima of 50,000 draws scatter by several per cent

@@ -58,7 +58,8 @@ def test_a_dry_run_prints_a_programme_that_a_session_takes(config, tmp_path):
     [
         (["--until-separated", "creep"], "give two different effects"),
         (["--dry-run"], "--dry-run needs --until-separated"),
-        (["--until-separated", "creep,slip", "--max-temperature", "23"], "of warming above"),
+        (["--until-separated", "creep,slip", "--max-temperature", "23"],
+         "0.5 K of warming above 22.0 °C; 5 K"),
         (["--until-separated", "creep,slip", "--epochs", "50"],
          "50 epochs of 0.4 s are 0 min; heat needs 15 min"),
     ],

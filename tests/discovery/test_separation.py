@@ -13,7 +13,7 @@ from thermocald.discovery.experiment import (
     rank_experiments,
     read_alternatives,
 )
-from thermocald.errors import ConfigurationError, DataError, UsageError
+from thermocald.errors import ConfigurationError, UsageError
 
 PAIRS = [("permanent_set", "self_heating"), ("thermal_lag", "hysteresis"), ("creep", "slip")]
 LIMITS = [Limits(40.0, 1.5, 0.8), Limits(60.0, 4.0, 0.3), Limits(40.0, 1.5, 0.8)]
@@ -38,11 +38,6 @@ def test_what_separates_is_preferred():
     assert order.index("two equal cycles") < order.index("one long hold")
     assert sigmas == sorted(sigmas, reverse=True)
     assert sigmas[0] > 3 * sigmas[-1]
-
-
-def test_limits_that_allow_no_heating_are_refused():
-    with pytest.raises(DataError, match=r"allow 2\.5 K of warming above 22\.0 °C; 5 K"):
-        rank_experiments(*PAIRS[0], Limits(25.0), Body(), 150, 10.0)
 
 
 def test_a_recording_tells_how_the_camera_warms():
@@ -71,7 +66,6 @@ def test_nothing_is_separated_where_neither_is(evidence_of):
 @pytest.mark.parametrize(
     ("text", "error", "said"),
     [
-        ("creep", UsageError, "give two different effects"),
         ("creep,creep", UsageError, "give two different effects"),
         ("creep,kreep", ConfigurationError, "did you mean 'creep'"),
         ("creep,defocus", UsageError, "defocus shows in the image"),

@@ -14,6 +14,7 @@ from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -31,6 +32,7 @@ from thermocald.analysis.study.measured import StudySettings
 from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
 from thermocald.errors import DriverMissing
+from thermocald.figures import Curve, Panel, draw_panel, save
 from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
@@ -376,7 +378,7 @@ def test_photographs_without_targets_are_one_line(open_page):
     steps = page.locator(".answer li").all_text_contents()
     assert [s.split(":")[0] for s in steps if ".jpg" in s] == ["5.jpg, 6.jpg, 7.jpg and 87 more"]
     assert re.search(
-        r"σ₀ \d\.\d+, redundancy \d+; it can be the noise", page.text_content(".answer")
+        r"σ₀ \d\.\d+, redundancy \d+; above 1 if the image", page.text_content(".answer")
     )
 
 
@@ -486,6 +488,26 @@ def test_the_page_is_whole_and_holds_the_numbers_of_the_study(page_text, warm_st
     for figure in figures:
         texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
         assert texts.count("x₀") == texts.count("B2") == 2
+
+
+@pytest.mark.parametrize("names", [[f"M{k}" for k in range(1, 8)], list("abcdefghij"), [LONG, "M"]])
+def test_a_legend_stays_in_its_drawing(names):
+    """The seventh series of a study was cut off."""
+    x = np.arange(3.0)
+    drawing = draw_panel(Panel("c", "x in px", "y in px", tuple(Curve(n, x, x) for n in names)))
+    drawing.draw_without_rendering()
+    assert drawing.axes[0].get_legend().get_window_extent().x1 <= drawing.bbox.x1
+
+
+def test_points_are_drawn_in_a_png_too(tmp_path):
+    """The figures for a paper had none: strokes of length zero are dropped there."""
+    x = np.linspace(0.0, 1.0, 20)
+    curves = (Curve("", x, x, "points"), Curve("", x[:1], x[:1], "points", "#ff0000"))
+    panel = Panel("c", "x in px", "y in px", curves)
+    _, png = save(draw_panel(panel), tmp_path, "c")
+    seen = cv2.imread(str(png)).reshape(-1, 3).astype(int)
+    for colour in ([178, 114, 0], [0, 0, 255]):  # blue, green, red
+        assert (np.abs(seen - colour).max(axis=1) < 10).sum() > 10
 
 
 def test_a_study_of_nearly_nothing_says_why(empty_study):

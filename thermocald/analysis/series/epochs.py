@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 MATERIAL = 0.1
 """Excess of sigma0 over 1 that is explained in the output."""
 CAUSES_OF_SIGMA0 = (
-    "it can be the noise of the image points, a test field worse than stated, or a lens that the "
-    "distortion does not describe"
+    "above 1 if the image points or the test field are worse than stated, or if the distortion "
+    "does not describe the lens"
 )
 _TESTS_A_FIELD = 18  # redundancy of a level that tests the field: 16 targets
 _SHOWN_SDS = 5.0  # significance of an affinity that the targets show

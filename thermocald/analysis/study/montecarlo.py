@@ -19,6 +19,7 @@ fixed: that of the first epoch, the mean of the series, and that of the last.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -83,9 +84,27 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
     return np.asarray(-solved, dtype=np.float64)
 
 
+def plane_covariance(jacobian: Array, root: Array) -> Array:
+    """Propagate the covariance of a root (m, 10) by ∂(X, Y)/∂iop (k, 2, 10) to (k, 2, 2) mm²."""
+    return np.asarray(jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2))
+
+
 _CHUNK = 512
-_SAMPLE = 400  # of the first sets, whose errors are drawn
 _CONVERGED = 1e-6  # px, a last step that leaves an error far below
+
+
+@dataclass(frozen=True, eq=False)
+class FirstOrder:
+    """The covariance of the Monte-Carlo simulation propagated to first order, per grid point, mm.
+
+    covariance (k, 2, 2) mm²; mean (k,); expected_largest (k,): for the number of draws of the
+    simulation; fractions (m+1,): of the clusters over all points.
+    """
+
+    covariance: Array
+    mean: Array
+    expected_largest: Array
+    fractions: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +113,8 @@ class MonteCarlo:
 
     image_points (k, 2) px; expected (k, 2) mm; counts (k, m+1): sets per cluster with the limits
     `clusters_mm`; mean, largest (k,); mean_error (k, 2): second-order bias; covariance (k, 2, 2)
-    mm²; sample (s, k, 2): errors of the first sets; folded: sets left out as they have no ray.
+    mm²; sample (s, k, 2): errors of the first chunk; folded: sets left out as they have no ray;
+    jacobian (k, 2, 10): ∂(X, Y)/∂iop; root (m, 10): of the covariance of the draws.
     """
 
     sets: int
@@ -110,6 +130,17 @@ class MonteCarlo:
     covariance: Array
     sample: Array
     folded: int
+    jacobian: Array
+    root: Array
+
+    @cached_property
+    def first_order(self) -> FirstOrder:
+        """What the same covariance gives to first order."""
+        covariance = plane_covariance(self.jacobian, self.root)
+        axes = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+        below = np.mean(shares_within(axes, self.clusters_mm), axis=0)
+        shares = np.diff(below, prepend=0.0, append=1.0)
+        return FirstOrder(covariance, *mean_and_largest(axes, self.sets), shares)
 
     @property
     def fractions(self) -> Array:
@@ -168,7 +199,7 @@ def simulate_errors(
     k = len(points)
     beyond = np.zeros((k, len(limits)), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))
-    sample: list[Array] = []
+    sample = np.empty((0, k, 2))
     rng = np.random.default_rng(settings.seed)
     used = 0
     for done in range(0, sets, _CHUNK):
@@ -185,8 +216,8 @@ def simulate_errors(
         squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
         rows = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
         sums += np.stack(rows, axis=1)
-        if done < _SAMPLE:
-            sample.append(np.stack([dx.T, dy.T], axis=-1))
+        if not done:
+            sample = np.stack([dx.T, dy.T], axis=-1)
         if progress is not None:
             progress(len(normal))
     folded = sets - used
@@ -202,7 +233,8 @@ def simulate_errors(
     covariance = second - mean_error[:, :, None] * mean_error[:, None, :]
     return MonteCarlo(
         sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, expected,
-        counts, means[:, 0], largest, mean_error, covariance, np.concatenate(sample), folded,
+        counts, means[:, 0], largest, mean_error, covariance, sample, folded,
+        jacobian, root,
     )  # fmt: skip
 
 

@@ -164,9 +164,27 @@ def compare(camera: CameraStudy) -> list[Comparison]:
         rows += _about("depth of field at 1 m, change", "mm", quoted.focus_mm, np.mean(focus), 1.0)
     ratio = max(one.series.sigma0.max() / one.series.sigma0[0] for one in series)
     rows += _about("σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35)
-    # correlations with the temperature, and of x0 with y0
+    rows += _statistics(quoted, camera)
+    # the classes of Table 7 that the text mentions, means and maxima
+    percent = (100 * mc.fractions).tolist()
+    rows += _about("errors below 1.5 cm at 10 m", "%", quoted.below, percent[0], 3.0)
+    if quoted.far == "likely":
+        rows.append(("errors of 5 to 10 cm", "%", "likely", percent[2], _LIKELY, np.inf))
+    elif quoted.far == "unlikely":
+        beyond = percent[2] + percent[3]
+        rows.append(("errors above 5 cm", "%", "unlikely", beyond, -np.inf, _UNLIKELY))
+    rows.append(("errors above 10 cm", "%", "hardly ever", percent[3], -np.inf, _UNLIKELY))
+    rows += _about("mean error at 10 m", "cm", quoted.mean_cm, mc.overall_mean / 10, 0.1)
+    largest, bound = mc.mean_largest / 10, 0.15 * quoted.maxima_cm
+    rows += _about("mean of the maximum errors", "cm", quoted.maxima_cm, largest, bound)
+    return [Comparison(camera.label, *row) for row in rows]
+
+
+def _statistics(quoted: Quoted, camera: CameraStudy) -> list[_Row]:
+    """Return the rows of the correlations and of the F-test."""
+    rows: list[_Row] = []
     absolute = [
-        {name: abs(d.r) for name, d in one.channels[0].dependences.items()} for one in series
+        {name: abs(d.r) for name, d in one.channels[0].dependences.items()} for one in camera.series
     ]
     for name in ("c", "x0", "y0"):
         least = min(r[name] for r in absolute)
@@ -182,21 +200,9 @@ def compare(camera: CameraStudy) -> list[Comparison]:
         r = float(camera.over_time[1, 2])
         rows.append(("r of x0 with y0 over time", "", "near −1", r, -1.0, -_CLOSE))
     for name in ("c", "x0", "y0"):
-        share = float(np.mean([one.significance[name].success_ratio for one in series]))
+        share = float(np.mean([one.significance[name].success_ratio for one in camera.series]))
         rows.append((f"F-test of {name}, success ratio", "", "near 1", share, 0.9, np.inf))
-    # the classes of Table 7 that the text mentions, means and maxima
-    percent = (100 * mc.fractions).tolist()
-    rows += _about("errors below 1.5 cm at 10 m", "%", quoted.below, percent[0], 3.0)
-    if quoted.far == "likely":
-        rows.append(("errors of 5 to 10 cm", "%", "likely", percent[2], _LIKELY, np.inf))
-    elif quoted.far == "unlikely":
-        beyond = percent[2] + percent[3]
-        rows.append(("errors above 5 cm", "%", "unlikely", beyond, -np.inf, _UNLIKELY))
-    rows.append(("errors above 10 cm", "%", "hardly ever", percent[3], -np.inf, _UNLIKELY))
-    rows += _about("mean error at 10 m", "cm", quoted.mean_cm, mc.overall_mean / 10, 0.1)
-    largest, bound = mc.mean_largest / 10, 0.15 * quoted.maxima_cm
-    rows += _about("mean of the maximum errors", "cm", quoted.maxima_cm, largest, bound)
-    return [Comparison(camera.label, *row) for row in rows]
+    return rows
 
 
 def _about(

@@ -39,15 +39,13 @@ from thermocald.analysis.study.montecarlo import (
     Trajectory,
     correlations_over_time,
     draw_root,
-    mean_and_largest,
-    plane_jacobian,
-    shares_within,
+    plane_covariance,
     simulate_errors,
     trajectories,
 )
 from thermocald.errors import GeometryError
 from thermocald.names import tell_apart
-from thermocald.numbers import parameter_label, percent
+from thermocald.numbers import counted, enumerated, parameter_label, percent
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
 
 if TYPE_CHECKING:
@@ -231,19 +229,22 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     significance = _significance(series, settings, notes)
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
-    short: dict[str, list[str]] = {}
-    for c in channels:
-        if slopes := [parameter_label(n) for n, d in c.dependences.items() if d.too_short]:
-            short.setdefault(", ".join(slopes), []).append(parameter_label(c.thermometer.name))
+    short = {
+        parameter_label(c.thermometer.name): enumerated(
+            [parameter_label(n) for n, d in c.dependences.items() if d.too_short]
+        )
+        for c in channels
+    }
     notes += [
-        f"Slopes of {of} on {' and '.join(on)}: the noise is correlated over more than a seventh "
-        "of the series, which is too short for their standard deviations; take those as an order "
-        "of magnitude."
-        for of, on in short.items()
+        f"Slopes of {of} on {enumerated([name for name in short if short[name] == of])}: the noise "
+        "is correlated over more than a seventh of the series, which is too short for their "
+        "standard deviations; take those as an order of magnitude."
+        for of in dict.fromkeys(short.values())
+        if of
     ]
     grid = image_grid(series.sensor)
     displacement = covariance = None
-    if len(series) > 1:
+    if len(series) > 1 and series.free:
         try:
             displacement, covariance = image_displacement(series, grid)
         except GeometryError as error:
@@ -272,26 +273,29 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
         steps = np.diff(series.time_s)
         gaps = steps > _GAP_IN_INTERVALS * series.interval_s
         if gaps.any():
-            count = int(gaps.sum())
             notes.append(
-                f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
+                f"The series has {counted(int(gaps.sum()), 'gap')}, the longest of "
                 f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s. Windows "
                 "across gaps are not tested; the noise decorrelates in a gap as between epochs."
             )
     held = [name for name in IOP_NAMES if name not in series.free]
-    if held:
+    if not series.free:
+        notes.append("All parameters were held fixed: whether they change was not examined.")
+    elif held:
         notes.append(
-            f"{', '.join(held)} {'was' if len(held) == 1 else 'were'} held fixed in the "
-            "adjustment: not tested, not correlated, not varied in the simulation."
+            f"{', '.join(map(parameter_label, held))} {'was' if len(held) == 1 else 'were'} held "
+            "fixed in the adjustment: not tested, not correlated, not varied in the simulation."
         )
-    if series.choice:
-        notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
-    notes += [f"The test field moved: {m.sentence}; corrected." for m in series.field_movements]
     if series.exterior == "per_epoch":
         notes.append(
-            "Every epoch has an exterior orientation of its own: its movements and those of the "
+            "Every epoch has an exterior orientation of its own"
+            f"{f' ({series.choice})' if series.choice else ''}: its movements and those of the "
             "principal point are weakly separated, which the standard deviations include."
         )
+    # of one that stood still, only what may have been missed, which follows a semicolon
+    elif series.choice and (series.exterior != "series" or ";" in series.choice):
+        notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
+    notes += [f"The test field moved: {m.sentence}; corrected." for m in series.field_movements]
     if not series.thermometers:
         notes.append("The series has no temperature: no dependence on it can be computed.")
     return notes
@@ -344,13 +348,16 @@ def _corrected(tests: dict[str, _Test], **names: str) -> dict[str, _Test]:
 
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     """Return the dependence of all parameters on one thermometer, or why there is none."""
-    name, sd = thermometer.name, thermometer.sd
+    name, sd = parameter_label(thermometer.name), thermometer.sd
     known = np.isfinite(thermometer.values)
     have = slice(None) if known.all() else known  # no copies of a long series
     t = thermometer.values[have]
     reason = ""
     if len(t) < _LEAST_DEPENDENCE:
-        reason = f"{name} has too few readings ({len(t)}) for a dependence on it."
+        reason = (
+            f"{name} is known in {len(t)} of {counted(len(series), 'epoch')}: a dependence on it "
+            f"needs {_LEAST_DEPENDENCE}."
+        )
     elif not np.ptp(t) > 0:
         reason = f"{name} stayed at {t[0]:.2f} °C: no dependence on it can be computed."
     elif float(np.var(t, ddof=1)) < 2 * sd**2:
@@ -375,7 +382,6 @@ def _focus(
     notes: list[str],
 ) -> FocusChange | None:
     if "c" not in deviations:
-        notes.append("The principal distance was held or has one value only: no change of focus.")
         return None
     sensor = series.sensor
     # the largest blur that counts as sharp: 2 to 3 px
@@ -403,20 +409,6 @@ def _focus(
 
 
 @dataclass(frozen=True, eq=False)
-class FirstOrder:
-    """The covariance of the Monte-Carlo simulation propagated to first order, per grid point, mm.
-
-    covariance (k, 2, 2) mm²; mean (k,); expected_largest (k,): for the number of draws of the
-    simulation; fractions (m+1,): of the clusters over all points.
-    """
-
-    covariance: Array
-    mean: Array
-    expected_largest: Array
-    fractions: Array
-
-
-@dataclass(frozen=True, eq=False)
 class CameraStudy:
     """The study of one camera (label) from its series.
 
@@ -432,7 +424,6 @@ class CameraStudy:
     sds: Array
     correlations: IopCorrelations | None
     montecarlo: MonteCarlo | None
-    first_order: FirstOrder | None
     over_time: Array
     trajectories: tuple[Trajectory, ...]
     notes: tuple[str, ...]
@@ -473,58 +464,67 @@ def study_camera(
     notes: list[str] = []
     studies = tuple(study_series(one, settings) for one in series)
     iop = np.mean([one.mean for one in series], axis=0)
-    squares, noise, degrees = np.zeros(10), np.zeros(10), np.zeros(10)
-    for one in series:
-        for name in one.free:
-            k = IOP_NAMES.index(name)
-            values, of_epochs = one.column(name)
-            squares[k] += np.var(values) * len(one)
-            noise[k] += np.mean(of_epochs**2) * (len(one) - 1)
-            degrees[k] += len(one) - 1
-    sds, noise = (np.sqrt(total / np.maximum(degrees, 1)) for total in (squares, noise))
+    sds, noise = _pooled_sds(series)
     correlations = median_correlations([one.correlations for one in series])
     if correlations is None:
         notes.append(
             "No epoch has a covariance matrix: correlations within the adjustments are unknown."
         )
-    montecarlo = first_order = None
+    montecarlo = None
     if correlations is None or not (sds > 0).any():
         notes.append(
             "No Monte-Carlo: it needs a parameter that varies over two epochs or more, and the "
             "correlations."
         )
     else:
-        sensor, correlation = series[0].sensor, correlations.median
         try:
-            montecarlo = simulate_errors(sensor, iop, sds, correlation, settings, progress)
-            jacobian = plane_jacobian(sensor, iop, montecarlo.image_points, settings.distance_mm)
-            covariance, by_noise = (
-                jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
-                for root in (draw_root(sds, correlation), draw_root(noise, correlation))
+            montecarlo = simulate_errors(
+                series[0].sensor, iop, sds, correlations.median, settings, progress
             )
-            axes = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
-            below = np.mean(shares_within(axes, settings.clusters_mm), axis=0)
-            shares = np.diff(below, prepend=0.0, append=1.0)
-            first_order = FirstOrder(covariance, *mean_and_largest(axes, settings.sets), shares)
-            share = np.trace(by_noise.sum(axis=0)) / np.trace(covariance.sum(axis=0))
-            if share > _MOSTLY_NOISE:
-                notes.append(
-                    f"The errors on the plane are mostly the noise of an epoch's calibration "
-                    f"({percent(min(share, 1.0))} of their variance), not changes of the camera."
-                )
         except GeometryError as error:
             notes.append(f"No Monte-Carlo: {error}.")
-    if montecarlo is not None and montecarlo.folded:
-        notes.append(
-            f"{montecarlo.folded} of {montecarlo.sets} drawn interior orientations fold the image "
-            "over itself and were left out."
-        )
+        else:
+            notes += _simulation_notes(montecarlo, draw_root(noise, correlations.median))
     try:
         paths = trajectories(series, settings.distance_mm, settings.grid, settings.clusters_mm)
     except GeometryError as error:
         paths = ()
         notes.append(f"The camera's drift cannot be projected onto the plane: {error}.")
     return CameraStudy(
-        label, studies, iop, sds, correlations, montecarlo, first_order,
-        correlations_over_time(series), paths, tuple(notes),
+        label, studies, iop, sds, correlations, montecarlo, correlations_over_time(series), paths,
+        tuple(notes),
     )  # fmt: skip
+
+
+def _simulation_notes(simulated: MonteCarlo, noise: Array) -> list[str]:
+    """State what limits a simulation; noise (m, 10): root of an epoch's covariance."""
+    notes = []
+    by_noise, by_all = (
+        np.trace(plane_covariance(simulated.jacobian, root).sum(axis=0))
+        for root in (noise, simulated.root)
+    )
+    if by_noise > _MOSTLY_NOISE * by_all:
+        notes.append(
+            "The errors on the plane are mostly the noise of an epoch's calibration "
+            f"({percent(min(by_noise / by_all, 1.0))} of their variance), not changes of the "
+            "camera."
+        )
+    if simulated.folded:
+        notes.append(
+            f"{simulated.folded} of {simulated.sets} drawn interior orientations fold the image "
+            "over itself and were left out."
+        )
+    return notes
+
+
+def _pooled_sds(series: Sequence[MeasuredSeries]) -> tuple[Array, Array]:
+    """Return the sds (10,) of the IOP over time and those of an epoch, 0 if held in all series."""
+    squares, noise, degrees = np.zeros(10), np.zeros(10), np.zeros(10)
+    for one in series:
+        for name in one.free:
+            k = IOP_NAMES.index(name)
+            values, sds = one.column(name)
+            squares[k] += np.var(values) * len(one)
+            noise[k] += np.mean(sds**2) * (len(one) - 1)
+            degrees[k] += len(one) - 1
+    return np.sqrt(squares / np.maximum(degrees, 1)), np.sqrt(noise / np.maximum(degrees, 1))

@@ -267,9 +267,10 @@ def _object_space(camera: CameraStudy) -> Iterator[Figure]:
     """Draw the error clouds on the object plane, one panel per grid point, and the mean and largest
     errors of the points with the mean of the largest (Figures 10 and 11).
     """
-    mc, first = camera.montecarlo, camera.first_order
-    if mc is None or first is None:
+    mc = camera.montecarlo
+    if mc is None:
         return
+    first = mc.first_order
     limits = mc.clusters_mm
     names = cluster_names(limits)
     size = round(np.sqrt(len(mc.image_points)))

@@ -38,7 +38,7 @@ from thermocald.result import document_of, jsonable
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from thermocald.analysis.study.measured import StudySettings
@@ -63,14 +63,14 @@ def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
     chapters = []
     for camera in study.cameras:
         series = [one.series for one in camera.series]
-        names = ", ".join(dict.fromkeys(s.camera for s in series))
+        names = ", ".join(dict.fromkeys(f"{s.camera}, {s.sensor}" for s in series))
         measured = "; ".join(f"{s.name} {day(s.start_utc)}" for s in series)
         chapters.append(
             Chapter(
                 camera.label,
                 _answer(camera),
                 tuple(_sections(camera, study.settings)),
-                (f"{names}, {series[0].sensor}. Measured: {measured}.",),
+                (f"{names}. Measured: {measured}.",),
                 (*map(as_sentence, _doubts(camera)), *_notes(camera)),
             )
         )
@@ -94,7 +94,14 @@ def _answer(camera: CameraStudy) -> Answer:
     if proof is None and any(len(study.series) > 1 for study in camera.series):
         proof = principal_point_figure(camera)
     channels = [channel for study in camera.series for channel in study.channels]
-    if any(d.p_holm < _SIGNIFICANT for c in channels for d in c.dependences.values()):
+    if not any(study.series.free for study in camera.series):
+        steps = ["Let the study estimate parameters: leave out --free none."]
+    elif any(
+        d.p_holm < _SIGNIFICANT
+        for c in channels
+        for name, d in c.dependences.items()
+        if name != "sigma0"
+    ):
         steps = [
             "Fit a thermal model, with which to correct measurements: thermocald fit.",
             "Find what a straight line does not explain, and why: thermocald discover.",
@@ -185,15 +192,19 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
     return (f"If the lens were {lens}, {change}. Neither was measured.",)
 
 
-def _notes(camera: CameraStudy) -> list[str]:
-    """Return the notes of all series, each once, with the series to which it applies."""
+def _once(texts: Iterable[tuple[str, SeriesStudy]]) -> dict[str, list[str]]:
+    """Return every text once, with the names of the series to which it applies."""
     holders: dict[str, list[str]] = {}
-    for study in camera.series:
-        for note in study.notes:
-            holders.setdefault(note, []).append(study.series.name)
+    for text, study in texts:
+        holders.setdefault(text, []).append(study.series.name)
+    return holders
+
+
+def _notes(camera: CameraStudy) -> list[str]:
+    found = _once((note, study) for study in camera.series for note in study.notes)
     notes = [
         note if len(names) == len(camera.series) else f"{', '.join(names)}: {note}"
-        for note, names in holders.items()
+        for note, names in found.items()
     ]
     return notes + list(camera.notes)
 
@@ -261,7 +272,8 @@ def answer_sentences(camera: CameraStudy) -> list[str]:
 
 def detail_sentences(camera: CameraStudy) -> list[str]:
     """Return sentences on the dependence on temperature, and on noise other than the stated."""
-    sentences = [s for study in camera.series if (s := _dependence(study))]
+    found = _once((text, study) for study in camera.series if (text := _dependence(study)))
+    sentences = [f"{', '.join(names)}: {text}." for text, names in found.items()]
     return sentences + [s for study in camera.series if (s := _noise(study))]
 
 
@@ -394,7 +406,9 @@ def _warmed(study: SeriesStudy) -> str:
     if reference is None or reference.name not in study.deviations:
         return ""
     d = study.deviations[reference.name]
-    name = parameter_label(reference.name)
+    name, known = parameter_label(reference.name), int(np.isfinite(reference.values).sum())
+    if known < len(study.series):
+        name += f" (known in {known} of {len(study.series)} epochs)"
     if d.returned:
         rose, largest = "rose" if d.largest > 0 else "fell", plain(abs(d.largest), "K", 3)
         within = plain(d.range, "K", 3)
@@ -402,6 +416,8 @@ def _warmed(study: SeriesStudy) -> str:
         back = abs(d.change) < 3 * d.sd_change
         end = "" if back else f"{plain(abs(d.change), 'K', 3)} from "
         return f", while {name} {rose} by up to {largest}{over} and ended {end}where it started"
+    if not d.range:
+        return f", while {name} stayed at {d.first:.2f} °C"
     if abs(d.change) < 3 * d.sd_change:
         return f", while {name} stayed within {plain(d.range, 'K', 2)}"
     return f", while {name} changed by {plain(d.change, 'K', 3)}"
@@ -419,25 +435,20 @@ def _noise(study: SeriesStudy) -> str:
 
 
 def _dependence(study: SeriesStudy) -> str:
+    """State which parameters depend on the reference temperature; "" if none was examined."""
     channel = next((c for c in study.channels if c.dependences), None)
-    if channel is None:
+    if channel is None or not study.series.free:
         return ""
-    close = [parameter_label(n) for n, d in channel.dependences.items() if abs(d.r) >= _CLOSE]
     found = channel.dependences.items()
+    close = [parameter_label(n) for n, d in found if abs(d.r) >= _CLOSE]
     significant = [parameter_label(n) for n, d in found if d.p_holm < _SIGNIFICANT]
     name = parameter_label(channel.thermometer.name)
-    if not study.series.free:
-        return (
-            f"{study.series.name}: all parameters were held fixed; whether they depend on {name} "
-            "was not examined."
-        )
     if not significant:
-        return f"{study.series.name}: no parameter depends significantly on {name}."
+        return f"no parameter depends significantly on {name}"
     depends = "depends" if len(significant) == 1 else "depend"
-    text = f"{study.series.name}: {', '.join(significant)} {depends} significantly on {name}"
-    if close == significant:
-        return f"{text}, and closely (|r| ≥ {_CLOSE})."
-    return text + (f", {', '.join(close)} closely (|r| ≥ {_CLOSE})." if close else ".")
+    text = f"{enumerated(significant)} {depends} significantly on {name}"
+    which = "" if close == significant else f" {enumerated(close)}"
+    return text + (f",{which or ' and'} closely (|r| ≥ {_CLOSE})" if close else "")
 
 
 def study_document(study: Study) -> dict[str, Any]:
@@ -513,9 +524,10 @@ def _channel(study: SeriesStudy, channel: ChannelStudy, distance_mm: float) -> d
 
 
 def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
-    mc, first = camera.montecarlo, camera.first_order
-    if mc is None or first is None:
+    mc = camera.montecarlo
+    if mc is None:
         return None
+    first = mc.first_order
     points = [
         {
             "image_point_px": mc.image_points[k], "expected_mm": mc.expected[k],

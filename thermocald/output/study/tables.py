@@ -57,13 +57,13 @@ def overview_table(camera: CameraStudy) -> Table:
         {
             "series": lambda s: s.series.name,
             "camera": lambda s: s.series.camera,
-            "sensor": lambda s: str(s.series.sensor),
             "epochs": epochs,
             "duration": lambda s: duration(float(s.series.time_s[-1] - s.series.time_s[0])),
             "interval": lambda s: f"{s.series.interval_s:.1f} s" if len(s.series) > 1 else "–",
             "temperature": temperatures,
             "σ₀; noise / stated": noise,
-            "estimated": lambda s: ", ".join(parameter_label(name) for name in s.series.free),
+            "estimated": lambda s: ", ".join(map(parameter_label, s.series.free)) or "nothing",
+            "exterior orientation": lambda s: s.series.exterior.replace("_", " "),
         },
         "Temperature: first to last epoch, and its range. σ₀ is that of the adjustments, against "
         "the stated standard deviations of the image points; noise / stated is the scatter between "
@@ -198,9 +198,10 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
     """Return the table of fractions, means and maxima of the errors (Table 7), also along the
     camera's own path, and the table of errors per grid point (Figure 11).
     """
-    mc, first = camera.montecarlo, camera.first_order
-    if mc is None or first is None:
+    mc = camera.montecarlo
+    if mc is None:
         return []
+    first = mc.first_order
 
     def row(label: str, fractions: Array, mean: float, largest: float) -> tuple[str, ...]:
         shown = [percent(float(v), 1) for v in fractions]

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from thermocald.errors import BadReading, DeviceError, DeviceGone
+from thermocald.errors import BadReading, ConfigurationError, DeviceError, DeviceGone
 from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import support
 
@@ -121,6 +121,9 @@ class Ds18b20Thermometer(support.CheckedThermometer):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.sensors: dict[str, str] = self.options.sensors
+        ids = list(self.sensors.values())
+        if twice := {rom for rom in ids if ids.count(rom) > 1}:
+            raise ConfigurationError(f"sensors: {min(twice)} is given twice")
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._pending: dict[str, Future[float]] = {}
 

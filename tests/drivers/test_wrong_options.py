@@ -41,6 +41,8 @@ WRONG = {
     ]),
     **{("thermometer", chip): ({}, [({"address": 0x50}, "0x50 is not an address of a")])
        for chip in ("bme280", "lm75", "mcp9808", "sht3x", "tmp117")},
+    ("thermometer", "ds18b20"): ({}, [
+        ({"sensors": {"camera": "28-1", "air": "28-1"}}, "sensors: 28-1 is given twice")]),
     ("thermometer", "thermal_zone"): ({}, [
         ({"zone": "pm8150b-vbat-lvl0"}, "set unit: thousandths")]),
     ("thermometer", "serial"): ({"port": "/dev/null"}, [

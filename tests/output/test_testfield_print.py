@@ -244,6 +244,7 @@ def test_every_paper_has_a_sensible_default(name, landscape):
         (Design((210, 297), 7.0, dictionary="DICT_KLINGON"), "DICT_KLINGON"),
         (Design((210, 297), 0.5), "0.5 mm"),
         (Design((210, 297), 7.0, sheets=2), "three of a corner"),
+        (Design((210, 297), 7.0, pitch=300.0), "1 × 1 targets; use a smaller pitch"),
         (Design((210, 297), 7.0, pitch=10.0), "need at least 29.75 mm"),
     ],
 )

@@ -208,7 +208,8 @@ def _grid(design: Design, size: tuple[float, float]) -> tuple[Array, Array]:
     if min(counts) < 2:
         raise UsageError(
             f"discs of {design.diameter:g} mm on {design.page[0]:g} × {design.page[1]:g} mm paper "
-            f"leave room for {counts[0]} × {counts[1]} targets; use smaller discs or larger paper"
+            f"leave room for {counts[0]} × {counts[1]} targets; use "
+            f"{'smaller discs' if design.pitch is None else 'a smaller pitch'} or larger paper"
         )
     x, y = (
         np.asarray(low + (side - low - reach - (n - 1) * pitch) / 2 + pitch * np.arange(n), float)

@@ -143,7 +143,7 @@ class EncodedImage:
             ) from error
         if image is None:
             raise ImageError(
-                f"{self.name}: is not an image (JPEG, PNG and TIFF are read; convert HEIC)"
+                f"{self.name}: is not an image or is cut off (JPEG, PNG, TIFF are read, not HEIC)"
             )
         return image
 

@@ -423,9 +423,8 @@ def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(shared,
         pair = rng.choice(full, 2, replace=False)
         rows = np.array(sorted(boards[pair[0]] + boards[pair[1]]))
         pose = camera.resect(recording.testfield, epoch.observations.select(rows))
-        assert pose.status in ("ok", "ambiguous_pose"), (
-            pose.reason
-        )  # if the boards are in one plane
+        # the boards may be in one plane, or on one line
+        assert pose.status in ("ok", "ambiguous_pose", "weak_geometry"), pose.reason
         if pose.ok:
             posed += 1
             ratio.append((pose.values[10:] - whole.values[10:]) / pose.sd[10:])

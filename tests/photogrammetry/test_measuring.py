@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from thermocald.analysis.camera.camera import Camera
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -108,18 +109,36 @@ def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
     assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 22.5  # 6 degrees of freedom
 
 
-@pytest.mark.parametrize("n", [5, 8])
-def test_points_near_one_line_give_a_pose(n):
-    """Of five, random draws missed some: "no pose fits" in 14 of 60 layouts."""
-    rng, Q = np.random.default_rng(1), camera_covariance()
-    for _ in range(8):
-        points = np.array([-2_000.0, 9_000.0, 500.0]) + rng.uniform(0, 1, (n, 1)) * [0, 18_000, 0]
-        points += rng.normal(0, 400, points.shape)
+@pytest.mark.parametrize(("kind", "n"), [("pair", 4), ("line", 5), ("line", 6), ("plane", 5)])
+def test_random_layouts_have_a_true_pose_or_are_told_why_not(kind, n):
+    """Of 60 layouts with two points close together, 18 fitted "no pose"; near a line, 2 % were
+    up to 15° off.
+    """
+    rng, statuses = np.random.default_rng(n), []
+    Q = np.diag([1e-6] * 3 + [0.0] * 7)
+    for _ in range(60):
+        depth = rng.uniform(6_000, 30_000, n)
+        points = np.column_stack([depth, rng.uniform(-0.35, 0.35, (2, n)).T * depth[:, None]])
+        if kind == "pair":
+            points[1] = points[0] + rng.normal(0, 100, 3)
+        elif kind == "plane":
+            points[:, 2] = 0.3 * points[:, 1] - 2_000.0
+        else:
+            share = rng.choice([0.02, 0.04, 0.08])
+            along = points[0] + rng.uniform(0, 1, (n, 1)) * (points[1] - points[0])
+            size = np.linalg.norm(points[1] - points[0])
+            points = along + rng.normal(0, share * size, (n, 3))
+        points = points[:, [1, 0, 2]] + POSE[3:]
         _, field, seen = drawn(rng, points, Q, 10.0)
-        r = resect(SENSOR, INTERIOR, Q, field, seen, snooping_alpha=0.0)
-        assert r.status == "ok", r.reason
-        d = r.values[10:] - POSE
-        assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 27
+        camera = Camera(SENSOR, np.nan, INTERIOR.as_array(), Q)
+        r = camera.resect(field, seen, 0.0)
+        statuses.append(r.status)
+        if r.ok:
+            d = r.values[10:] - POSE
+            d[:3] = np.arctan2(np.sin(d[:3]), np.cos(d[:3]))
+            assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 50  # 6 degrees of freedom
+    assert set(statuses) <= {"ok", "ambiguous_pose", "weak_geometry"}
+    assert statuses.count("ok") >= 30
 
 
 def test_points_on_one_line_or_at_one_pixel_determine_no_pose():
@@ -129,18 +148,18 @@ def test_points_on_one_line_or_at_one_pixel_determine_no_pose():
     near = line + np.random.default_rng(5).normal(0, 100, (8, 3))
     for points, reason in (
         (line, "on one line"),
-        (near[[0, 2, 5, 7]], "the camera's direction is known to"),
-        (near, "which lie nearly on one line: add one beside"),
+        (near[[0, 2, 5, 7]], "determine the camera's place to ±"),
+        (near, "no pose fits the 8 control points; check"),
         (control_points(4, rng), "all seen at one place"),
         (control_points(8, rng), "all seen at one place"),
     ):
         _, field, seen = drawn(rng, points, Q, 20.0)
         if "one place" in reason:
             seen.points[:] = 900.0
-        if "which" in reason:
+        if "check" in reason:
             seen.points[:] = rng.uniform(0, 2400, seen.points.shape)
         r = resect(SENSOR, INTERIOR, Q, field, seen)
-        assert r.status == "no_orientation"
+        assert r.status == ("weak_geometry" if "place to" in reason else "no_orientation")
         assert reason in r.reason
 
 

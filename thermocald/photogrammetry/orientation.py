@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -113,20 +114,21 @@ def _robust_resection(
         ideal = _ideal(sensor, interior, uv)
     except GeometryError:
         return None
-    threshold = _TOLERANCE * sensor.width * sensor.pixel_pitch / interior.c
-    found = majority_pose(X, ideal, threshold)
-    if found is None:
-        return None
-    exterior, rows = _exterior(*found[:2]), found[2]
-    residuals = np.linalg.norm(_residuals(sensor, interior, exterior, X, uv), axis=1)
-    if len(rows) <= _CLEAR * len(X):
-        # For a board seen obliquely SQPnP of few pairs may fail; the resection of a plane does not.
-        tolerance = _TOLERANCE * sensor.width
-        for _, whole in resection(sensor, interior, X, uv)[:1]:
-            other = np.linalg.norm(_residuals(sensor, interior, whole, X, uv), axis=1)
-            if (other < tolerance).sum() > (residuals < tolerance).sum():
-                return whole, other
-    return exterior, residuals
+    tolerance = _TOLERANCE * sensor.width
+    found = majority_pose(X, ideal, tolerance * sensor.pixel_pitch / interior.c)
+    pose, fit, residuals = None, int(_CLEAR * len(X)), np.empty(0)
+    if found is not None:
+        pose = _exterior(*found[:2])
+        residuals = np.linalg.norm(image_residuals(sensor, interior, pose, X, uv), axis=1)
+        if len(found[2]) > _CLEAR * len(X):
+            return pose, residuals
+        fit = int((residuals < tolerance).sum())
+    # For a board seen obliquely SQPnP of few pairs may fail; the resection of a plane does not.
+    for _, whole in resection(sensor, interior, X, uv)[:1]:
+        other = np.linalg.norm(image_residuals(sensor, interior, whole, X, uv), axis=1)
+        if (other < tolerance).sum() > fit:
+            return whole, other
+    return None if pose is None else (pose, residuals)
 
 
 def majority_pose(
@@ -183,7 +185,7 @@ def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
     return np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
 
 
-def _residuals(
+def image_residuals(
     sensor: Sensor, interior: InteriorOrientation, pose: ExteriorOrientation, X: Array, uv: Array
 ) -> Array:
     """Return measured minus predicted image points (n, 2) px; 1e6 for points behind the camera."""
@@ -219,8 +221,41 @@ def resection(
             poses = [_exterior(cv2.Rodrigues(rvec)[0], tvec.ravel())]
     except cv2.error:  # degenerate points fail an assertion of OpenCV's
         return []
-    rms = [float(np.sqrt(np.mean(_residuals(sensor, interior, p, X, uv) ** 2))) for p in poses]
+    rms = [float(np.sqrt(np.mean(image_residuals(sensor, interior, p, X, uv) ** 2))) for p in poses]
     return sorted(zip(rms, poses, strict=True), key=lambda s: s[0])
+
+
+_SPREAD = 6  # points whose triples are tried
+_START = 0.005  # of the image's width: largest RMS residual of a pose of all points
+
+
+def possible_poses(
+    sensor: Sensor, interior: InteriorOrientation, field_points: ArrayLike, image_points: ArrayLike
+) -> list[ExteriorOrientation]:
+    """Return poses that fit all points, the best first; several of them may be nearly the same.
+
+    They are those of `resection`, and up to four of any three of six points that are far apart in
+    the image. Source: Ke and Roumeliotis (2017), AP3P.
+    """
+    X, uv = np.asarray(field_points, dtype=float), np.asarray(image_points, dtype=float)
+    try:
+        ideal = _ideal(sensor, interior, uv)
+    except GeometryError:  # an image point is where the distortion folds back
+        return []
+    found = resection(sensor, interior, X, uv)
+    chosen = [int(np.argmax(np.linalg.norm(uv - uv.mean(axis=0), axis=1)))]
+    while len(chosen) < min(_SPREAD, len(X)):
+        away = np.linalg.norm(uv[:, None] - uv[chosen], axis=2).min(axis=1)
+        away[chosen] = -1.0
+        chosen.append(int(np.argmax(away)))
+    for three in map(list, combinations(chosen, 3)):
+        _, *poses = cv2.solveP3P(X[three], ideal[three], np.eye(3), None, cv2.SOLVEPNP_AP3P)
+        for turn, shift in zip(*poses, strict=True):
+            pose = _exterior(cv2.Rodrigues(turn)[0], shift.ravel())
+            off = image_residuals(sensor, interior, pose, X, uv)
+            found.append((float(np.sqrt(np.mean(off**2))), pose))
+    found.sort(key=lambda f: f[0])
+    return [pose for rms, pose in found if rms <= _START * sensor.width]
 
 
 _QUICK_VIEWS_DEG = (60.0, 40.0, 80.0, 25.0)
@@ -273,7 +308,7 @@ def orient(
             return found
     i, e, inliers = approximate_orientation(sensor, points, image_points, nominal_c, interior)
     part = refine(sensor, i, e, points[inliers], image_points[inliers], interior is not None)
-    residuals = _residuals(sensor, part.camera.interior, part.exterior, points, image_points)
+    residuals = image_residuals(sensor, part.camera.interior, part.exterior, points, image_points)
     return Orientation(part.camera, part.exterior, residuals)
 
 
@@ -324,4 +359,5 @@ def refine(
             break
         last = scale
     i, e = InteriorOrientation.from_array(p[:10]), ExteriorOrientation.from_array(p[10:])
-    return Orientation(CameraModel(sensor, i), e, _residuals(sensor, i, e, points, image_points))
+    residuals = image_residuals(sensor, i, e, points, image_points)
+    return Orientation(CameraModel(sensor, i), e, residuals)

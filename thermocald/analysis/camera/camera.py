@@ -8,9 +8,8 @@ as independent of each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +17,9 @@ import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
 from thermocald.arrays import floats
-from thermocald.errors import ConfigurationError, GeometryError, UsageError
+from thermocald.errors import ConfigurationError, UsageError
 from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import (
-    EOP,
     IOP_NAMES,
     CameraModel,
     ExteriorOrientation,
@@ -164,8 +162,8 @@ class Camera(Result):
         seen: the image points, as a table or mapping with target, x, y, sx, sy (px);
         snooping_alpha: error probability of a single test for gross errors, 0 for none; start: an
         earlier pose, with which three points suffice. The covariance (16, 16) of the result is
-        joint; its status and reason explain a missing pose, such as that up to five points fit a
-        second one as well or hardly determine the camera's place. If the points lie on each other
+        joint; its status and reason explain a missing pose, such as that the points fit a second
+        one as well or hardly determine the camera's place. If the points lie on each other
         after a turn, exchanged names give another pose, and no residual shows it. Raises
         TestFieldError for a target that the field lacks, UsageError for image points that are no
         numbers.
@@ -191,68 +189,9 @@ class Camera(Result):
                 raise UsageError("a target is given twice")
             if not (np.isfinite(seen.points).all() and (seen.sigmas > 0).all()):
                 raise UsageError("x, y (px) must be finite numbers, and sx, sy above 0")
-        pose = resect(
+        return resect(
             self.sensor, self.interior, self.covariance, control, seen, start, snooping_alpha
         )
-        if not pose.ok or len(seen) > _FEW:
-            return pose
-        beside = control.points[seen.targets] - pose.values[EOP][3:]
-        if (sd := pose.sd[EOP][3:].max()) > _WEAK * np.linalg.norm(beside, axis=1).min():
-            why = (
-                f"the control points determine the camera's place to ± {sd:.0f} mm only: add "
-                "points beside their line or plane"
-            )
-            return replace(pose, status="weak_geometry", reason=why)
-        if self._has_twin(control, seen, pose, start):
-            why = (
-                f"{len(seen)} control points fit a second pose nearly as well: add a control "
-                "point, or give an earlier pose"
-            )
-            return replace(pose, status="ambiguous_pose", reason=why)
-        return pose
-
-    def _has_twin(
-        self, control: TestField, seen: Observations, pose: Adjustment,
-        earlier: ExteriorOrientation | None,
-    ) -> bool:  # fmt: skip
-        """Return whether a pose apart from the found one fits, from any three of the points.
-
-        earlier: a pose; then only one that is nearer to it counts.
-        """
-        import cv2
-
-        from thermocald.photogrammetry.epoch.measuring import resect
-        from thermocald.photogrammetry.orientation import FLIP
-
-        here = pose.values[EOP][3:]
-
-        def is_apart(centre: Array) -> bool:
-            apart = centre - here
-            far = apart @ np.linalg.solve(pose.covariance[EOP, EOP][3:, 3:], apart) > _APART
-            if earlier is None:
-                return bool(far)
-            away, kept = (np.linalg.norm(one - earlier.centre) for one in (centre, here))
-            return bool(far and away < kept)
-
-        points, camera = control.points[seen.targets], (self.sensor, self.interior, self.covariance)
-        try:
-            ideal = directions(self.sensor, self.values, seen.points)[:, :2] * [1.0, -1.0]
-        except GeometryError:  # a point outside the image, where the distortion folds back
-            return False
-        worst = pose.sigma0**2 * pose.redundancy + _FITS
-        for three in map(list, combinations(range(len(seen)), 3)):
-            given = points[three], ideal[three], np.eye(3), None
-            _, *found = cv2.solveP3P(*given, cv2.SOLVEPNP_AP3P)
-            for turn, shift in zip(*found, strict=True):
-                R = cv2.Rodrigues(turn)[0].T
-                start = ExteriorOrientation.from_rotation(R @ FLIP, (-R @ shift).ravel())
-                if not is_apart(start.centre):
-                    continue
-                other = resect(*camera, control, seen, start, 0.0)
-                fits = other.ok and other.sigma0**2 * other.redundancy < worst
-                if fits and is_apart(other.values[EOP][3:]):
-                    return True
-        return False
 
     def on_plane(
         self,
@@ -364,12 +303,6 @@ class Camera(Result):
         centred = InteriorOrientation(*self.values[:3].tolist())
         distortion = points - self.undistort(points, centred)
         return _draw(self.sensor, points, distortion, self.lines()[0])
-
-
-_WEAK = 0.04  # sd of a place over the distance to a point, beyond which it is far from linear
-_FEW = 5  # control points that a second pose may fit by chance, or that hardly determine one
-_APART = 25.0  # χ² of the difference of two centres from which they are two poses
-_FITS = 13.8  # χ² by which a second pose may fit worse
 
 
 def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Array:

@@ -41,6 +41,7 @@ _IMAGES = frozenset(
     {".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"}
 )
 _ASSUMED_PITCH = 0.001
+_FIRST = 5  # photographs from which a camera to start from is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,20 +245,37 @@ def _adjust_together(
     settings: AdjustmentSettings,
 ) -> tuple[list[int], CommonInterior]:
     """Adjust all photographs that have a pose; return their positions too. Else GeometryError."""
-    start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
-    oriented = {}
-    for k, o in usable.items():
-        with suppress(GeometryError):
-            points = testfield.points[o.targets]
-            _, oriented[k], _ = approximate_orientation(
-                camera.sensor, points, o.points, interior=start
-            )
+    oriented, why = dict[int, ExteriorOrientation](), ""
+    # a frontal view, for example, gives a camera with which others have no pose
+    for first in sorted(usable, key=lambda k: -len(usable[k]))[:_FIRST]:
+        try:
+            trial = _first_camera(usable[first], testfield, camera, settings)
+        except GeometryError as error:
+            why = why or str(error)
+            continue
+        found = _orient_all(usable, testfield, camera.sensor, trial)
+        if len(found) > len(oriented):
+            start, oriented = trial, found
+        if len(oriented) == len(usable):
+            break
     if not oriented:
-        raise GeometryError("no pose explains the targets of any photograph")
+        raise GeometryError(why or "no pose explains the targets of any photograph")
     chosen = [usable[k] for k in oriented]
     return list(oriented), adjust_common_interior(
         camera.sensor, testfield, chosen, start, list(oriented.values()), settings
     )
+
+
+def _orient_all(
+    usable: dict[int, Observations], testfield: TestField, sensor: Sensor, at: InteriorOrientation
+) -> dict[int, ExteriorOrientation]:
+    """Return the poses of the photographs that have one with an interior orientation."""
+    oriented = {}
+    for k, o in usable.items():
+        with suppress(GeometryError):
+            points = testfield.points[o.targets]
+            oriented[k] = approximate_orientation(sensor, points, o.points, interior=at)[1]
+    return oriented
 
 
 def _photograph(

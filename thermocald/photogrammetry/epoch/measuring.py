@@ -35,21 +35,20 @@ from thermocald.photogrammetry.epoch.adjustment import (
     AdjustmentSettings,
     adjust,
     failed,
-    is_ambiguous,
 )
-from thermocald.photogrammetry.orientation import approximate_orientation, resection
+from thermocald.photogrammetry.orientation import approximate_orientation, possible_poses
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
-_START = 0.005  # of the image's width: largest RMS residual of a start from all control points
 _THIN = 0.005  # extent across over extent along, up to which points count as one line
-_NEARLY_THIN = 0.03  # the same, up to which a pose may fail for that reason
-_LARGEST_SD = np.radians(4.0)  # of the camera's direction: beyond, its covariance is not true
+_WEAK = 0.04  # sd of a place over the distance to a point, beyond which it is far from linear
+_APART = 25.0  # χ² of the difference of two centres from which they are two poses
+_FITS = 13.8  # χ² by which a second pose may fit worse
 _BESIDE_PX = 5.0  # an image point may be this far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # least angle of a ray to a plane; below, a pixel means metres
 
@@ -84,23 +83,12 @@ def resect(
     if (np.ptp(observations.points, axis=0) <= observations.sigmas.max()).all():
         why = "the control points are all seen at one place in the image; check x, y (px)"
         return failed("no_orientation", why, observations)
-    suspects, pose, thin = None, start, extent[1] <= _NEARLY_THIN * extent[0]
+    pose, suspects = start, None
     if pose is None:
-        with suppress(GeometryError):
-            _, pose, fits = approximate_orientation(
-                sensor, points, observations.points, interior=interior
-            )
-            suspects = ~fits
-        if suspects is None or suspects.any():
-            # the pose of three or four points that it draws may miss the others
-            for rms, whole in resection(sensor, interior, points, observations.points)[:1]:
-                if rms <= _START * sensor.width:
-                    pose, suspects = whole, None
-        if pose is None:
-            nearly = ", which lie nearly on one line: add one beside, or" if thin else ";"
-            belong = "check that x, y (px) belong to X, Y, Z"
-            why = f"no pose fits the {n} control points{nearly} {belong}"
-            return failed("no_orientation", why, observations)
+        pose, suspects = _approximate_pose(sensor, interior, points, observations.points)
+    if pose is None:
+        why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
+        return failed("no_orientation", why, observations)
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
     if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
         why = (
@@ -108,21 +96,76 @@ def resect(
             "that the camera is this one, with this lens and image size"
         )
         return failed("too_many_rejected", why, observations)
-    if result.ok and thin:
-        sd = float(np.sqrt(np.linalg.eigvalsh(result.covariance[10:13, 10:13])[-1]))
-        if sd > _LARGEST_SD:
-            why = (
-                "the control points lie nearly on one line, about which the camera's direction is "
-                f"known to {np.degrees(sd):.0f}° only: add one beside"
-            )
-            return failed("no_orientation", why, observations)
-    if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
+    if not result.ok:
+        return result
+    nearest = np.linalg.norm(points - result.values[EOP][3:], axis=1).min()
+    # sds that are stated far too large say nothing of the geometry
+    true = min(1.0, 5.0 * result.sigma0) if result.redundancy > 4 else 1.0
+    if true * (sd := float(result.sd[EOP][3:].max())) > _WEAK * nearest:
         why = (
-            "the control points lie in one plane, and a second, mirrored pose fits nearly as "
-            "well: add one outside the plane, or give an earlier pose"
+            f"the control points determine the camera's place to ± {sd:.0f} mm only: add "
+            "points beside their line or plane"
+        )
+        return replace(result, status="weak_geometry", reason=why)
+    problem = sensor, control, observations, interior, covariance
+    if _has_twin(*problem, result, replace(s, snooping_alpha=0.0), start):
+        why = (
+            f"a second pose fits the {n} control points nearly as well: add one outside their "
+            "line or plane, or give an earlier pose"
         )
         return replace(result, status="ambiguous_pose", reason=why)
     return result
+
+
+def _approximate_pose(
+    sensor: Sensor, interior: InteriorOrientation, points: Array, uv: Array
+) -> tuple[ExteriorOrientation | None, Mask | None]:
+    """Return a pose to start from and a mask (n,) of the points that it does not fit."""
+    pose = suspects = None
+    with suppress(GeometryError):
+        _, pose, fits = approximate_orientation(sensor, points, uv, interior=interior)
+        suspects = ~fits
+    if suspects is None or suspects.any():
+        # the pose of three or four points that it draws may miss the others
+        whole = possible_poses(sensor, interior, points, uv)
+        if whole:
+            return whole[0], None
+    return pose, suspects
+
+
+def _has_twin(
+    sensor: Sensor,
+    control: TestField,
+    observations: Observations,
+    interior: InteriorOrientation,
+    covariance: Array,
+    pose: Adjustment,
+    settings: AdjustmentSettings,
+    earlier: ExteriorOrientation | None,
+) -> bool:
+    """Return whether a pose apart from the found one fits nearly as well.
+
+    earlier: a pose; then only one that is nearer to it counts.
+    """
+    here, Q = pose.values[EOP][3:], pose.covariance[EOP, EOP][3:, 3:]
+
+    def is_apart(centre: Array) -> bool:
+        apart = centre - here
+        far = bool(apart @ np.linalg.solve(Q, apart) > _APART)
+        if earlier is None or not far:
+            return far
+        away, kept = (np.linalg.norm(one - earlier.centre) for one in (centre, here))
+        return bool(away < kept)
+
+    seen = observations.select(~np.isin(observations.targets, pose.rejected))
+    worst = pose.sigma0**2 * pose.redundancy + _FITS * max(pose.sigma0**2, 1.0)
+    for start in possible_poses(sensor, interior, control.points[seen.targets], seen.points):
+        if is_apart(start.centre):
+            other = adjust(sensor, control, seen, interior, start, settings, None, covariance)
+            fits = other.ok and other.sigma0**2 * other.redundancy < worst
+            if fits and is_apart(other.values[EOP][3:]):
+                return True
+    return False
 
 
 class _Surface:

@@ -43,6 +43,7 @@ from thermocald.photogrammetry.network.bundle import (
     KnownTargets,
     point_tests,
 )
+from thermocald.photogrammetry.orientation import resection
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,6 +56,7 @@ _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at
 _GROSS = 20.0  # times the usual residual; an image point beyond it is left out at first
 _GROSS_OF_FEW = 5.0  # the same with the targets held
 _POOR = 4.0  # times the residuals of a typical photograph
+_MIRRORED = 0.5  # times its residuals, below which another pose of a photograph is tried
 _FEWEST_TO_COMPARE = 4  # photographs
 _ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
@@ -123,11 +125,22 @@ def adjust_common_interior(
         if s.snooping_alpha > 0:
             used = size <= (_GROSS_OF_FEW if few else _GROSS) * max(float(np.median(size)), 1.0)
     if left_out:
+        # a photograph of a plane may have begun with the plane's second, mirrored pose
+        model = InteriorOrientation.from_array(bundle.interior)
+        exteriors = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()]
+        turned = False
+        for i in left_out:
+            o = photographs[i]
+            own = float(np.sqrt(np.mean(in_pixels.residuals(bundle)[rays.photo == i] ** 2)))
+            for rms, pose in resection(sensor, model, testfield.points[o.targets], o.points)[:1]:
+                if rms < _MIRRORED * own:
+                    exteriors[i], turned = pose, True
+        if turned:
+            return adjust_common_interior(sensor, testfield, photographs, model, exteriors, s)
         others = [i for i in range(len(photographs)) if i not in left_out]
-        starts = [ExteriorOrientation.from_array(e) for e in bundle.exteriors()[others]]
-        interior = InteriorOrientation.from_array(bundle.interior)
+        starts = [exteriors[i] for i in others]
         chosen = [photographs[i] for i in others]
-        rest = adjust_common_interior(sensor, testfield, chosen, interior, starts, s)
+        rest = adjust_common_interior(sensor, testfield, chosen, model, starts, s)
         more = {others[i]: reason for i, reason in rest.left_out.items()}
         return replace(rest, left_out=left_out | more)
     bundle, part, found, used, redundancy = _snooped(every, bundle, used, few, s)

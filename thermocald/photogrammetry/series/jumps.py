@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
-_CERTAIN = 36.0  # χ² with 6 degrees of freedom of a displacement, and of each further epoch's own
+_CERTAIN = 30.0  # χ² with 6 degrees of freedom of a displacement, and of each further one
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
 _RETURNS = 5.0  # χ² by which a return must explain the epochs better than a step that stays
-_BENDS = 10.0  # χ² that each column of a bend must explain
+_COLUMN = 10.0  # χ² that each column of a course must explain
 _FREEDOM = (0, 3, 5)  # epochs beyond a bend that its columns need
 _BESIDE = 5  # epochs around a change in which a step may be instead
 _TOGETHER = 0.7  # epochs between a bend and a step that may be between the same two epochs
@@ -199,7 +199,7 @@ def _find_displacement(
     # a heater is switched between two epochs: a step between them, too, hides a part of it
     apart = np.abs(at - np.array([[away.start or stays], [stays]]) + 0.5)
     edge = int(apart[:, bend].argmin())
-    together = price[bend] > 0 and apart[edge, bend] < _TOGETHER
+    together = bool(courses[bend, :, 0].any()) and apart[edge, bend] < _TOGETHER
     course = courses[apart[edge].argmin() if together else bend]
     estimator, k = np.linalg.pinv(np.column_stack([*shapes, course])), len(shapes)
     hat = course[np.isin(rows, away)] @ estimator[k:]
@@ -233,17 +233,21 @@ def _displacements(rows: Index, row: int) -> Iterator[tuple[range, int, list[Arr
 
 def _courses(rows: Index) -> tuple[Array, Array, Array]:
     """Return where the course of some epochs (n,) may bend (b,), its columns (b, n, 7), and the χ²
-    (b,) that the bend must explain; the last has none.
+    (b,) that these must explain beyond a straight line.
 
-    The course is a cubic on either side, with less freedom beside few epochs.
+    The course is a cubic on either side, with less freedom beside few epochs; the last but one has
+    no bend, and the last is a straight line.
     """
-    at = np.append(np.arange(rows[0], rows[-1], 0.1), rows[-1])
+    at = np.append(np.arange(rows[0], rows[-1], 0.1), [rows[-1]] * 2)
     beyond = (rows - at[:, None]) / SIDE
     beyond *= np.where(at < rows.mean(), -1.0, 1.0)[:, None]
     free = (beyond > 0).sum(axis=1)[:, None] > _FREEDOM
     powers = np.clip(beyond, 0.0, None)[..., None] ** [1, 2, 3] * free[:, None]
-    cubic = np.broadcast_to(np.vander((rows - rows.mean()) / SIDE, 4), (*beyond.shape, 4))
-    return at, np.concatenate([powers, cubic], axis=-1), _BENDS * free.sum(axis=1)
+    cubic = np.tile(np.vander((rows - rows.mean()) / SIDE, 4), (len(at), 1, 1))
+    cubic[-1, :, :2] = 0.0
+    price = _COLUMN * (free.sum(axis=1) + 2.0)
+    price[-1] = 0.0
+    return at, np.concatenate([powers, cubic], axis=-1), price
 
 
 def _explained(beyond: Array, left: Array, shapes: list[Array]) -> Array:

@@ -27,6 +27,7 @@ _LARGE = 5.0  # robust standard deviations of the change between neighbours; noi
 _CERTAIN = 30.0  # χ² with 6 degrees of freedom of a displacement, and of each further one
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
 _RETURNS = 5.0  # χ² by which a return must explain the epochs better than a step that stays
+_SWAYS = 40.0  # χ² of a return, as a mount that sways returns, too
 _COLUMN = 10.0  # χ² that each column of a course must explain
 _FREEDOM = (0, 3, 5)  # epochs beyond a bend that its columns need
 _BESIDE = 5  # epochs around a change in which a step may be instead
@@ -196,6 +197,8 @@ def _find_displacement(
     if found is None:
         return None
     away, stays, shapes = found
+    if not stays and least.min() - best < _SWAYS:
+        return None
     # a heater is switched between two epochs: a step between them, too, hides a part of it
     apart = np.abs(at - np.array([[away.start or stays], [stays]]) + 0.5)
     edge = int(apart[:, bend].argmin())

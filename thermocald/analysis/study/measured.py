@@ -29,7 +29,6 @@ from thermocald.thermal.thermometer import estimate_reading_noise
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
@@ -76,8 +75,9 @@ class MeasuredSeries:
     """The epochs with a result of one series of one camera.
 
     label: what the study treats as one camera; name: of the series; time_s (E,): s since the first
-    epoch of the series; thermometers: the first is the reference; values (E, 10): IOP; sds (E, 10): NaN if held fixed; sigma0, redundancy (E,); correlations (m, 10, 10): of the
-    IOP in the epochs' adjustments, a sample if the series is long; exterior: how the exterior
+    epoch of the series; thermometers: the first is the reference; values (E, 10): IOP; sds (E, 10):
+    NaN if held fixed; sigma0, redundancy (E,); correlations (m, 10, 10): of the IOP in the epochs'
+    adjustments, a sample if the series is long; exterior: how the exterior
     orientation was estimated; choice: why; without_result: {reason: epochs}; start_utc: s UTC of
     the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
     image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that

@@ -45,7 +45,6 @@ def year(epochs: int) -> MeasuredSeries:
         "rpi",
         Sensor(3280, 2464, 0.00112),
         "formula",
-        np.arange(epochs),
         time_s,
         (Thermometer("temperature", true, 0.05),),
         values,

@@ -50,7 +50,6 @@ class WarmUp:
             "camera": "nexus5",
             "sensor": NEXUS,
             "source": "formula",
-            "number": np.arange(n),
             "time_s": time_s,
             "thermometers": (Thermometer("temperature", temperature, self.thermometer_sd),),
             "values": values,

@@ -89,7 +89,7 @@ def test_a_temperature_without_information(warm_up, temperature, words):
 
 def test_gaps_are_reported_and_not_tested_across(warm_up):
     series, rows = warm_up()(), np.r_[0:60, 100:150]
-    names = ("number", "time_s", "values", "sds", "sigma0", "redundancy", "correlations")
+    names = ("time_s", "values", "sds", "sigma0", "redundancy", "correlations")
     t = series.thermometers[0]
     kept = {"thermometers": (replace(t, values=t.values[rows]),)}
     kept |= {name: getattr(series, name)[rows] for name in names}

@@ -29,8 +29,6 @@ from thermocald.thermal.thermometer import estimate_reading_noise
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
@@ -76,10 +74,10 @@ class Thermometer:
 class MeasuredSeries:
     """The epochs with a result of one series of one camera.
 
-    label: what the study treats as one camera; name: of the series; number (E,); time_s (E,): s
-    since the first epoch of the series; thermometers: the first is the reference; values (E, 10):
-    IOP; sds (E, 10): NaN if held fixed; sigma0, redundancy (E,); correlations (m, 10, 10): of the
-    IOP in the epochs' adjustments, a sample if the series is long; exterior: how the exterior
+    label: what the study treats as one camera; name: of the series; time_s (E,): s since the first
+    epoch of the series; thermometers: the first is the reference; values (E, 10): IOP; sds (E, 10):
+    NaN if held fixed; sigma0, redundancy (E,); correlations (m, 10, 10): of the IOP in the epochs'
+    adjustments, a sample if the series is long; exterior: how the exterior
     orientation was estimated; choice: why; without_result: {reason: epochs}; start_utc: s UTC of
     the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
     image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that
@@ -92,7 +90,6 @@ class MeasuredSeries:
     camera: str
     sensor: Sensor
     source: str
-    number: NDArray[np.int64]
     time_s: Array
     thermometers: tuple[Thermometer, ...]
     values: Array
@@ -210,7 +207,7 @@ def measured_series(
         thermometers.append(Thermometer(name, at_frames, noise))
     return MeasuredSeries(
         label, source.head.series, source.head.camera.name, source.head.camera.sensor, source.title,
-        table.number[ok], time_s - time_s[0], tuple(thermometers),
+        time_s - time_s[0], tuple(thermometers),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
         correlations(covariances), exterior, without_result, float(time_s[0]),
         "" if adjustment is None else adjustment.choice,

@@ -15,65 +15,51 @@ import numpy as np
 from thermocald.photogrammetry.linalg import inverse_of_determined, mad_sd
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
 
     Step = tuple[Array, Array]
     """A step (k,) of the pose and the weights (k, k) of what is known of it."""
 
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
-_CERTAIN = 6.0  # standard deviations of the step by the epochs around
-_CERTAIN_CHI2 = 36.0  # χ² with 6 degrees of freedom of a step beside a bend
-_BENT = 3.0  # standard deviations of the squares that straight lines leave
-_LASTING = 0.5  # share of the change that must remain
-_BESIDE = 5  # epochs between a step and a bend, within which either looks like the other
-SIDE = 8  # epochs before and after a jump that give its step
+_CERTAIN = 30.0  # χ² with 6 degrees of freedom of a displacement, and of each further one
+_SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
+_RETURNS = 5.0  # χ² by which a return must explain the epochs better than a step that stays
+_SWAYS = 40.0  # χ² of a return, as a mount that sways returns, too
+_COLUMN = 10.0  # χ² that each column of a course must explain
+_FREEDOM = (0, 3, 5)  # epochs beyond a bend that its columns need
+_BESIDE = 5  # epochs around a change in which a step may be instead
+_TOGETHER = 0.7  # epochs between a bend and a step that may be between the same two epochs
+SIDE = 8  # epochs before and after a gap that give its step
+_WINDOW = SIDE + 2  # epochs before and after a change that show what happened
+_BRIEF = SIDE - 1  # most epochs for which a mount is touched
 _MOST = 8  # jumps examined
 _ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from both
 _LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
 _EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
 _DRIFTS = 39.1  # χ² with 12 degrees of freedom, exceeded by chance in one of 10,000 series
-_TOUCHED = 10.0  # usual deviations from what the epochs before or after predict
-_BRIEF = 3  # epochs for which a mount may be touched
 _NEIGHBOURS = 5  # epochs on one side that predict an epoch
-_SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
-
-
-def _find_touches(trajectory: Array, scale: Array) -> Mask:
-    """Return the epochs (E,) in which the mount was elsewhere, as if touched.
-
-    trajectory, scale: as in `find_jumps`. An epoch next to an end is not examined.
-    """
-    before, after = _predictions(trajectory)
-    least = least_deviation(trajectory)
-    deviation = least / scale[:, None]
-    inside = slice(_NEIGHBOURS, len(trajectory) - _NEIGHBOURS)
-    usual = np.maximum(np.median(deviation[inside], axis=0), 1.0)
-    # a camera that suddenly drifts does not return
-    returns = np.abs(after - before) < _LASTING * least
-    touched = np.zeros(len(trajectory), dtype=bool)
-    touched[inside] = ((deviation > _TOUCHED * usual) & returns)[inside].any(axis=1)
-    return touched
 
 
 def find_jumps(
     trajectory: Array, M: Array, g: Array, scale: Array, gaps: Sequence[int]
-) -> tuple[Array, dict[int, Step], Array, Mask]:
+) -> tuple[Array, dict[int, Step], Array, dict[int, tuple[Array, float]]]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; scale
     (E,): noise of an epoch over the typical one, as a camera may defocus; gaps: the first epoch
-    after each gap. Returns the trajectory without any jumps, what is known of the mount's by their
-    epochs, the covariance (k, k) of a step in a gap that shows none, and the epochs (E,) in which
-    the mount was elsewhere, as if touched.
+    after each gap. Returns the trajectory without any jumps and touches, what is known of the
+    mount's jumps by their epochs, the covariance (k, k) of a step in a gap that shows none, and the
+    displacement (k,) of each epoch in which the mount was elsewhere, as if touched, with its
+    variance over an epoch's.
     """
     jumps: dict[int, Step]
     left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
     # in a gap the camera drifts, too: only the perspective shows how far the mount moved
     for row in gaps:
-        step, _ = _step(left, row)
+        step = _step(left, row)
         left[row:] -= step
         jumps[row] = np.zeros_like(step), _loose(step)
     for row, (moved, V) in zip(gaps, estimate_steps(M, g, jumps), strict=True):
@@ -83,45 +69,30 @@ def find_jumps(
     pair = np.hypot(scale[1:], scale[:-1])[:, None]
     change = _without_drift(np.diff(left, axis=0)) / pair
     noise = pair * np.maximum(mad_sd(change, axis=0), 1.0)
-    touches: list[tuple[slice, Array]] = []
+    touches: dict[int, tuple[Array, float]] = {}
     examined = {*gaps}
-    while len(examined) < _MOST + len(gaps) and len(left) >= 4 * SIDE:
+    while len(examined) < _MOST + len(gaps):
         every = np.diff(left, axis=0)
-        change = _without_drift(every)
-        size = np.where(_is_abrupt(every), np.abs(change) / noise, 0.0)
+        size = np.where(_is_abrupt(every), np.abs(_without_drift(every)) / noise, 0.0)
         for row in examined:
             size[row - 1] = 0.0
         worst = int(size.max(axis=1).argmax())
-        row, column = worst + 1, int(size[worst].argmax())
-        if size[worst, column] < _LARGE:
+        if size[worst].max() < _LARGE:
             break
-        examined.add(row)
-        step, factor = _step(left, row)
-        lasting = _step(left, row, 1)[0][column]  # a spike is no jump
-        certain = abs(step[column]) > _CERTAIN * noise[worst, column] * np.sqrt(factor / 2)
-        jumped = certain and abs(lasting) >= _LASTING * abs(change[worst, column])
+        examined.add(worst + 1)
         sds = noise[worst] / np.sqrt(2.0)
-        bend = _straight_bend(left, row, sds) if jumped else None
-        if bend is not None:  # which may be anywhere between the two epochs
-            variance = np.diag(factor * sds**2) + np.outer(bend, bend) / 12.0
-        else:
-            beside = _step_beside_bend(left, row, sds)
-            if beside is None:
-                continue
-            row, last, step, variance = beside
-            if last and _returns(left, row, last, step):
-                left[row:last] -= step
-                touches.append((slice(row, last), step))
-            if last or not jumped or row in jumps:
-                continue
-        left[row:] -= step
-        if jump := _find_mover(row, step, variance, M, g):
-            jumps[row] = jump
-    touched = _find_touches(left, scale)
-    for away, step in touches:
-        left[away] += step
-        touched[away] = True
-    return left, dict(sorted(jumps.items())), hidden, touched
+        found = _find_displacement(left, worst + 1, sds)
+        if found is None:
+            continue
+        away, there, variances, row, step, variance = found
+        for each, course, of_course in zip(away, there, variances, strict=True):
+            touches[each] = left[each] - course, 1.0 + float(of_course)
+            left[each] = course
+        if row and row not in jumps:
+            left[row:] -= step
+            if jump := _find_mover(row, step, variance, M, g):
+                jumps[row] = jump
+    return left, dict(sorted(jumps.items())), hidden, touches
 
 
 def estimate_steps(M: Array, g: Array, jumps: Mapping[int, Step]) -> list[tuple[Array, Array]]:
@@ -167,20 +138,13 @@ def least_deviation(trajectory: Array) -> Array:
     """Return how far each epoch of a trajectory (E, k) is from the parabola through those before it
     or after it, whichever is nearer: a spike is far from both, a kink from one.
     """
-    return np.asarray(np.nanmin(np.abs(trajectory - _predictions(trajectory)), axis=0))
-
-
-def _predictions(trajectory: Array) -> Array:
-    """Return each epoch (2, E, k) as predicted by the parabolas through the epochs before it and
-    after it, NaN near the ends.
-    """
     n = _NEIGHBOURS
     predict = np.linalg.pinv(np.vander(np.arange(1.0, n + 1), 3))[-1]  # at 0
     windows = np.lib.stride_tricks.sliding_window_view(trajectory, n, axis=0)
-    out = np.full((2, *trajectory.shape), np.nan)
-    out[0, n:] = windows[:-1] @ predict[::-1]
-    out[1, :-n] = windows[1:] @ predict
-    return out
+    predicted = np.full((2, *trajectory.shape), np.nan)
+    predicted[0, n:] = windows[:-1] @ predict[::-1]
+    predicted[1, :-n] = windows[1:] @ predict
+    return np.asarray(np.nanmin(np.abs(trajectory - predicted), axis=0))
 
 
 def _without_drift(change: Array) -> Array:
@@ -203,77 +167,107 @@ def _is_abrupt(change: Array) -> Mask:
     return np.asarray(np.abs(change - usual) > _ABRUPT * next_to)
 
 
-def _step(trajectory: Array, row: int, apart: int = 0) -> tuple[Array, float]:
-    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's.
-
-    apart: number of epochs on both sides that do not count.
-    """
+def _step(trajectory: Array, row: int) -> Array:
+    """Return the step (k,) of a straight line at an epoch."""
     t = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory))) - row
-    t = t[(t < -apart) | (t >= apart)]
-    estimator = np.linalg.pinv(np.column_stack([np.ones(len(t)), t, t >= 0]))[2]
-    return estimator @ trajectory[row + t], float(estimator @ estimator)
+    line = np.column_stack([np.ones(len(t)), t, t >= 0])
+    return np.asarray(np.linalg.pinv(line)[2] @ trajectory[row + t])
 
 
-def _straight_bend(trajectory: Array, row: int, sds: Array) -> Array | None:
-    """Return the change of the rates (k,) at an epoch before and after which a trajectory (E, k) is
-    straight; None if it is not, or if that change between two epochs may look like the step.
-
-    sds (k,): of an epoch.
-    """
-    rows = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory)))
-    u, after = rows - row + 0.5, rows >= row
-    lines, y = np.column_stack([u**0, u, after, u * after]), trajectory[rows] / sds
-    fit = np.linalg.pinv(lines) @ y
-    left, (step, rate) = y - lines @ fit, np.linalg.norm(fit[2:], axis=1)
-    freedom = left.size * (1.0 - 4.0 / len(rows))
-    straight = float((left**2).sum()) < freedom + _BENT * np.sqrt(2.0 * freedom)
-    return fit[3] * sds if straight and step > rate else None
-
-
-def _step_beside_bend(
+def _find_displacement(
     trajectory: Array, row: int, sds: Array
-) -> tuple[int, int, Array, Array] | None:
-    """Return the epoch near `row` at which a trajectory (E, k) steps, the one at which it returns
-    (0 if it stays), the step (k,) and its covariance (k, k); None if a bend alone explains it.
+) -> tuple[range, Array, Array, int, Array, Array] | None:
+    """Find how a trajectory (E, k) is displaced at about `row`: for some epochs, to stay, or both.
 
-    sds (k,): of an epoch. The course is a cubic on either side of the bend. A heater is switched
-    anywhere between two epochs: if the step is between them too, one hides a part of the other.
+    sds (k,): of an epoch. Returns the m epochs in which it was elsewhere, none if it stays; where
+    they would be without that (m, k), and its variances (m,) over an epoch's; the epoch from which
+    on it stays displaced, 0 if it returns; that step (k,) and its covariance (k, k). None if the
+    course alone explains it.
     """
-    rows = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory)))
-    t, y = (rows - row) / SIDE, trajectory[rows] / sds
-    at = np.arange(-_BESIDE, _BESIDE, 0.1)
-    after = np.clip(t - at[:, None] / SIDE, 0.0, None)
-    cubic = np.broadcast_to(np.vander(t, 4), (len(at), len(t), 4))
-    bends = np.concatenate([np.stack([after, after**2, after**3], axis=-1), cubic], axis=-1)
-    beyond = np.eye(len(t)) - bends @ np.linalg.pinv(bends)
-    spans = [(row + k, 0) for k in range(-_BESIDE, _BESIDE + 1)]
-    brief = range(1, _BRIEF + 1)
-    spans += [(row, row + m) for m in brief] + [(row - m, row) for m in brief]
-    steps = np.array([(rows >= a) & ~((rows >= b) & (b > 0)) for a, b in spans]).T.astype(float)
-    left, free = beyond @ y, beyond @ steps
-    least = (left**2).sum(axis=(1, 2))
-    gain = ((np.swapaxes(free, 1, 2) @ left) ** 2).sum(axis=2)
-    gain /= np.maximum((free**2).sum(axis=1), 1e-9)  # (bends, steps)
-    bend, k = np.unravel_index(int((least[:, None] - gain).argmin()), gain.shape)
-    if least.min() - least[bend] + gain[bend, k] < _CERTAIN_CHI2:
+    rows = np.arange(max(row - _WINDOW, 0), min(row + _WINDOW, len(trajectory)))
+    at, courses, price = _courses(rows)
+    beyond = np.eye(len(rows)) - courses @ np.linalg.pinv(courses)
+    left = beyond @ (trajectory[rows] / sds)
+    least = (left**2).sum(axis=(1, 2)) + price
+    best, found = least.min() - _CERTAIN, None
+    for away, stays, shapes, cost in _displacements(rows, row):
+        misfit = least + cost - _explained(beyond, left, shapes)
+        if misfit.min() < best:
+            best, bend, found = misfit.min(), int(misfit.argmin()), (away, stays, shapes)
+    if found is None:
         return None
-    first, last = spans[k]
-    apart = at - (first - row - 0.5)
-    together = abs(apart[bend]) < 0.7
-    model = np.column_stack([steps[:, k], bends[np.abs(apart).argmin() if together else bend]])
-    estimator = np.linalg.pinv(model)
-    step, rate = (estimator @ trajectory[rows])[:2]
-    variance = np.diag(estimator[0] @ estimator[0] * sds**2)
+    away, stays, shapes = found
+    if not stays and least.min() - best < _SWAYS:
+        return None
+    # a heater is switched between two epochs: a step between them, too, hides a part of it
+    apart = np.abs(at - np.array([[away.start or stays], [stays]]) + 0.5)
+    edge = int(apart[:, bend].argmin())
+    together = bool(courses[bend, :, 0].any()) and apart[edge, bend] < _TOGETHER
+    course = courses[apart[edge].argmin() if together else bend]
+    estimator, k = np.linalg.pinv(np.column_stack([*shapes, course])), len(shapes)
+    hat = course[np.isin(rows, away)] @ estimator[k:]
+    step, rate = (estimator @ trajectory[rows])[k - 1 : k + 1]
+    variance = np.diag(estimator[k - 1] @ estimator[k - 1] * sds**2)
     variance += together * np.outer(rate, rate) / (12.0 * SIDE**2)
-    return first, last, step, variance
+    return away, hat @ trajectory[rows], (hat**2).sum(axis=1), stays, step, variance
 
 
-def _returns(trajectory: Array, row: int, last: int, step: Array) -> bool:
-    """Test whether a trajectory (E, k) is where it was before a brief step (k,) from `row` on."""
-    t = np.r_[max(row - SIDE, 0) : row, last : min(last + SIDE, len(trajectory))] - last
-    shapes = np.column_stack([np.ones(len(t)), t, t**2, t >= 0])
-    stays = np.linalg.pinv(shapes)[3] @ trajectory[last + t]
-    return bool(np.linalg.norm(stays) < _LASTING * np.linalg.norm(step))
+def _displacements(rows: Index, row: int) -> Iterator[tuple[range, int, list[Array], float]]:
+    """Yield the displacements of some epochs (n,) at about `row`.
+
+    Each has the epochs elsewhere, the first that stays so or 0, the shapes (n,), and the χ² that it
+    must explain beyond that of a step.
+    """
+    inside = range(rows[0] + 1, rows[-1] + 1)
+    for stays in range(row - _BESIDE, row + _BESIDE + 1):
+        if stays in inside:
+            yield range(0), stays, [(rows >= stays).astype(float)], 0.0
+    for m in range(1, _BRIEF + 1):
+        for away in (range(row, row + m), range(row - m, row)):
+            if away.start not in inside or away.stop not in inside:
+                continue
+            each = [(rows == k).astype(float) for k in away]
+            for shapes in ([np.sum(each, axis=0)], each):
+                cost = _CERTAIN * (len(shapes) - 1)
+                yield away, 0, shapes, cost + _RETURNS
+                after = (rows >= away.stop).astype(float)
+                yield away, away.stop, [*shapes, after], cost + _SHOWN
+
+
+def _courses(rows: Index) -> tuple[Array, Array, Array]:
+    """Return where the course of some epochs (n,) may bend (b,), its columns (b, n, 7), and the χ²
+    (b,) that these must explain beyond a straight line.
+
+    The course is a cubic on either side, with less freedom beside few epochs; the last but one has
+    no bend, and the last is a straight line.
+    """
+    at = np.append(np.arange(rows[0], rows[-1], 0.1), [rows[-1]] * 2)
+    beyond = (rows - at[:, None]) / SIDE
+    beyond *= np.where(at < rows.mean(), -1.0, 1.0)[:, None]
+    free = (beyond > 0).sum(axis=1)[:, None] > _FREEDOM
+    powers = np.clip(beyond, 0.0, None)[..., None] ** [1, 2, 3] * free[:, None]
+    cubic = np.tile(np.vander((rows - rows.mean()) / SIDE, 4), (len(at), 1, 1))
+    cubic[-1, :, :2] = 0.0
+    price = _COLUMN * (free.sum(axis=1) + 2.0)
+    price[-1] = 0.0
+    return at, np.concatenate([powers, cubic], axis=-1), price
+
+
+def _explained(beyond: Array, left: Array, shapes: list[Array]) -> Array:
+    """Return the squares (b,) of what is `left` (b, n, k) beyond some courses that shapes explain.
+
+    beyond (b, n, n): projectors; shapes (n,): columns.
+    """
+    total: Array = np.zeros(len(left))
+    before: list[Array] = []
+    for shape in shapes:
+        free = beyond @ shape
+        for other in before:
+            free -= other * (other * free).sum(axis=1)[:, None]
+        free /= np.sqrt(np.maximum((free**2).sum(axis=1), 1e-9))[:, None]
+        before.append(free)
+        total += (np.einsum("bn,bnk->bk", free, left) ** 2).sum(axis=1)
+    return total
 
 
 def _find_mover(row: int, step: Array, variance: Array, M: Array, g: Array) -> Step | None:

@@ -233,10 +233,11 @@ def estimate_movement(
     pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
     pauses = _apart(pauses, len(rows), SIDE)
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
-    without_jumps, jumps, hidden, touched = find_jumps(trajectory, M, g, scale, pauses)
-    trajectory = _fill(without_jumps, touched)
+    trajectory, jumps, hidden, touches = find_jumps(trajectory, M, g, scale, pauses)
     steps = estimate_steps(M, g, jumps)
-    drift = find_drift(M * ~touched[:, None, None], g * ~touched[:, None])
+    touched = list(touches)
+    M[touched], g[touched] = 0.0, 0.0
+    drift = find_drift(M, g)
     # what the free parameters do not follow is the mount's, however slow
     found = [
         _separate(trajectory, axes[:, part], alike[part], *how)
@@ -259,15 +260,14 @@ def estimate_movement(
         (slow_course(len(good), row), back @ step, back @ V @ back.T)
         for row, (step, V) in zip(first, steps, strict=True)
     ]
-    away = without_jumps - trajectory
-    for row in np.flatnonzero(touched):  # all of it the mount's, as of what trembles
+    for row, (away, variance) in touches.items():  # all of it the mount's, as of what trembles
         there = (np.arange(len(good)) == rows[row]).astype(float)
-        variance = _FILLED * scale[row] ** 2 + (_AMISS * np.linalg.norm(away[row])) ** 2
-        moved.append((there, back @ away[row], variance * (back @ back.T)))
+        variance = variance * scale[row] ** 2 + (_AMISS * np.linalg.norm(away)) ** 2
+        moved.append((there, back @ away, variance * (back @ back.T)))
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
         first, tuple(moved), back @ hidden @ back.T,
-        back @ drift @ back.T, tuple(rows[touched].tolist()),
+        back @ drift @ back.T, tuple(rows[sorted(touched)].tolist()),
     )  # fmt: skip
 
 

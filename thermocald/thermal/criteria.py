@@ -20,6 +20,7 @@ GROSS = 4.5  # sd of a residual from its neighbours in time: 7 in 10⁶ by chanc
 SPIKE = 7.0  # the same before any adjustment, relative to the neighbours' median
 GROSS_OF_MEAN = 6.0  # sd from the median of the epochs of a short mean
 BRIEF, TOUCH = 3, 2.0  # epochs of a touch; times the changes around it, which heat exceeds by 1.2
+SELDOM = 0.05  # share of the epochs that may be touched
 LEAP = 10.0  # times the usual squared deviation of an epoch from its neighbours
 
 # -- noise -------------------------------------------------------------------------------------

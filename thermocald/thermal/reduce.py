@@ -200,6 +200,7 @@ def find_touches(movement: Array) -> Mask:
 
     movement (E, m): in units of its noise. The camera leaves and is back after at most
     `criteria.BRIEF` epochs, both by far more than the epochs around move; what heat moves does not.
+    What happens often is no touch.
     """
     touched = np.zeros(len(movement), dtype=bool)
     changes = np.diff(movement, axis=0)
@@ -218,7 +219,8 @@ def find_touches(movement: Array) -> Mask:
         found = leaps > criteria.TOUCH * np.maximum(usual, np.sqrt(2.0 * movement.shape[1]))
         for first in np.flatnonzero(found & back) + _AROUND + 1:
             touched[first : first + brief] = True
-    return touched
+    often = touched.sum() > max(criteria.BRIEF, criteria.SELDOM * len(touched))
+    return np.zeros_like(touched) if often else touched
 
 
 _MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image's points

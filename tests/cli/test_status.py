@@ -13,6 +13,7 @@ import pytest
 from thermocald.analysis.online.observer import Equilibrium
 from thermocald.cli import run
 from thermocald.cli.run import WIDTH, status_lines
+from thermocald.daemon.live_state import status_warnings
 
 LONG = "/srv/recordings/2026/under-the-old-bridge/second-arch/thermocald-left-bank.db"
 
@@ -33,9 +34,9 @@ def camera(**changes):
     }  # fmt: skip
 
 
-def document():
+def document(**changes):
     gone = camera(status="too_few", reason=f"only 3 targets are found in the frame {LONG}/17.jpg")
-    return {
+    status = {
         "version": "0.1.0", "pid": 30190, "utc": 1e9 + 95.0, "started": 1e9, "age_s": 0.4,
         "stalled": [], "sessions": {}, "clock": {"trusted": False}, "frames": {"paused": ""},
         "store": {"state": "waiting", "why": f"{LONG}: database or disk is full", "waiting": 3,
@@ -48,8 +49,9 @@ def document():
                 "why": "/sys/bus/w1/devices/28-000000bfe244/temperature is gone since 12:04",
             },
         },
-        "outputs": {},
+        "outputs": {}, **changes,
     }  # fmt: skip
+    return status | {"warnings": status_warnings(status)}
 
 
 def test_status_fits_into_80_columns_and_breaks_no_path():
@@ -71,7 +73,7 @@ def test_status_fits_into_80_columns_and_breaks_no_path():
 
 def test_a_disk_nearly_full_is_told_in_words():
     """It was `store: results_only:  (0 epochs wait)`."""
-    little = document() | {"store": {"state": "results_only", "why": "", "waiting": 0, "lost": 0}}
+    little = document(store={"state": "results_only", "why": "", "waiting": 0, "lost": 0})
     assert "! store: its disk is nearly full: results are stored" in "\n".join(status_lines(little))
 
 

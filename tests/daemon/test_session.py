@@ -74,6 +74,15 @@ def test_a_device_that_gives_nothing_is_told_before_it_begins(session, daemon, d
         assert store.all_series() == []
 
 
+def test_it_pauses_while_the_phone_is_away(session):
+    gone = [{"kind": "unplugged", "at_s": 3.0, "for_s": 2.0}]
+    process = session("--epochs", "16", "--no-report", "--no-check", camera=gone)
+    told = process.said()
+    assert process.returncode == 0, told
+    assert "paused: " in told
+    assert "the camera is back" in told
+
+
 def test_wrong_usage_is_one_line(session):
     process = session("--camera", "nobody")
     told = process.said()

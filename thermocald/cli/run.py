@@ -301,8 +301,6 @@ _SILENT_S = 30.0  # as for the page's /healthz
 
 def status_lines(document: dict[str, Any]) -> list[str]:
     """Return a `thermocald-status/1` document as lines; the first is the headline."""
-    from thermocald.daemon.live_state import status_warnings
-
     running = duration(max(0.0, document["utc"] - document["started"]))
     headline = f"thermocald {document['version']}, pid {document['pid']}, for {running}"
     if (age := document["age_s"]) > _OLD_S:
@@ -320,7 +318,7 @@ def status_lines(document: dict[str, Any]) -> list[str]:
     wide = max((len(name) for name, _ in others), default=0)
     for name, device in others:
         lines += _wrapped(f"{name:<{wide}}  {_device(device)}", wide + 2)
-    lines += [part for text in status_warnings(document) for part in _wrapped(f"! {text}")]
+    lines += [part for text in document["warnings"] for part in _wrapped(f"! {text}")]
     return lines
 
 

@@ -65,20 +65,18 @@ def take_on_the_desk(
         say(f"series {session.series} has {done} epochs; {epochs - done} are still to be taken")
     set_up_logging("warning")
     # the session's devices alone; the camera has no other series to return to
-    camera = next(c for c in config.cameras if c.name == session.camera)
-    used = [t for t in config.thermometers if t.name in camera.thermometers]
-    chosen = camera.model_copy(update={"series": None})
+    own = next(c for c in config.cameras if c.name == session.camera)
+    used = [t for t in config.thermometers if t.name in own.thermometers]
+    chosen = own.model_copy(update={"series": None})
     config = config.model_copy(update={"cameras": (chosen,), "thermometers": tuple(used)})
     follower = Follower(session, say, watch, done)
 
     def turn(service: Service) -> bool:
         one = service.sessions.status()[session.camera]
-        station = service.station
-        links = [line.link for line in station.cameras]
-        if one["state"] in ("checking", "refused"):
-            links += station.thermometers.links.values()
-        for link in links:
-            if link.state == "failed" or (link.state == "out" and one["state"] != "running"):
+        camera, links = service.station.cameras[0], service.station.thermometers.links
+        checks = camera.run is None and one["state"] not in ("done", "stopped")
+        for link in (camera.link, *(links.values() if checks else ())):
+            if link.state == "failed" or (link.state == "out" and checks):
                 raise DeviceError(f"{link.called}: {link.why}")
         return follower.follow(one)
 

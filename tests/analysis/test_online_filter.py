@@ -79,6 +79,21 @@ def test_no_alarm_over_a_warm_up():
         assert all(take(0.35 * max(k - 20, 0)).change == "" for k in range(60))
 
 
+@pytest.mark.parametrize("readings_end", [20, 1000])
+@pytest.mark.parametrize("every", [1, 12])
+def test_a_camera_that_warms_while_its_thermometer_is_not_read_did_not_slip(every, readings_end):
+    """The last reading counted as the camera's temperature, and its warming as a slip."""
+    camera, events = Surveyed(0.0, 5), []
+    observer = OnlineObserver(camera.sensor, camera.field, lambda *a: events.append(a))
+    for k in range(60):
+        seen, result = camera.epoch(0.35 * k)
+        at = k - k % every
+        reading = 25.0 + 0.35 * at if k < readings_end else np.nan
+        epoch = Epoch(k, 10.0 * k, 10.0 * at, {"temperature": reading}, None, seen)
+        observer.observe(CalibratedEpoch(epoch, result, {}))
+    assert not events
+
+
 def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
     found, take = Surveyed(0.0, 2).filter()
     for _ in range(20):

@@ -195,7 +195,7 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         (("correct", "{elsewhere}", "--log", "{M1}/epochs.csv"), "of another camera, or binned"),
         (("correct", "{no_y}", "--log", "{M1}/epochs.csv"), "no column 'y'"),
         (("correct", "{five}", "--log", "{M1}/epochs.csv"), "line 2: column x: 'five' is not a n"),
-        (("correct", "{points}", "--log", "{one_reading}"), "1 reading"),
+        (("correct", "{points}", "--log", "{one_reading}"), "readings at 1 time"),
         (("correct", "{points}", "--log", "{backwards}"), "outside the temperature log"),
         (("correct", "{points}", "--log", "{no_time}"), "rows with a time"),
         (("predict",), "give one of"),

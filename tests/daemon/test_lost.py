@@ -81,6 +81,7 @@ def test_a_refused_row_is_lost_for_everybody(guard, path, tmp_path, refusal, mon
         "frames": {"paused": ""}, "sessions": {}, "age_s": 0.0, "utc": 1.0, "started": 0.0,
         "version": "0",
     }  # fmt: skip
+    document["warnings"] = status_warnings(document)
     assert any("1 epoch lost" in text for text in status_warnings(document))
     assert "thermometer air: slow" in status_warnings(document)
     monkeypatch.setattr("thermocald.cli.run.read_status", lambda *_: document)

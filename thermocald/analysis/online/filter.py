@@ -164,7 +164,8 @@ _ALPHA = 1e-6  # error probability of one test
 _HISTORY, _FEWEST = 100, 10  # epochs that show how much a camera usually moves
 _USUAL, _BEYOND = 0.9, 3.0  # quantile of their chi-squares, and the multiple of it for an event
 _RATE_SD_PX = 5.0  # prior sd of the rates per kelvin
-_UNKNOWN_STEP = 0.3  # K from epoch to epoch without a thermometer
+# K/s and K from epoch to epoch without a reading of its own, unless it changed faster before
+_UNKNOWN_RATE, _UNKNOWN_STEP = 0.03, 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,31 +224,37 @@ class OnlineFilter:
         self.T0 = self.last_temperature = temperature
         self._readings, self._warmed = 1, False
         self._rise = self._rise_variance = 0.0
+        self._rate = self._unread_s = 0.0  # K/s between the last two readings; since the last, s
         self.epochs, self._surprised = 1, 0
 
     def update(
         self, adjustment: Adjustment, temperature: float, errors: tuple[Array, Array],
-        tremble: Array | None = None,
+        tremble: Array | None = None, elapsed_s: float = 10.0,
     ) -> Innovation:  # fmt: skip
         """Update the estimate with an epoch that has a result.
 
-        temperature: °C at the frame; for NaN the last one is used; errors: noise (16, 16) and
+        temperature: °C at the frame, NaN if it has no reading of its own: the camera then is where
+        it was, as uncertain as its temperature may have changed; errors: noise (16, 16) and
         influence of the common errors, from `FieldErrors.split`; tremble (6, 6): covariance of the
-        mount's movements about its mean, from the epochs so far.
+        mount's movements about its mean, from the epochs so far; elapsed_s: since the last epoch.
         """
         free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         if not self.epochs or not np.array_equal(free, self._free):
             self._start(adjustment, errors, free, temperature, tremble)
             return Innovation(0.0, 0.0, len(free), "")
-        before = self._rise
-        if not np.isnan(temperature):
+        before, unknown = self._rise, 0.0
+        self._unread_s += elapsed_s
+        if np.isnan(temperature):
+            unknown = max(self._rate * elapsed_s, min(_UNKNOWN_RATE * elapsed_s, _UNKNOWN_STEP))
+        else:
             self._read(temperature)
-        unknown = _UNKNOWN_STEP if np.isnan(self.T0) else 0.0
-        step = np.hypot(self._rise - before, unknown)
+            self._rate = abs(self._rise - before) / max(self._unread_s, 1e-3)
+            self._unread_s = 0.0
+        step = np.hypot((self._rise - before) * _LAG, unknown)
         n, warm = len(free), self._warm
         wander = _WANDER_PX * self.sensor.pixel_pitch
         self._P[warm, warm] += (wander / self._scale[warm]) ** 2
-        self._P[:n, :n] += self._rate_moment() * (step * _LAG) ** 2
+        self._P[:n, :n] += self._rate_moment() * step**2
         z = (adjustment.values - self._held)[self._free] / self._scale[:n]
         R, K = self._scaled(errors)
         R += self._rate_moment() * self._rise_variance

@@ -234,6 +234,7 @@ class OnlineObserver:
         self._rejected: Counter[int] = Counter()
         self._reported: set[int] = set()
         self._equilibrium = Equilibrium("unknown")
+        self._last = math.inf, math.nan  # times of frame and reading of the last epoch
 
     def observe(
         self, calibrated: CalibratedEpoch, adjusted: Adjustment | None = None,
@@ -246,11 +247,16 @@ class OnlineObserver:
         field_variance: factor of the stated covariance of the field.
         """
         epoch, adjustment = calibrated.epoch, adjusted or calibrated.adjustment
-        temperature = next(iter(epoch.temperatures.values()), math.nan)
         if not adjustment.ok or epoch.observations is None:
             return {}
+        temperature = next(iter(epoch.temperatures.values()), math.nan)
+        at, read_at = self._last
+        if epoch.temperature_time == read_at:  # a slow thermometer: the reading of another epoch
+            temperature = math.nan
+        self._last = epoch.frame_time, epoch.temperature_time
+        elapsed_s = max(epoch.frame_time - at, 0.0)
         errors = self._errors.split(adjustment, epoch.observations, field_variance)
-        innovation = self.filter.update(adjustment, temperature, errors, tremble)
+        innovation = self.filter.update(adjustment, temperature, errors, tremble, elapsed_s)
         self._watch_targets(calibrated, adjustment)
         event = innovation.change if innovation.change in _SENTENCES else ""
         if event:

@@ -103,7 +103,7 @@ def read_log(
         notes.append(f"log: {time_names[0]!r} holds days since 1899-12-30, as of a spreadsheet")
     times = table.times
     if (different := len(np.unique(times))) < 2:
-        raise DataError(f"{path}: holds {counted(different, 'time')}; at least two are needed")
+        raise DataError(f"{path}: has readings at {counted(different, 'time')}; two are needed")
     steps = np.diff(times)
     if not table.labels and steps.max() > 0 and (back := np.flatnonzero(steps < 0) + 1).size:
         row = int(back[0])

@@ -92,6 +92,8 @@ def test_a_store_and_its_recording_are_the_same_series(inside, short):
         tc.open("thermocald.db", "M7")
     with pytest.raises(StoreError, match="does not exist"):
         tc.open("nowhere")
+    with pytest.raises(StoreError, match="is no store; give a recording's folder or a store"):
+        tc.open("M1/epochs.csv")
 
 
 def test_photographs_become_a_series(inside, tmp_path):

@@ -111,6 +111,8 @@ def test_a_board_is_as_large_as_the_paper_allows():
         (("--chessboard", "8x6"), "looks the same"),
         (("--chessboard", "9by6"), "COLUMNSxROWS"),
         (("--chessboard", "9x6", "--aprilgrid", "6x6"), "one board at a time"),
+        (("--chessboard", "9x6", "--marker", 20), "a chessboard has no tags"),
+        (("--aprilgrid", "6x6", "--square", 20), "that of its tags"),
         (("--charuco", "11x8", "--dictionary", "DICT_4X4_50", "--paper", "A0", "--marker", 99),
          "smaller than squares"),
         (("--charuco", "12x12", "--dictionary", "DICT_4X4_50", "--paper", "A0"), "50 markers"),

@@ -68,6 +68,10 @@ def _board(
             raise UsageError("--square, --marker: give --charuco, --chessboard or --aprilgrid too")
         return None
     kind, counts = given[0]
+    if kind == "chessboard" and marker:
+        raise UsageError("--marker: a chessboard has no tags")
+    if kind == "aprilgrid" and square:
+        raise UsageError("--square: the size of an AprilGrid is that of its tags: --marker")
     columns, rows = two_numbers(f"--{kind}", counts, "COLUMNSxROWS, up to 1000, such as 9x6", 1000)
     return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
 

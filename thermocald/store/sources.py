@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
     from thermocald.store.series import SeriesReader, StoredSeries
 
+_NO_STORES = (".csv", ".parquet", ".yaml", ".yml", ".json", ".zip")  # files of a recording, …
+
 
 def open_source(source: Path) -> SeriesReader:
     """Open a store to read corrected times: a file, or `postgresql://…?camera=…&series=…`.
@@ -42,6 +44,8 @@ def open_source(source: Path) -> SeriesReader:
     else:
         from thermocald.store.database.store import Store
 
+        if source.suffix.lower() in _NO_STORES and source.is_file() and not is_database(source):
+            raise StoreError(f"{shown(source)}: is no store; give a recording's folder or a store")
         opened = Store.open(source)
     opened.corrected = True
     return opened

@@ -61,7 +61,9 @@ class TestField:
             raise TestFieldError(f"a test field of {n} targets has columns of shapes {shapes}")
         if len(set(self.names)) != n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
-            raise TestFieldError(f"target {twice!r} is duplicated in the test field")
+            raise TestFieldError(
+                f"{twice!r} is given twice; each target or control point needs its own name"
+            )
         first: dict[str, str] = {}
         for name, code in zip(self.names, self.codes, strict=True):
             if code and (other := first.setdefault(code, name)) != name:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Self
@@ -136,8 +136,10 @@ class Store(SeriesReader):
         They are read in pages, so that no statement is open while another thread may close the
         file: SQLite's library crashes if a connection is closed during a statement.
         """
-        whole = not first and last is None
-        missing, following, more = 0, 1, True
+        missing, following, more, end = 0, 1, True, 0
+        if whole := not first and last is None:
+            with suppress(StoreError):  # of a damaged store, the epochs tell
+                end = self.last_epoch(series) or 0  # first: a daemon may write while this reads
         while more:
             page: list[StoredEpoch] = []
             try:
@@ -153,10 +155,10 @@ class Store(SeriesReader):
                 missing += max(0, stored.epoch.number - following)
                 first = following = stored.epoch.number + 1
                 yield stored
-        if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - following)):
+        if whole and (missing := missing + max(0, end + 1 - following)):
             log.warning(
-                "%s: %d epochs of series %s are missing; `thermocald check` lists them",
-                self.path, missing, series.name,
+                "%s: lacks %s of series %s; `thermocald check` lists what is missing",
+                self.path, counted(missing, "epoch"), series.name,
             )  # fmt: skip
 
     def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:

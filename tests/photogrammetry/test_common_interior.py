@@ -187,7 +187,8 @@ def test_few_points_of_an_uncertain_field_are_not_rejected_by_turns(shared, tmp_
     names = [path.name for path in paths]
     r = calibrate_observations(names, seen, {}, field, camera, AdjustmentSettings())
     assert r.status == "weak_geometry"
-    assert "the principal distance is known to" in r.reason
+    weak = ("the principal distance is known to", "the photographs hardly determine the camera")
+    assert any(text in r.reason for text in weak)
 
 
 def test_gross_errors_are_rejected():

@@ -30,8 +30,9 @@ def carried_by_c(share: float, changes: Mapping[str, tuple[float, float]]) -> di
 class Course:
     """One parameter over a series, in its own unit.
 
-    mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
-    of a straight line from the first to the last epoch, with sd_change; p: p-value of no change,
+    mean; scatter: standard deviation over the epochs, and sd: stated by the adjustments, RMS, both
+    without epochs in which the mount was touched; change: of a straight line from the first to the
+    last epoch, with sd_change; p: p-value of no change,
     corrected for the number of parameters; drifts: p below 1 %, with and without any single group
     of targets; rests_on: the group without which there would be no drift; per_kelvin,
     sd_per_kelvin, p_temperature: slope on the reference temperature, its standard deviation and

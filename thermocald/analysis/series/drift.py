@@ -19,6 +19,7 @@ from thermocald.analysis.series.course import LEVEL, Course
 from thermocald.analysis.statistics.dependence import dependence, holm, slope_noise
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
+from thermocald.photogrammetry.series.mount import STILL
 from thermocald.photogrammetry.series.target_noise import slow_errors
 from thermocald.thermal.thermometer import estimate_reading_noise
 
@@ -61,6 +62,9 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     found, ok = [], table.ok
     time = table.frame_time[ok]
     slow = table.slow_between_ends
+    movement = STILL if table.adjustment is None else table.adjustment.movement
+    # an epoch in which the mount was touched is as uncertain as many others together
+    still = ~np.isin(np.flatnonzero(ok), () if table.sampled is not None else movement.touched)
     for name in names:
         column = IOP_NAMES.index(name)
         values, sds = table.values[ok, column], table.sd[ok, column]
@@ -77,8 +81,8 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         if tilt_sd > 0:
             p = max(p, _p_value(float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t))), tilt_sd))
         line = Course(
-            name, float(values.mean()), float(values.std(ddof=1)),
-            float(np.sqrt(np.mean(sds**2))), slope * span,
+            name, float(values.mean()), float(values[still].std(ddof=1)),
+            float(np.sqrt(np.mean(sds[still] ** 2))), slope * span,
             float(np.hypot(sd_slope * span, tilt_sd)), min(1.0, p), drifts=False,
             last_minus_first=float(values[-1] - values[0]),
             sd_last_minus_first=float(np.sqrt(sds[-1] ** 2 + sds[0] ** 2 + slow[column])),

@@ -69,6 +69,7 @@ _FEWEST_TO_COMPARE = 3  # photographs
 _LEAST_SHARE = 1e-6  # of the largest eigenvalue, below which an error is absorbed altogether
 _DISAGREE = 3.0  # standard deviations of the ratio of two variances
 _ITERATIONS = 60
+_AS_STATED = 2.0  # residuals in their sigmas: larger ones have another cause than weak geometry
 _WIDEST = 3.0  # the factor for a variance from hardly any degree of freedom
 _CONTROLLED = 1e-3  # cofactor of a residual below which no other observation controls it
 
@@ -246,10 +247,13 @@ class BundleAdjustment:
         else:
             if self.known is not None and not robust:
                 size = np.sqrt(np.mean(v * v))
+                why = "is it one camera with one focus, and a field that does not bend? If so, "
+                if size < _AS_STATED:
+                    why = "the photographs hardly determine the camera; "
                 raise GeometryError(
                     f"the adjustment did not converge in {iterations} iterations; residuals are "
-                    f"{size:.1f} times their sigmas: is it one camera with one focus, and a field "
-                    "that does not bend? If so, take more photographs, some of them oblique"
+                    f"{size:.1f} times their sigmas: {why}take more photographs, some of them "
+                    "oblique"
                 )
         # orthonormal to the last bit
         U, _, Vt = np.linalg.svd(bundle.rotations)

@@ -145,25 +145,32 @@ def _has_twin(
 ) -> bool:
     """Return whether a pose apart from the found one fits nearly as well.
 
-    earlier: a pose; then only one that is nearer to it counts.
+    earlier: a pose; then only one that is nearer to it counts, none if the found one is the same.
     """
     here, Q = pose.values[EOP][3:], pose.covariance[EOP, EOP][3:, 3:]
 
     def is_apart(centre: Array) -> bool:
         apart = centre - here
-        far = bool(apart @ np.linalg.solve(Q, apart) > _APART)
-        if earlier is None or not far:
-            return far
+        return bool(apart @ np.linalg.solve(Q, apart) > _APART)
+
+    if earlier is not None and not is_apart(earlier.centre):
+        return False
+
+    def counts(centre: Array) -> bool:
+        if not is_apart(centre):
+            return False
+        if earlier is None:
+            return True
         away, kept = (np.linalg.norm(one - earlier.centre) for one in (centre, here))
         return bool(away < kept)
 
     seen = observations.select(~np.isin(observations.targets, pose.rejected))
     worst = pose.sigma0**2 * pose.redundancy + _FITS * max(pose.sigma0**2, 1.0)
     for start in possible_poses(sensor, interior, control.points[seen.targets], seen.points):
-        if is_apart(start.centre):
+        if counts(start.centre):
             other = adjust(sensor, control, seen, interior, start, settings, None, covariance)
             fits = other.ok and other.sigma0**2 * other.redundancy < worst
-            if fits and is_apart(other.values[EOP][3:]):
+            if fits and counts(other.values[EOP][3:]):
                 return True
     return False
 

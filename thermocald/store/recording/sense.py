@@ -216,7 +216,8 @@ def find_unit_change(times: Array, values: Array) -> tuple[int, str] | None:
         ):
             allowed, possible = far, True
             if "F" in words:
-                allowed, possible = (far, high.min() > TOO_HOT_C) if paused else (near, True)
+                allowed = far if paused else near
+                possible = not paused or bool(high.min() > TOO_HOT_C)
             elif "tenths" in words:
                 possible = bool(np.any(low % 1) and not np.any(high % 1))
             if possible and abs(after[0] - factor * before[-1] - zero) < allowed:

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from thermocald.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+    from concurrent.futures import Future, ProcessPoolExecutor
 
     State = TypeVar("State")
     Item = TypeVar("Item")
@@ -43,6 +41,8 @@ def in_order(
         for item in items:
             yield work(state, item)
         return
+    from concurrent.futures.process import BrokenProcessPool
+
     with processes(jobs, _begin, (work, state)) as pool:
         waiting: deque[Future[Any]] = deque()
         try:
@@ -69,6 +69,9 @@ def processes(
 
     They are not forked: the threads of OpenCV and of linear algebra do not survive a fork.
     """
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context  # 1 MB that a daemon does without
+
     return ProcessPoolExecutor(jobs, get_context("spawn"), begin, given)
 
 

@@ -12,7 +12,6 @@ import errno
 import importlib
 import math
 import re
-import ssl
 import threading
 import time
 from concurrent.futures import Future
@@ -151,6 +150,8 @@ def reason(error: BaseException) -> str:
     cause = cause if isinstance(cause, BaseException) else error
     if isinstance(cause, TimeoutError):
         return "no answer in time"
+    import ssl  # 1 MB that most daemons do without
+
     if isinstance(cause, ssl.SSLCertVerificationError):
         return f"its certificate is not trusted: {cause.verify_message}"
     if isinstance(cause, OSError) and cause.errno is not None and cause.strerror:

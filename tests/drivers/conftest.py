@@ -1,10 +1,25 @@
-"""The adb server on loopback for several modules, which add its phones."""
+"""The bench of a test's driver, and an adb server for several modules, which add its phones."""
 
 from __future__ import annotations
 
 import pytest
 
 from tests.drivers.fakes.adb_server import AdbServer, wait_little
+from tests.drivers.laboratory import LABORATORY
+
+
+@pytest.fixture
+def driver(request):
+    """The (kind, name) under test: the module's DRIVER, or a parameter."""
+    return request.module.DRIVER
+
+
+@pytest.fixture
+def bench(driver, tmp_path, monkeypatch):
+    """The bench of one driver; a driver without one fails."""
+    with LABORATORY[driver](tmp_path, monkeypatch) as one:
+        one.driver = driver
+        yield one
 
 
 @pytest.fixture(scope="module")

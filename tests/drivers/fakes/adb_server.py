@@ -11,7 +11,6 @@ import io
 import re
 import socket
 import struct
-import threading
 import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -35,27 +34,37 @@ def wait_little(monkeypatch) -> None:
     monkeypatch.setattr(adbutils._adb, "time", SimpleNamespace(sleep=lambda _: None))
 
 
-def photograph(
-    when: float, *, iso=100, distance=None, subsecond="250", size=(96, 64), zone=None, zoom=None
-) -> bytes:
+TAGS = {"iso": 0x8827, "distance": 0x9206, "subsecond": 0x9291, "zone": 0x9011, "zoom": 0xA404}
+FOCUS = """  android.lens.focusDistance (80007): float[1]
+        [0.25 ]
+"""
+
+
+def photograph(when: float, size=(96, 64), **stated) -> bytes:
     """Return a JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
     image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
     tags = Image.Exif()
     sub = tags.get_ifd(0x8769)
-    sub[0x829A], sub[0x8827] = 1 / 60, iso
+    sub[0x829A] = 1 / 60
     sub[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(when))
-    if subsecond is not None:
-        sub[0x9291] = subsecond
-    if zone is not None:
-        sub[0x9011] = zone
-    if zoom is not None:
-        sub[0xA404] = zoom
-    if distance is not None:
-        sub[0x9206] = distance
-    tags[0x010F], tags[0x0110] = "Acme", "Phone 4a"
+    usual = {"iso": 100, "distance": 1.5, "subsecond": f"{int(when % 1 * 1000):03d}"}
+    for name, value in (usual | stated).items():
+        if value is not None:
+            sub[TAGS[name]] = value
     out = io.BytesIO()
     image.save(out, "JPEG", quality=95, exif=tags)
     return out.getvalue()
+
+
+def shoot(count=1, writing_s=0.0, **stated) -> Callable[[FakePhone], None]:
+    """Return a camera app that writes `count` photographs per trigger."""
+
+    def write(phone: FakePhone) -> None:
+        for k in range(count):
+            name = f"IMG_{len(phone.files):04d}_{k}.jpg"
+            phone.add(name, photograph(phone.now(), **stated), writing_s)
+
+    return write
 
 
 @dataclass
@@ -71,12 +80,13 @@ class FakePhone:
     stays_locked: bool = False
     free_kb: int = 5_000_000
     trigger: str = "input keyevent 27"
-    shoot: Callable[[FakePhone], None] | None = None
+    shoot: Callable[[FakePhone], None] | None = field(default_factory=shoot)
+    state: str = "device"
     battery: str = "  voltage: 4100\n  temperature: 287\n"
     thermal: str = ""
     zones: str = ""
-    media_camera: str = ""
-    hang: threading.Event | None = None
+    media_camera: str = FOCUS
+    hang_s: float = 0.0
     cut_transfer: bool = False
     load: bool = False
     commands: list[str] = field(default_factory=list)
@@ -135,12 +145,6 @@ class AdbServer(LineServer):
         self.listing: str | None = None
         super().__init__("adb")
 
-    def close(self) -> None:
-        for phone in self.phones.values():
-            if phone.hang is not None:
-                phone.hang.set()
-        super().close()
-
     def _serve(self, line: socket.socket) -> None:
         with line, contextlib.suppress(OSError, ValueError, struct.error):
             self._host(line)
@@ -150,7 +154,7 @@ class AdbServer(LineServer):
         if request == "host:version":
             _block(line, "0029")
         elif request == "host:devices":
-            mine = "".join(f"{serial}\tdevice\n" for serial in self.phones)
+            mine = "".join(f"{serial}\t{p.state}\n" for serial, p in self.phones.items())
             _block(line, mine if self.listing is None else self.listing)
         elif match := re.fullmatch(r"host-serial:(.*):features", request):
             if self._phone(line, match[1]):
@@ -166,11 +170,9 @@ class AdbServer(LineServer):
         if phone is None:
             text = f"device '{serial}' not found"
             line.sendall(b"FAIL" + f"{len(text):04x}{text}".encode())
-        elif phone.hang is not None:
-            phone.hang.wait()
-        else:
-            return phone
-        return None
+            return None
+        time.sleep(phone.hang_s)
+        return phone
 
     def _device(self, line: socket.socket, phone: FakePhone) -> None:
         request = _request(line)

@@ -93,9 +93,7 @@ def script(tmp_path, monkeypatch):
     hook.write_text("#!/bin/sh\ncat > /dev/null\n")
     hook.chmod(0o755)
     options = {"command": [str(hook)], **WHEN, "timeout_s": 5}
-    yield Bench(
-        options, lambda: hook.rename(away), lambda: away.rename(hook), gone=DeviceNotFound
-    )
+    yield Bench(options, lambda: hook.rename(away), lambda: away.rename(hook), gone=DeviceNotFound)
 
 
 @contextmanager

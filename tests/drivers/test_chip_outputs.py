@@ -13,58 +13,36 @@ from pathlib import Path
 
 import pytest
 
-from tests.drivers.fakes.sysfs import Sysfs
-from tests.drivers.test_device_outputs import phone_reads, serial
+from tests.drivers.test_device_outputs import battery, kernel, serial
 from thermocald.errors import BadReading
-from thermocald.hal import VirtualClock, open_device
 
 with Path(__file__).with_suffix("").with_name("chip_outputs.tsv").open() as file:
     ROWS = list(csv.DictReader(file, delimiter="\t", quoting=csv.QUOTE_NONE))
 REFUSE = "refuse"
 
 
-def fields(text):
-    return dict(part.split("=") for part in text.split())
-
-
-def kernel(row, folder):
-    sysfs, name = Sysfs(folder), row["chip"]
-    if row["driver"] == "hwmon":
-        given = row["what it gives"]
-        files = fields(given) if "=" in given else {"input": given}
-        sysfs.hwmon(0, name, **{f"temp1_{k}": v for k, v in files.items()})
-    elif row["driver"] == "iio":
-        files = fields(row["what it gives"])
-        names = {k: k if k.startswith("fault") else f"in_temp_{k}" for k in files}
-        sysfs.iio(0, name, **{names[k]: v for k, v in files.items()})
-    else:
-        sysfs.zone(0, name, row["what it gives"])
-    key, driver = ("zone", "thermal_zone") if row["driver"] == "zone" else ("chip", row["driver"])
-    options = {key: name, "sysfs": str(folder), **json.loads(row["options"] or "{}")}
-    with open_device("thermometer", driver, options, VirtualClock()) as device:
-        return device.read().values["temperature"]
-
-
 def reading(row, server, folder):
     """Return the driver's °C for a row; raises BadReading."""
-    if row["driver"] == "serial":
-        options = {"pattern": r"T=(?P<temperature>\S+)", **json.loads(row["options"] or "{}")}
-        return serial(server, folder, row["what it gives"], options)
-    if row["driver"] == "battery":
-        lines = [f"  {k}: {v}" for k, v in fields(row["what it gives"]).items()]
-        text = "\n".join(["Current Battery Service state:", "  present: true", *lines, ""])
-        return phone_reads(server, {"temperature": "battery"}, battery=text)["temperature"]
-    return kernel(row, folder)
+    driver, text = row["driver"], row["what it gives"]
+    options = json.loads(row["options"] or "{}")
+    if driver == "serial":
+        options = {"pattern": r"T=(?P<temperature>\S+)", **options}
+        return serial(server, folder, text, options)
+    if driver == "battery":
+        lines = "".join(f"  {part.replace('=', ': ')}\n" for part in text.split())
+        text = f"Current Battery Service state:\n  present: true\n{lines}"
+        return battery(server, folder, text, {})
+    driver = {"zone": "thermal_zone"}.get(driver, driver)
+    return kernel(server, folder, text, {"driver": driver, "name": row["chip"], **options})
 
 
-DRIVERS = sorted({row["driver"] for row in ROWS})
 PARTS = {"serial": 12, "hwmon": 4, "iio": 6}
 
 
 @pytest.mark.parametrize(
     ("driver", "every"),
     [
-        *((driver, PARTS.get(driver, 1)) for driver in DRIVERS),
+        *((driver, PARTS.get(driver, 1)) for driver in sorted({row["driver"] for row in ROWS})),
         *(pytest.param(driver, 1, marks=pytest.mark.slow) for driver in PARTS),
     ],
 )

@@ -101,16 +101,21 @@ def test_a_device_is_opened_twice_unplugged_and_back(driver, bench):
     use(kind, device)
     bench.unplug()
     with pytest.raises((TransientDeviceError, bench.gone), match=bench.says):
-        for _ in range(3):  # a few buffered results may come first
-            use(kind, device)
-            device.close()
-            device.open()
+        use_until_it_fails(kind, device)
     device.close()
     with pytest.raises(bench.gone):
         device.open()
     bench.plug()
     with device:
         use(kind, device)
+
+
+def use_until_it_fails(kind, device):
+    """Use the device until it raises; a few buffered results may come first."""
+    for _ in range(3):
+        use(kind, device)
+        device.close()
+        device.open()
 
 
 def of_kind(kind):

@@ -11,7 +11,6 @@ from thermocald_drivers.picamera import Picamera2Camera, sensor_temperature
 
 from thermocald import errors
 
-
 DRIVER = ("camera", "picamera2")
 
 

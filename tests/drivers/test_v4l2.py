@@ -234,7 +234,9 @@ class Capture:
         pass
 
     def get(self, name):
-        known = dict(zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), self.size))
+        known = dict(
+            zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), self.size, strict=True)
+        )
         return {cv2.CAP_PROP_POS_MSEC: time.monotonic() * 1e3, **known}.get(name, -1)
 
     def read(self):

@@ -67,7 +67,7 @@ CALIBRATION = (
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 
-def bme280(adc_t=ADC_T, identity=0x60, status=0):
+def bme280(adc_t=ADC_T, adc_h=ADC_H, identity=0x60, status=0):
     def block(first, data):
         chip.registers.update({first + k: bytes([byte]) for k, byte in enumerate(data)})
 
@@ -78,7 +78,7 @@ def bme280(adc_t=ADC_T, identity=0x60, status=0):
     def measure(self, register, data):
         if register == 0xF4 and data[0] & 3:
             raw = (ADC_P << 4).to_bytes(3, "big") + (adc_t << 4).to_bytes(3, "big")
-            block(0xF7, raw + ADC_H.to_bytes(2, "big"))
+            block(0xF7, raw + adc_h.to_bytes(2, "big"))
 
     chip.on_write = measure
     return chip

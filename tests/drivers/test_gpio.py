@@ -35,7 +35,7 @@ def pin(bench):
 def await_state(pin, states):
     """Wait until the pin has had all states."""
     seen, deadline = set(), time.monotonic() + 2.0
-    while seen < states and time.monotonic() < deadline:
+    while not seen >= states and time.monotonic() < deadline:
         seen.add(bool(pin.state))
     assert seen >= states
 

@@ -9,7 +9,7 @@ import pytest
 from thermocald_drivers.android import exif, exposure_start
 from thermocald_drivers.android_phone import AdbPhone
 
-from tests.drivers.fakes.adb_server import FOCUS, photograph, shoot
+from tests.drivers.fakes.adb_server import photograph, shoot
 from thermocald import errors
 from thermocald.hal import VirtualClock
 
@@ -117,30 +117,6 @@ def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench,
     phone.shoot = action
     with bench.device() as device:
         assert device.capture().encoded.endswith(b"\xff\xd9")
-
-
-FOCUS_MOVED = FOCUS.replace("0.25", "0.31")
-
-
-@pytest.mark.parametrize(
-    ("change", "tags", "why"),
-    [({"media_camera": FOCUS_MOVED}, {}, "focus_distance_dioptres was 0.25 and is 0.31"),
-     ({}, {"zoom": 2.0}, "digital_zoom was 1.0 and is 2.0"),
-     ({}, {"distance": 2.0}, "subject_distance_m was 1.5 and is 2.0"),
-     ({}, {"size": (48, 32)}, "the photograph has 48×32 px, not 96×64; set the camera app"),
-     ({"media_camera": FOCUS + "android.control.afState (1): byte[1]\n [PASSIVE_SCAN ]\n"}, {},
-      "autofocus is at work")],
-)  # fmt: skip
-def test_a_phone_that_is_changed_gives_no_frame_until_it_is_set_back(
-    bench, phone, change, tags, why
-):
-    with bench.device() as device:
-        assert device.capture().settings["focus_distance_dioptres"] == 0.25
-        vars(phone).update(change, shoot=shoot(**tags))
-        with pytest.raises(errors.BadReading, match=why):
-            device.capture()
-        phone.media_camera, phone.shoot = FOCUS, shoot()
-        device.capture()
 
 
 def test_exposure_that_moved_is_flagged_or_refused(bench, phone):

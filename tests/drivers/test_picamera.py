@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from thermocald_drivers.picamera import Picamera2Camera, sensor_temperature
 
-from thermocald import errors
-
 DRIVER = ("camera", "picamera2")
 
 
@@ -36,82 +34,36 @@ def test_a_frame_is_the_fresh_grey_plane_at_the_middle_of_its_exposure(bench, pi
     assert frame.monotonic == pytest.approx(stamp * 1e-9 - boot - 0.05, abs=0.002)
 
 
-@pytest.fixture
-def focusing(pi):
-    """A camera with a focusing lens, such as the Camera Module 3."""
-    pi.camera_controls = {"LensPosition": (0.0, 32.0, 1.0)}
-    pi.standing = {"LensPosition": 1.5, "ColourGains": (1.75, 1.5)}
-    return pi
-
-
-LOCKED = {
-    "exposure_auto": 0.0, "white_balance_auto": 0.0, "exposure_s": 0.004, "gain": 1.0,
-    "focus_dioptres": 1.5, "focus_auto": 0.0, "colour_gain_red": 1.75, "colour_gain_blue": 1.5,
-}  # fmt: skip
-
-
-def test_what_is_not_configured_is_locked_as_it_is(bench, focusing):
-    device = bench.device()
-    for _ in range(2):
-        with device:
-            frame = device.capture()
-            assert device.warnings() == []
-        assert frame.settings == LOCKED
-        controls = focusing.instances[-1].configuration["controls"]
-        assert (controls["AfMode"], controls["LensPosition"]) == (0, 1.5)
-        assert (controls["AwbEnable"], controls["ColourGains"]) == (False, (1.75, 1.5))
-        # closed and opened again, the same values are set
-        focusing.standing = {"LensPosition": 4.0, "ColourGains": (1.0, 1.0)}
+def test_manual_controls(bench, pi):
     with bench.device(gain=2.0, focus_dioptres=2.0) as device:
         device.capture()
-    controls = focusing.instances[-1].configuration["controls"]
+    controls = pi.instances[-1].configuration["controls"]
     assert (controls["AeEnable"], controls["AfMode"], controls["LensPosition"]) == (False, 0, 2.0)
     assert (controls["ExposureTime"], controls["AnalogueGain"]) == (4000, 2.0)
 
 
-@pytest.mark.parametrize(
-    "moved", [{"LensPosition": 2.0}, {"ColourGains": (1.0, 1.5)}, {"LensPosition": None}]
-)
-def test_a_lock_that_does_not_hold_gives_no_frame(bench, focusing, moved):
-    with bench.device() as device:
-        device.capture()
-        focusing.extra = moved
-        with pytest.raises(errors.BadReading, match=f"{next(iter(moved))} was set to"):
-            device.capture()
-
-
-def test_auto_only_by_name_and_with_a_warning(bench, focusing):
+def test_auto_only_by_name_and_with_a_warning(bench, pi):
     with bench.device(focus_dioptres="auto", exposure_s="auto", colour_gains="auto") as device:
-        focusing.extra = {"LensPosition": 5.0}
+        pi.extra = {"LensPosition": 5.0}
         frame = device.capture()
         warned = [text.partition(":")[0] for text in device.warnings()]
     assert warned == ["exposure_s", "focus_dioptres", "colour_gains"]
-    controls = focusing.instances[0].configuration["controls"]
+    controls = pi.instances[0].configuration["controls"]
     assert (controls["AeEnable"], controls["AwbEnable"], controls["AfMode"]) == (True, True, 2)
     assert "ExposureTime" not in controls
     assert (frame.settings["focus_auto"], frame.settings["focus_dioptres"]) == (1.0, 5.0)
 
 
-def test_the_stanza_has_size_and_lens_position(focusing):
+def test_the_stanza_has_size_and_lens_position(pi):
     (found,) = Picamera2Camera.attached()
     assert found.options == {
         "camera": 0, "model": "imx219", "width": 96, "height": 64, "focus_dioptres": 1.0,
         "exposure_s": 0.02, "gain": 1.0,
     }  # fmt: skip
-    assert focusing.instances[0].closed
-    focusing.busy = True
+    assert pi.instances[0].closed
+    pi.busy = True
     (found,) = Picamera2Camera.attached()
     assert found.options["model"] == "imx219"
-
-
-def test_a_capture_that_hangs_closes_the_camera(bench, pi):
-    pi.hang_s = 0.8
-    with bench.device() as device:
-        with pytest.raises(errors.DeviceTimeout):
-            device.capture()
-        assert pi.instances[0].closed
-        with pytest.raises(errors.DeviceGone):
-            device.capture()
 
 
 def test_the_temperature_of_the_sensor_is_stored_once_it_was_measured(bench, pi, shared):

@@ -26,13 +26,13 @@ class Request:
 
 
 class StandIn:
-    """One camera; tests set its class attributes."""
+    """A camera with a focusing lens, such as the Camera Module 3; tests set its attributes."""
 
     cameras = ({"Model": "imx219", "Id": "/base/soc/i2c0mux/i2c@1/imx219@10"},)
     sensor_resolution = (96, 64)
-    camera_controls: ClassVar[dict] = {"ExposureTime": (), "AnalogueGain": ()}
+    camera_controls: ClassVar[dict] = {"LensPosition": (0.0, 32.0, 1.0)}
     extra: ClassVar[dict] = {}
-    standing: ClassVar[dict] = {}
+    standing: ClassVar[dict] = {"LensPosition": 1.5, "ColourGains": (1.75, 1.5)}
     stale = 0
     hang_s = 0.0
     busy = False

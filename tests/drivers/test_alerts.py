@@ -6,6 +6,7 @@ import json
 import math
 import re
 import time
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -136,15 +137,8 @@ def test_a_program_gets_it_without_a_shell_and_a_few_variables_only(script, tmp_
 @pytest.fixture
 def start():
     """class → its server on loopback, which is closed after the test."""
-    started = []
-
-    def make(server, **options):
-        started.append(server(**options))
-        return started[-1]
-
-    yield make
-    for server in started:
-        server.close()
+    with ExitStack() as stack:
+        yield lambda server, **options: stack.enter_context(closing(server(**options)))
 
 
 def test_a_webhook_and_an_outage(start, tmp_path):

@@ -49,42 +49,27 @@ def test_photographs_by_the_triggers_of_the_vendors(bench, phone, trigger, comma
     assert len(phone.files) == 3
 
 
-def test_the_app_stays_open(bench, phone):
-    with bench.device() as device:
-        for _ in range(2):
-            device.capture()
-    assert sum("STILL_IMAGE_CAMERA" in c for c in phone.commands) == 1
-
-
 @pytest.mark.parametrize("offset", [0.0, 37.25, -7200.0])
 def test_the_time_is_exifs_with_the_phones_clock_compared(bench, phone, offset):
-    phone.clock_offset = offset
     exposed = []
 
-    def action(phone):
-        time.sleep(0.15)  # a shutter lag that the trigger's time lacks
+    def with_lag(phone):
+        time.sleep(0.15)  # of the shutter, which the trigger's time lacks
         exposed.append(time.time())
         shoot()(phone)
         exposed.append(time.time())
 
-    phone.shoot = action
+    phone.clock_offset, phone.shoot = offset, with_lag
     with bench.device() as device:
         frame = device.capture()
+        # without fractions or with a clock that was set it is the trigger's
+        phone.shoot = shoot(subsecond=None)
+        assert abs(device.capture().utc - time.time()) < 1.0
+        phone.clock_offset, phone.shoot = 3600.0, shoot()
+        assert abs(device.capture().utc - time.time()) < 1.0
     before, after = exposed
     assert before - 0.005 < frame.utc - 1 / 120 < after + 0.005
-
-
-@pytest.mark.parametrize(
-    ("knob", "value"), [("shoot", shoot(subsecond=None)), ("clock_offset", 3600.0)]
-)
-def test_without_fractions_or_with_a_clock_that_was_set_it_is_the_triggers(
-    bench, phone, knob, value
-):
-    with bench.device() as device:
-        setattr(phone, knob, value)
-        called = time.time()
-        frame = device.capture()
-    assert abs(frame.utc - called) < 1.0
+    assert sum("STILL_IMAGE_CAMERA" in c for c in phone.commands) == 1  # the app stays open
 
 
 @pytest.mark.parametrize(
@@ -119,26 +104,19 @@ def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench,
         assert device.capture().encoded.endswith(b"\xff\xd9")
 
 
-def test_exposure_that_moved_is_flagged_or_refused(bench, phone):
-    for refuse in (False, None, True):
-        phone.shoot = shoot()
-        with bench.device(refuse_unlocked=refuse) as device:
-            device.capture()
-            phone.shoot = shoot(iso=200)
-            if refuse:
-                with pytest.raises(errors.BadReading, match="iso was 100 and is 200"):
-                    device.capture()
-            else:
-                assert device.capture().settings["iso"] == 200.0
-                assert any("refuse_unlocked" in w for w in device.warnings()) == (refuse is False)
-
-
-def test_what_a_phone_does_not_report_is_in_the_warnings(bench, phone):
+@pytest.mark.parametrize("refuse", [False, None, True])
+def test_exposure_that_moved_is_flagged_or_refused(bench, phone, refuse):
     phone.media_camera, phone.shoot = "", shoot(distance=None)
-    with bench.device() as device:
-        assert device.warnings() == []
+    with bench.device(refuse_unlocked=refuse) as device:
         device.capture()
-        assert "cannot be checked" in device.warnings()[0]
+        assert any("cannot be checked" in w for w in device.warnings())  # the focus
+        phone.shoot = shoot(iso=200)
+        if refuse:
+            with pytest.raises(errors.BadReading, match="iso was 100 and is 200"):
+                device.capture()
+        else:
+            assert device.capture().settings["iso"] == 200.0
+        assert any("refuse_unlocked" in w for w in device.warnings()) == (refuse is False)
 
 
 @THERMOMETER

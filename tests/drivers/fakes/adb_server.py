@@ -100,11 +100,8 @@ class FakePhone:
             self.growing[name] = (time.monotonic(), writing_s)
 
     def content(self, name: str) -> bytes:
-        data = self.files[name]
-        if name in self.growing:
-            begin, takes = self.growing[name]
-            return data[: int(len(data) * min(1.0, (time.monotonic() - begin) / takes))]
-        return data
+        data, (begin, takes) = self.files[name], self.growing.get(name, (0.0, 1e-9))
+        return data[: int(len(data) * min(1.0, (time.monotonic() - begin) / takes))]
 
     def shell(self, command: str) -> str:
         self.commands.append(command)
@@ -112,29 +109,21 @@ class FakePhone:
             self.awake, self.locked = True, self.stays_locked
         if command == self.trigger and self.shoot:
             self.shoot(self)
-        if command.startswith("date"):
-            return f"{self.now():.9f} +0000\n"
-        if command.startswith("dumpsys power"):
-            return (
-                f"  mWakefulness={'Awake' if self.awake else 'Asleep'}\n"
-                f"  mShowingLockscreen={str(self.locked).lower()}\n"
-            )
-        if command.startswith("df"):
-            return f"Filesystem 1K-blocks Used Available Use% On\n/dev/x 9 9 {self.free_kb} 9% /\n"
         if match := re.match(r"rm -f '(.*)'", command):
             self.files.pop(match[1].rsplit("/", 1)[1], None)
-        if "thermal_zone*" in command:
-            return self.zones
-        if "thermocald_load" in command and command.startswith("timeout"):
-            self.load = True
-        if command.startswith("pkill"):
-            self.load = False
+        if command.startswith(("timeout", "pkill")):
+            self.load = command.startswith("timeout")
         answers = {
+            "date": f"{self.now():.9f} +0000\n",
+            "dumpsys power": f"  mWakefulness={'Awake' if self.awake else 'Asleep'}\n"
+            f"  mShowingLockscreen={str(self.locked).lower()}\n",
+            "df": f"Filesystem 1K-blocks Used Available Use% On\n/dev/x 9 9 {self.free_kb} 9% /\n",
+            "for z in /sys/class/thermal": self.zones,
             "dumpsys battery": self.battery,
             "dumpsys thermalservice": self.thermal,
             "dumpsys media.camera": self.media_camera,
         }
-        return answers.get(command, "")
+        return next((text for begin, text in answers.items() if command.startswith(begin)), "")
 
 
 class AdbServer(LineServer):

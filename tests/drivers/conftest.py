@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drivers.fakes.adb_server import AdbServer, wait_little
+from tests.drivers.fakes.sysfs import Sysfs
 from tests.drivers.laboratory import LABORATORY
 
 
@@ -20,6 +21,17 @@ def bench(driver, tmp_path, monkeypatch):
     with LABORATORY[driver](tmp_path, monkeypatch) as one:
         one.driver = driver
         yield one
+
+
+@pytest.fixture
+def fake(bench):
+    """What stands below the driver."""
+    return bench.fake
+
+
+@pytest.fixture
+def sysfs(tmp_path):
+    return Sysfs(tmp_path)
 
 
 @pytest.fixture(scope="module")

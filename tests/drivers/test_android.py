@@ -18,11 +18,6 @@ THERMOMETER = pytest.mark.parametrize("driver", [("thermometer", "android")])
 LOAD = pytest.mark.parametrize("driver", [("output", "android_load")])
 
 
-@pytest.fixture
-def phone(bench):
-    return bench.fake
-
-
 @pytest.mark.parametrize(
     ("trigger", "command"),
     [
@@ -31,45 +26,45 @@ def phone(bench):
         ({"trigger": "tap", "tap": [540, 2000]}, "input tap 540 2000"),
     ],
 )
-def test_photographs_by_the_triggers_of_the_vendors(bench, phone, trigger, command):
-    phone.trigger = command
-    phone.add("IMG_old.jpg", b"old")
+def test_photographs_by_the_triggers_of_the_vendors(bench, fake, trigger, command):
+    fake.trigger = command
+    fake.add("IMG_old.jpg", b"old")
     with bench.device(**trigger) as device:
         for _ in range(2):
-            phone.awake = False
+            fake.awake = False
             frame = device.capture()
-            assert phone.awake
+            assert fake.awake
     assert np.max(np.abs(frame.image - np.add.outer(np.arange(64.0), np.arange(96)))) <= 3
     assert frame.encoded[:2] == b"\xff\xd8"
     assert frame.exposure == pytest.approx(1 / 60, rel=1e-4)
-    assert phone.commands.count(command) == 2
-    assert len(phone.files) == 3  # they are deleted only when told
+    assert fake.commands.count(command) == 2
+    assert len(fake.files) == 3  # they are deleted only when told
     with bench.device(**trigger, delete=True) as device:
         device.capture()
-    assert len(phone.files) == 3
+    assert len(fake.files) == 3
 
 
 @pytest.mark.parametrize("offset", [0.0, 37.25, -7200.0])
-def test_the_time_is_exifs_with_the_phones_clock_compared(bench, phone, offset):
+def test_the_time_is_exifs_with_the_phones_clock_compared(bench, fake, offset):
     exposed = []
 
-    def with_lag(phone):
+    def with_lag(fake):
         time.sleep(0.15)  # of the shutter, which the trigger's time lacks
         exposed.append(time.time())
-        shoot()(phone)
+        shoot()(fake)
         exposed.append(time.time())
 
-    phone.clock_offset, phone.shoot = offset, with_lag
+    fake.clock_offset, fake.shoot = offset, with_lag
     with bench.device() as device:
         frame = device.capture()
         # without fractions or with a clock that was set it is the trigger's
-        phone.shoot = shoot(subsecond=None)
+        fake.shoot = shoot(subsecond=None)
         assert abs(device.capture().utc - time.time()) < 1.0
-        phone.clock_offset, phone.shoot = 3600.0, shoot()
+        fake.clock_offset, fake.shoot = 3600.0, shoot()
         assert abs(device.capture().utc - time.time()) < 1.0
     before, after = exposed
     assert before - 0.005 < frame.utc - 1 / 120 < after + 0.005
-    assert sum("STILL_IMAGE_CAMERA" in c for c in phone.commands) == 1  # the app stays open
+    assert sum("STILL_IMAGE_CAMERA" in c for c in fake.commands) == 1  # the app stays open
 
 
 @pytest.mark.parametrize(
@@ -93,24 +88,24 @@ def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half
     assert one.clock_offset() == (pytest.approx(offset), "+0000", pytest.approx(half))
 
 
-def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench, phone):
-    def action(phone):
-        phone.add(".pending-1-IMG.jpg", b"half")
-        phone.add("IMG_2.dng", b"raw")
-        shoot(writing_s=0.4)(phone)
+def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench, fake):
+    def action(fake):
+        fake.add(".pending-1-IMG.jpg", b"half")
+        fake.add("IMG_2.dng", b"raw")
+        shoot(writing_s=0.4)(fake)
 
-    phone.shoot = action
+    fake.shoot = action
     with bench.device() as device:
         assert device.capture().encoded.endswith(b"\xff\xd9")
 
 
 @pytest.mark.parametrize("refuse", [False, None, True])
-def test_exposure_that_moved_is_flagged_or_refused(bench, phone, refuse):
-    phone.media_camera, phone.shoot = "", shoot(distance=None)
+def test_exposure_that_moved_is_flagged_or_refused(bench, fake, refuse):
+    fake.media_camera, fake.shoot = "", shoot(distance=None)
     with bench.device(refuse_unlocked=refuse) as device:
         device.capture()
         assert any("cannot be checked" in w for w in device.warnings())  # the focus
-        phone.shoot = shoot(iso=200)
+        fake.shoot = shoot(iso=200)
         if refuse:
             with pytest.raises(errors.BadReading, match="iso was 100 and is 200"):
                 device.capture()
@@ -120,9 +115,9 @@ def test_exposure_that_moved_is_flagged_or_refused(bench, phone, refuse):
 
 
 @THERMOMETER
-def test_temperatures(bench, phone, shared):
-    phone.thermal = next((shared / "data/adb").glob("06_*")).read_text()
-    phone.zones = "cpu-0-0 37000\nbattery 370\n"
+def test_temperatures(bench, fake, shared):
+    fake.thermal = next((shared / "data/adb").glob("06_*")).read_text()
+    fake.zones = "cpu-0-0 37000\nbattery 370\n"
     sensors = {"temperature": "battery", "ap": "thermal:AP", "soc": "zone:cpu-0-0"}
     sensors["usb"] = "thermal:USB"
     with bench.device(sensors=sensors) as device:
@@ -146,11 +141,11 @@ ASKED = r"unit of 45 is unknown; set units: \{soc: degC\}"
         ("battery", {}, (55, 92, 61, 24, 5, 45), ["unknown unit", 9.2, 6.1, 2.4, 0.5, 4.5]),
     ],
 )
-def test_a_unit_that_was_certain_once_is_kept(bench, phone, source, units, numbers, expected):
+def test_a_unit_that_was_certain_once_is_kept(bench, fake, source, units, numbers, expected):
     with bench.device(sensors={"soc": source}, units=units) as device:
         for number, celsius in zip(numbers, expected, strict=True):
-            phone.zones = f"{source.partition(':')[2]} {number}\n"
-            phone.battery = f"present: true\nvoltage: 3900\ntemperature: {number}\n"
+            fake.zones = f"{source.partition(':')[2]} {number}\n"
+            fake.battery = f"present: true\nvoltage: 3900\ntemperature: {number}\n"
             if isinstance(celsius, str):
                 with pytest.raises(errors.BadReading, match=celsius):
                     device.read()
@@ -159,28 +154,28 @@ def test_a_unit_that_was_certain_once_is_kept(bench, phone, source, units, numbe
 
 
 @LOAD
-def test_warm_up_by_load_which_the_limit_stops_for_good(bench, phone):
+def test_warm_up_by_load_which_the_limit_stops_for_good(bench, fake):
     bench.options |= {"hysteresis_k": 1.0, "lease_s": 30, "processes": 2}
     bench.clock = clock = VirtualClock()
     with bench.device() as output:
         for celsius, heating in ((28.7, True), (38.6, False), (37.0, True)):
-            phone.battery = f"  voltage: 4000\n  temperature: {celsius * 10:.0f}\n"
+            fake.battery = f"  voltage: 4000\n  temperature: {celsius * 10:.0f}\n"
             output.emit({})
-            assert phone.load == heating
-    assert not phone.load  # closing stops it
-    phone.commands.clear()
+            assert fake.load == heating
+    assert not fake.load  # closing stops it
+    fake.commands.clear()
     with bench.device() as output:
         for processes in (2, 2, 4):  # the load is a lease that is renewed
             output.emit({})
-            assert sum(c.startswith("timeout 30 ") for c in phone.commands) == processes
+            assert sum(c.startswith("timeout 30 ") for c in fake.commands) == processes
             clock.advance(10)
-        phone.battery = "  voltage: 4000\n  temperature: 420\n"
+        fake.battery = "  voltage: 4000\n  temperature: 420\n"
         with pytest.raises(errors.PermanentDeviceError, match=r"42\.00 °C reached the limit"):
             output.emit({})
-        assert not phone.load
-        phone.battery = "  voltage: 4000\n  temperature: 200\n"
+        assert not fake.load
+        fake.battery = "  voltage: 4000\n  temperature: 200\n"
         output.emit({})
-        assert not phone.load
+        assert not fake.load
 
 
 WHEN = 1_605_956_400.25

@@ -1,12 +1,15 @@
 """Outputs of devices, each with the expected reading: right, or rejected with its reason.
 
 Those found in public are the files of ../shared/data/devices, whose first line has source, kind,
-expected and options, and of ../shared/data/adb, read by hand; the others are in OUTPUTS. The
-unchanged driver reads each: from an adb server, a tty or a sysfs tree.
+expected and options, and of ../shared/data/adb, read by hand; the others are in OUTPUTS. Those of
+data sheets and public drivers are the rows of `chip_outputs.tsv`: driver, chip, output, further
+options, temperature or `refuse`, source. The unchanged driver reads each as the first reading after
+opening, so that nothing supports an idle value: from an adb server, a tty or a sysfs tree.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import threading
@@ -25,8 +28,6 @@ HEAD = re.compile(
     r"# source: .*? \| kind: (?P<kind>\w+) \| expected: (?P<expected>.*?)"
     r"(?: \| options: (?P<options>.*))?$"
 )
-
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"{DATA} is not there")
 
 
 def read(driver, clock=None, **options):
@@ -249,7 +250,7 @@ OUTPUTS = [
 ]  # fmt: skip
 ROWS = [
     *map(of_file, FILES),
-    *(of_dump(*row) for row in DUMPS),
+    *(of_dump(*row) for row in DUMPS if DATA.is_dir()),
     *((kind, text, more, told) for kind, more, outputs in OUTPUTS for text, told in outputs),
 ]
 
@@ -268,3 +269,54 @@ def test_an_output_is_read_as_it_should(kind, text, options, expected, server, t
     if isinstance(expected, dict):
         found = {name: found.get(name, "absent") for name in expected}
     assert found == (pytest.approx(expected) if isinstance(expected, float) else expected)
+
+
+with Path(__file__).with_name("chip_outputs.tsv").open() as file:
+    CHIPS = list(csv.DictReader(file, delimiter="\t", quoting=csv.QUOTE_NONE))
+REFUSE = "refuse"
+
+
+def reading(row, server, folder):
+    """Return the driver's °C for a row; raises BadReading."""
+    driver, text = row["driver"], row["what it gives"]
+    options = json.loads(row["options"] or "{}")
+    if driver == "serial":
+        options = {"pattern": r"T=(?P<temperature>\S+)", **options}
+        return serial(server, folder, text, options)
+    if driver == "battery":
+        lines = "".join(f"  {part.replace('=', ': ')}\n" for part in text.split())
+        text = f"Current Battery Service state:\n  present: true\n{lines}"
+        return battery(server, folder, text, {})
+    driver = {"zone": "thermal_zone"}.get(driver, driver)
+    return kernel(server, folder, text, {"driver": driver, "name": row["chip"], **options})
+
+
+PARTS = {"serial": 12, "hwmon": 4, "iio": 6}
+
+
+@pytest.mark.parametrize(
+    ("driver", "every"),
+    [
+        *((driver, PARTS.get(driver, 1)) for driver in sorted({row["driver"] for row in CHIPS})),
+        *(pytest.param(driver, 1, marks=pytest.mark.slow) for driver in PARTS),
+    ],
+)
+def test_a_chip_is_read_rightly_or_refused(driver, every, server, tmp_path):
+    wrong = []
+    for k, row in enumerate([row for row in CHIPS if row["driver"] == driver][::every]):
+        found, message, expected = REFUSE, "", row["expected"]
+        try:
+            found = reading(row, server, tmp_path / str(k))
+        except BadReading as error:
+            message = str(error)
+        # the kernel's offsets and scales are rounded to as much as 3 mK
+        meant = REFUSE if expected == REFUSE else pytest.approx(float(expected), abs=5e-3)
+        if found != meant or len(message.splitlines()) > 1:
+            wrong.append((row["chip"], row["what it gives"], found, expected, message))
+    assert wrong == []
+
+
+def test_there_are_enough():
+    """With good readings among them: otherwise a driver that rejects everything would pass."""
+    assert len(CHIPS) >= 1050
+    assert sum(row["expected"] != REFUSE for row in CHIPS) >= 200

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.errors import BadReading, DeviceGone, DeviceNotFound, WrongDevice
 from thermocald.hal import VirtualClock, open_device
-
-
-@pytest.fixture
-def sysfs(tmp_path):
-    return Sysfs(tmp_path)
 
 
 def thermometer(driver, sysfs, **options):

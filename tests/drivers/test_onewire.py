@@ -9,17 +9,12 @@ import time
 import pytest
 from thermocald_drivers.onewire import decode
 
-from tests.drivers.fakes.sysfs import Sysfs, scratchpad, w1_slave
+from tests.drivers.fakes.sysfs import scratchpad, w1_slave
 from thermocald.errors import BadReading, DeviceNotFound, DeviceTimeout
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 ROM = "28-000000bfe244"
 CRC_NO = "ff ff ff ff ff ff ff ff ff : crc=c9 NO\n46 01 4b 46 7f ff 0a 10 85 t=-62"
-
-
-@pytest.fixture
-def sysfs(tmp_path):
-    return Sysfs(tmp_path)
 
 
 def thermometer(sysfs, clock=None, **options):

@@ -12,20 +12,15 @@ from thermocald_drivers.picamera import Picamera2Camera, sensor_temperature
 DRIVER = ("camera", "picamera2")
 
 
-@pytest.fixture
-def pi(bench):
-    return bench.fake
-
-
-def test_a_frame_is_the_fresh_grey_plane_at_the_middle_of_its_exposure(bench, pi):
-    pi.stale = 3
+def test_a_frame_is_the_fresh_grey_plane_at_the_middle_of_its_exposure(bench, fake):
+    fake.stale = 3
     with bench.device(exposure_s=0.1) as device:
         called = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         frame = device.capture()
     assert np.array_equal(frame.image, np.add.outer(np.arange(64), np.arange(96)) % 251)
     assert frame.encoded is None
     assert frame.exposure == pytest.approx(0.1)
-    (one,) = pi.instances
+    (one,) = fake.instances
     assert one.requests_out == 0
     assert one.closed
     stamp = one.given["SensorTimestamp"]
@@ -34,43 +29,43 @@ def test_a_frame_is_the_fresh_grey_plane_at_the_middle_of_its_exposure(bench, pi
     assert frame.monotonic == pytest.approx(stamp * 1e-9 - boot - 0.05, abs=0.002)
 
 
-def test_manual_controls(bench, pi):
+def test_manual_controls(bench, fake):
     with bench.device(gain=2.0, focus_dioptres=2.0) as device:
         device.capture()
-    controls = pi.instances[-1].configuration["controls"]
+    controls = fake.instances[-1].configuration["controls"]
     assert (controls["AeEnable"], controls["AfMode"], controls["LensPosition"]) == (False, 0, 2.0)
     assert (controls["ExposureTime"], controls["AnalogueGain"]) == (4000, 2.0)
 
 
-def test_auto_only_by_name_and_with_a_warning(bench, pi):
+def test_auto_only_by_name_and_with_a_warning(bench, fake):
     with bench.device(focus_dioptres="auto", exposure_s="auto", colour_gains="auto") as device:
-        pi.extra = {"LensPosition": 5.0}
+        fake.extra = {"LensPosition": 5.0}
         frame = device.capture()
         warned = [text.partition(":")[0] for text in device.warnings()]
     assert warned == ["exposure_s", "focus_dioptres", "colour_gains"]
-    controls = pi.instances[0].configuration["controls"]
+    controls = fake.instances[0].configuration["controls"]
     assert (controls["AeEnable"], controls["AwbEnable"], controls["AfMode"]) == (True, True, 2)
     assert "ExposureTime" not in controls
     assert (frame.settings["focus_auto"], frame.settings["focus_dioptres"]) == (1.0, 5.0)
 
 
-def test_the_stanza_has_size_and_lens_position(pi):
+def test_the_stanza_has_size_and_lens_position(fake):
     (found,) = Picamera2Camera.attached()
     assert found.options == {
         "camera": 0, "model": "imx219", "width": 96, "height": 64, "focus_dioptres": 1.0,
         "exposure_s": 0.02, "gain": 1.0,
     }  # fmt: skip
-    assert pi.instances[0].closed
-    pi.busy = True
+    assert fake.instances[0].closed
+    fake.busy = True
     (found,) = Picamera2Camera.attached()
     assert found.options["model"] == "imx219"
 
 
-def test_the_temperature_of_the_sensor_is_stored_once_it_was_measured(bench, pi, shared):
+def test_the_temperature_of_the_sensor_is_stored_once_it_was_measured(bench, fake, shared):
     with bench.device() as device:
         stored = []
         for celsius in (0.0, 31.0):
-            pi.extra = {"SensorTemperature": celsius}
+            fake.extra = {"SensorTemperature": celsius}
             stored.append(device.capture().settings.get("sensor_temperature_c"))
     assert stored == [None, 31.0]
     lines = (shared / "data/libcamera/picamera2_metadata_real.jsonl").read_text().splitlines()

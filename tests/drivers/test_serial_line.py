@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -17,15 +17,8 @@ PATTERN = r"T=(?P<temperature>[-+]?\d+\.\d+)"
 
 @pytest.fixture
 def instrument():
-    made = []
-
-    def make(answers=None):
-        made.append(Instrument(answers))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
+    with ExitStack() as stack:
+        yield lambda answers=None: stack.enter_context(closing(Instrument(answers)))
 
 
 def thermometer(far, **options):

@@ -11,23 +11,11 @@ import numpy as np
 import pytest
 from thermocald_drivers.v4l2 import V4l2Camera
 
-from tests.drivers.fakes.v4l2_kernel import (
-    AUTO_EXPOSURE,
-    AUTO_FOCUS,
-    EXPOSURE,
-    FOCUS,
-    FREQUENCY,
-    GAIN,
-)
+from tests.drivers.fakes import v4l2_kernel as v4l2
 from thermocald import errors
 from thermocald.hal import VirtualClock
 
 DRIVER = ("camera", "v4l2")
-
-
-@pytest.fixture
-def kernel(bench):
-    return bench.fake
 
 
 # v4l2loopback 0.12: the stamp is right, but its type is not stated
@@ -36,10 +24,10 @@ def kernel(bench):
     [(0x2000, -0.05, "GREY"), (0x12000, +0.05, "YUYV"), (0, -0.05, "MJPG")],
 )
 def test_the_frame_is_fresh_and_its_time_the_middle_of_the_exposure(
-    bench, kernel, flags, shift, pixel_format
+    bench, fake, flags, shift, pixel_format
 ):
-    kernel.flags, stamps = flags, []
-    kernel.stamp = lambda now: stamps.append(now) or now
+    fake.flags, stamps = flags, []
+    fake.stamp = lambda now: stamps.append(now) or now
     with bench.device(exposure_s=0.1, pixel_format=pixel_format) as device:
         time.sleep(0.1)  # the queue fills with old frames
         called = time.monotonic()
@@ -59,12 +47,12 @@ def test_the_frame_is_fresh_and_its_time_the_middle_of_the_exposure(
         (0x2000, lambda now: now + 0.15),  # vivid's stamps are up to a frame in the future
     ],
 )
-def test_where_stamps_tell_nothing_no_frame_is_old_nor_from_the_future(bench, kernel, flags, stamp):
-    kernel.flags, kernel.stamp = flags, stamp
+def test_where_stamps_tell_nothing_no_frame_is_old_nor_from_the_future(bench, fake, flags, stamp):
+    fake.flags, fake.stamp = flags, stamp
     bench.clock = VirtualClock(utc=1_700_000_000.0, monotonic=500.0)
     with bench.device() as device:
         time.sleep(0.1)  # the queue fills with frames of unknown age
-        begin = kernel.made_by(time.monotonic())
+        begin = fake.made_by(time.monotonic())
         called = time.monotonic()
         frame = device.capture()
         took = time.monotonic() - called
@@ -74,27 +62,27 @@ def test_where_stamps_tell_nothing_no_frame_is_old_nor_from_the_future(bench, ke
     assert frame.utc - frame.monotonic == pytest.approx(1_700_000_000.0 - 500.0)
 
 
-def test_manual_controls_are_set(bench, kernel):
+def test_manual_controls_are_set(bench, fake):
     controls = {"power_line_frequency": 1}
     with bench.device(exposure_s=0.0156, gain=10, controls=controls) as device:
         frame = device.capture()
     stated = {"exposure_auto": 0.0, "exposure_s": 0.0156, "gain": 10.0, "power_line_frequency": 1.0}
     assert frame.settings.items() >= stated.items()
-    controls = AUTO_EXPOSURE, EXPOSURE, GAIN, FREQUENCY
-    assert [kernel.controls[c][4] for c in controls] == [1, 156, 10, 1]
-    kernel.obeys = lambda control, value: 128 if control == GAIN else value
+    controls = v4l2.AUTO_EXPOSURE, v4l2.EXPOSURE, v4l2.GAIN, v4l2.FREQUENCY
+    assert [fake.values[c] for c in controls] == [1, 156, 10, 1]
+    fake.obeys = lambda control, value: 128 if control == v4l2.GAIN else value
     with pytest.raises(errors.WrongDevice, match="gain was set to 10 and is 128"):
         bench.device(gain=10).open()
     with bench.device(gain=10, strict=False) as device:
         assert device.capture().settings["gain"] == 128.0
 
 
-def test_auto_by_name_leaves_it_to_the_camera_with_a_warning(bench, kernel):
+def test_auto_by_name_leaves_it_to_the_camera_with_a_warning(bench, fake):
     for options in ({}, {"focus": "auto", "exposure_s": "auto"}):
         with bench.device(**options) as device:
-            modes = kernel.controls[AUTO_FOCUS][4], kernel.controls[AUTO_EXPOSURE][4]
+            modes = fake.values[v4l2.AUTO_FOCUS], fake.values[v4l2.AUTO_EXPOSURE]
             assert modes == ((1, 3) if options else (0, 1))
-            kernel.controls[FOCUS][4] = 60 if options else 35
+            fake.values = {v4l2.FOCUS: 60 if options else 35}
             frame = device.capture()
     assert frame.exposure is None
     assert (frame.settings["focus_auto"], frame.settings["focus"]) == (1.0, 60.0)
@@ -102,56 +90,56 @@ def test_auto_by_name_leaves_it_to_the_camera_with_a_warning(bench, kernel):
         f"{name}: auto lets the camera change it; every change alters the calibration"
         for name in ("exposure_s", "focus")
     ]
-    kernel.obeys = lambda control, value: 1 if control == AUTO_FOCUS else value
+    fake.obeys = lambda control, value: 1 if control == v4l2.AUTO_FOCUS else value
     with pytest.raises(errors.WrongDevice, match="to let it change, set focus: auto"):
         bench.device().open()
 
 
-def test_a_camera_that_rounds_its_own_value_is_locked_at_what_it_takes(bench, kernel):
+def test_a_camera_that_rounds_its_own_value_is_locked_at_what_it_takes(bench, fake):
     """It reports 37 while it focuses automatically, and can be set in steps of 5."""
 
     def obeys(control, value):
-        if control == AUTO_FOCUS and value == 0:
-            kernel.controls[FOCUS][4] = 0  # loses its position
-        return value // 5 * 5 if control == FOCUS else value
+        if control == v4l2.AUTO_FOCUS and value == 0:
+            fake.controls[v4l2.FOCUS][4] = 0  # loses its position
+        return value // 5 * 5 if control == v4l2.FOCUS else value
 
-    kernel.controls[FOCUS][4], kernel.obeys = 37, obeys
+    fake.controls[v4l2.FOCUS][4], fake.obeys = 37, obeys
     for _ in range(2):
         with bench.device() as device:
             assert device.capture().settings["focus"] == 35.0
 
 
-def test_the_stanza_has_the_current_values(kernel, tmp_path):
+def test_the_stanza_has_the_current_values(fake, tmp_path):
     node = tmp_path / "sys/class/video4linux/video0"
     node.mkdir(parents=True)
     (node / "name").write_text("Fake Webcam\n")
     (node / "index").write_text("0\n")
     (found,) = V4l2Camera.attached(str(tmp_path / "sys"), str(tmp_path))
     assert found.options == {
-        "device": str(kernel.path), "width": 1920, "height": 1080, "pixel_format": "MJPG",
+        "device": str(fake.path), "width": 1920, "height": 1080, "pixel_format": "MJPG",
         "exposure_s": 0.025, "gain": 64, "focus": 35,
     }  # fmt: skip
-    assert kernel.controls[AUTO_FOCUS][4] == 1  # nothing was set
+    assert fake.controls[v4l2.AUTO_FOCUS][4] == 1  # nothing was set
 
 
-def test_a_single_broken_frame_is_skipped(bench, kernel):
+def test_a_single_broken_frame_is_skipped(bench, fake):
     with bench.device() as device:
         sequence = device.capture().sequence
-        kernel.broken = set(range(sequence + 1, sequence + 5))
+        fake.broken = set(range(sequence + 1, sequence + 5))
         assert device.capture().sequence >= sequence + 5
 
 
-def test_by_serial_number(bench, kernel, tmp_path):
+def test_by_serial_number(bench, fake, tmp_path):
     by_id = tmp_path / "v4l/by-id"
     by_id.mkdir(parents=True)
     device = bench.device(device=None, serial="8A3F", dev=str(tmp_path))
     with pytest.raises(errors.DeviceNotFound, match=r"8A3F"):
         device.open()
-    (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index0").symlink_to(kernel.path)
+    (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index0").symlink_to(fake.path)
     (by_id / "usb-046d_HD_Pro_Webcam_C920_8A3F-video-index1").symlink_to(tmp_path / "video1")
     with device:
         device.capture()
-    (by_id / "usb-046d_HD_Pro_Webcam_C920_18A3F-video-index0").symlink_to(kernel.path)
+    (by_id / "usb-046d_HD_Pro_Webcam_C920_18A3F-video-index0").symlink_to(fake.path)
     with pytest.raises(errors.WrongDevice, match="several match"):
         device.open()
 

@@ -52,9 +52,10 @@ FREE = [
         'secret: "{}', "password=x {}; connection refused", "(password=two {} words)",
         r"password=a\ {} host=x", "password = {} host=x", "b'password={}'", "password == '{}'",
         "{{'password': b'{}'}}", r'password="a\"{}" x', r"password='a\'{}' x", "password: '''{}'''",
-        'token "{}" was refused', "password is '{}'", "wrong password {}", "the wifi password is {}",
+        'token "{}" was refused', "password is '{}'", "wrong password {}",
         "curl --password {0} --token={0}", "password -> {}", ':password=>"{}"', "password%3D{}",
-        "<password>{}</password>", "password%3A%20{}", "{{'passwords': ['a', '{}']}}",
+        "<password>{}</password>", "the wifi password is {}",
+        "password%3A%20{}", "{{'passwords': ['a', '{}']}}",
         "credentials=('u', '{}')", 'tokens: ("{}", "b")', 'password: "a\n{}" x',
         "password:\n  {}\nx: 1",
         # of an address

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import gpiozero
 import linuxpy.ioctl
 import numpy as np
+import pytest
 import smbus2
 from gpiozero.pins.mock import MockFactory
 
@@ -66,6 +67,14 @@ class Bench:
     def device(self, **more: Any) -> Any:
         """Construct the driver, with further options."""
         return open_device(*self.driver, {**self.options, **more}, self.clock)
+
+    @contextmanager
+    def broken(self, attributes):
+        """Set attributes of the fake for a while."""
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in attributes.items():
+                patch.setattr(self.fake, name, value)
+            yield
 
 
 @contextmanager

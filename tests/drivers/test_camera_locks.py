@@ -76,9 +76,6 @@ def test_a_lock_that_does_not_hold_gives_no_frame_until_it_is_set_back(
 ):
     with bench.device() as device:
         device.capture()
-        with pytest.MonkeyPatch.context() as moved:
-            for name, value in change.items():
-                moved.setattr(bench.fake, name, value)
-            with pytest.raises(BadReading, match=message):
-                device.capture()
+        with bench.broken(change), pytest.raises(BadReading, match=message):
+            device.capture()
         device.capture()

@@ -149,37 +149,31 @@ COLUMNS = ("driver", "wrong", "options", "error", "message")
 @pytest.mark.parametrize(COLUMNS, rows(NOT_OPENED))
 def test_what_keeps_a_device_from_being_opened(bench, wrong, options, error, message):
     device = bench.device(**options)
-    with pytest.MonkeyPatch.context() as broken:
-        for name, value in wrong.items():
-            broken.setattr(bench.fake, name, value)
-        with pytest.raises(error, match=message):
-            device.open()
+    with bench.broken(wrong), pytest.raises(error, match=message):
+        device.open()
     assert all(one.closed for one in getattr(bench.fake, "instances", ()))
     if not wrong:
         return
-    with device, pytest.MonkeyPatch.context() as broken:
-        broken.setattr(bench.fake, name, value)
-        device.close()
-        # a camera's node may be root's until udev has handled it, or another camera's
-        transient = errors.TransientDeviceError
-        with pytest.raises(transient if bench.driver[1] == "v4l2" else errors.DeviceError):
-            device.open()
+    with device:
+        pass
+    # after a plug a camera's node may be root's until udev has handled it, or another camera's
+    seen = errors.TransientDeviceError if bench.driver[1] == "v4l2" else errors.DeviceError
+    with bench.broken(wrong), pytest.raises(seen):
+        device.open()
 
 
 @pytest.mark.parametrize(COLUMNS, rows(NOT_USED))
 def test_what_makes_a_device_fail(bench, wrong, options, error, message):
-    device = bench.device(**options)
+    device, (kind, name) = bench.device(**options), bench.driver
     begin = time.monotonic()
-    with device, pytest.MonkeyPatch.context() as broken:
-        for name, value in wrong.items():
-            broken.setattr(bench.fake, name, value)
-        with pytest.raises(error, match=message):
-            use(bench.driver[0], device)
+    with device:
+        with bench.broken(wrong), pytest.raises(error, match=message):
+            use(kind, device)
         assert time.monotonic() - begin < 2.0
-        if "hang_s" in wrong and bench.driver[1] == "picamera2":
+        if name == "picamera2" and "hang_s" in wrong:
             assert bench.fake.instances[-1].closed
     with device:
-        use(bench.driver[0], device)
+        use(kind, device)
     assert not any(one.requests_out for one in getattr(bench.fake, "instances", ()))
 
 

@@ -10,11 +10,7 @@ from thermocald.errors import DeviceDenied, DeviceTimeout, PermanentDeviceError
 from thermocald.hal import VirtualClock
 
 DRIVER = ("output", "relay")
-PROGRAMME = [
-    {"seconds": 100, "hold_c": None},
-    {"seconds": 1000, "hold_c": 45.0},
-    {"seconds": 100, "hold_c": None},
-]
+PROGRAMME = [{"seconds": s, "hold_c": c} for s, c in ((100, None), (1000, 45.0), (100, None))]
 LONG = [{"seconds": 5000, "hold_c": 45.0}]
 
 

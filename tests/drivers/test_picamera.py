@@ -13,7 +13,7 @@ DRIVER = ("camera", "picamera2")
 
 
 def test_a_frame_is_the_fresh_grey_plane_at_the_middle_of_its_exposure(bench, fake):
-    fake.stale = 3
+    fake.stale, fake.camera_controls, fake.standing = 3, {}, {}  # a lens of fixed focus
     with bench.device(exposure_s=0.1) as device:
         called = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         frame = device.capture()

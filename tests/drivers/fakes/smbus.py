@@ -21,7 +21,6 @@ class Chip:
 
     registers: dict[int, bytes] = field(default_factory=dict)
     on_write: Callable[[Chip, int, bytes], None] | None = None
-    on_read: Callable[[Chip, int], None] | None = None
     reply: bytes = b""
 
     def word(self, register: int, value: int) -> None:
@@ -51,8 +50,6 @@ class Bus:
 
     def _read(self, address: int, register: int, count: int) -> bytes:
         chip = self._chip(address)
-        if chip.on_read:
-            chip.on_read(chip, register)
         data = b"".join(
             chip.registers.get(register + k, b"")
             for k in range(count)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,32 +29,29 @@ def write(tmp_path):
     head = Head("M1", "M1", 10.0, CameraSpec("c", Sensor(64, 48, 0.001)), {"lens": Channel()})
     field = TestField.build(["a", "b", "c"], np.eye(3) * 1000)
 
-    def write_epochs(*epochs):
+    def write_epochs(images, lens=20.0, seen=None):
+        """Write an epoch for each image."""
         with RecordingWriter(tmp_path / "M1", head, field) as writer:
-            for epoch, image in epochs:
-                writer.append(epoch, image=image)
+            for k, image in enumerate(images, 1):
+                time, values = BEGIN + 10 * k, {"lens": np.broadcast_to(lens, len(images))[k - 1]}
+                one = Epoch(k, time, time + 1.5, values, observations=seen)
+                writer.append(one, image=image)
         return str(tmp_path / "M1")
 
     return write_epochs
 
 
-def epoch(i: int, temperature: float = 20.0, seen: Observations | None = None) -> Epoch:
-    time = BEGIN + 10 * i
-    return Epoch(i, time, time + 1.5, {"lens": temperature + i}, observations=seen)
-
-
-def replay(kind, write, *epochs, **options):
+def replay(kind, path, **options):
     clock = VirtualClock(utc=BEGIN + 100.0, monotonic=7.0)
-    return open_device(kind, "replay", {"recording": write(*epochs), **options}, clock)
+    return open_device(kind, "replay", {"recording": path, **options}, clock)
 
 
-def test_frames_keep_their_instants_and_bytes(write):
+def test_frames_keep_their_instants_and_bytes(write, tmp_path):
     """Regression: an empty file was no epoch, and a JPEG that is cut off was a `bad_frame`."""
     jpeg = b"\xff\xd8 not decoded here"
-    camera = replay("camera", write, (epoch(1), IMAGE), (epoch(2), jpeg), (epoch(3), IMAGE),
-                    (epoch(4), IMAGE), (epoch(5), IMAGE), (epoch(6), None))  # fmt: skip
-    for number, data in ((3, b""), (4, b"no picture")):
-        (Path(camera.where) / f"frames/00000{number}.png").write_bytes(data)
+    camera = replay("camera", write([IMAGE, jpeg, IMAGE, IMAGE, IMAGE, None]))
+    (tmp_path / "M1/frames/000003.png").write_bytes(b"")
+    (tmp_path / "M1/frames/000004.png").write_bytes(b"no picture")
     frames = []
     for _ in range(4):
         with camera:  # closed and opened, it goes on
@@ -65,7 +61,7 @@ def test_frames_keep_their_instants_and_bytes(write):
     assert [f.utc - BEGIN for f in frames] == [10.0, 20.0, 30.0, 40.0]
     assert [f.monotonic for f in frames[:2]] == pytest.approx([7.0 - 90.0, 7.0 - 80.0])
     assert [f.sequence for f in frames] == [1, 2, 3, 4]
-    (Path(camera.where) / "frames/000005.png").unlink()
+    (tmp_path / "M1/frames/000005.png").unlink()
     for error, message in (
         (BadReading, "000005.png: cannot be read: No such file"),
         (BadReading, "epoch 6 has no frame"),
@@ -76,13 +72,12 @@ def test_frames_keep_their_instants_and_bytes(write):
 
 
 def test_loop_goes_on_in_time(write):
-    with replay("camera", write, (epoch(1), IMAGE), (epoch(2), IMAGE), loop=True) as camera:
+    with replay("camera", write([IMAGE] * 2), loop=True) as camera:
         assert [camera.capture().utc - BEGIN for _ in range(5)] == [10, 20, 30, 40, 50]
 
 
 def test_readings_keep_their_own_instants(write):
-    epochs = ((epoch(1), IMAGE), (epoch(2, np.nan), IMAGE), (epoch(3), IMAGE))
-    with replay("thermometer", write, *epochs) as device:
+    with replay("thermometer", write([IMAGE] * 3, lens=[21.0, np.nan, 23.0])) as device:
         first = device.read()
         with pytest.raises(BadReading, match="epoch 2 has no temperature"):
             device.read()
@@ -94,7 +89,7 @@ def test_readings_keep_their_own_instants(write):
 def test_measurements_come_without_a_picture(write):
     targets, points = np.array([2, 0]), np.array([[1.5, 2.5], [3.25, 4.0]])
     seen = Observations(targets, points, np.full((2, 2), 0.04), np.array([1e-4, -1e-4]))
-    with replay("camera", write, (epoch(1, seen=seen), None)) as camera:
+    with replay("camera", write([None], seen=seen)) as camera:
         frame = camera.capture()
     field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: by name, not by row
     found = observations_from_lists(frame.observations, field)
@@ -120,7 +115,7 @@ def test_a_sensor_of_another_size_than_its_frames_is_an_error_before_the_start(
     write, tmp_path, driver
 ):
     """Regression: frames had no result, one by one; recorded image points had a wrong x0, y0."""
-    path = write((epoch(1), IMAGE))
+    path = write([IMAGE])
     options = {"recording": path} if driver == "replay" else {}
     camera = {"name": "c", "driver": driver, "testfield": f"{path}/testfield.csv", **options}
     sensor, size = {"pixel_pitch_mm": 0.001}, [(64, 48), (3280, 2464)][driver == "mock"]

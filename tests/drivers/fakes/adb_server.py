@@ -14,7 +14,7 @@ import struct
 import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -136,10 +136,10 @@ class AdbServer(LineServer):
 
     def _serve(self, line: socket.socket) -> None:
         with line, contextlib.suppress(OSError, ValueError, struct.error):
-            self._host(line)
+            self._host(line, line.makefile("rb"))
 
-    def _host(self, line: socket.socket) -> None:
-        request = _request(line)
+    def _host(self, line: socket.socket, stream: BinaryIO) -> None:
+        request = _request(stream)
         if request == "host:version":
             _block(line, "0029")
         elif request == "host:devices":
@@ -152,7 +152,7 @@ class AdbServer(LineServer):
             phone = self._phone(line, match[1])
             if phone:
                 line.sendall(b"OKAY" + struct.pack("<Q", 1))
-                self._device(line, phone)
+                self._device(line, stream, phone)
 
     def _phone(self, line: socket.socket, serial: str) -> FakePhone | None:
         phone = self.phones.get(serial)
@@ -163,8 +163,8 @@ class AdbServer(LineServer):
         time.sleep(phone.hang_s)
         return phone
 
-    def _device(self, line: socket.socket, phone: FakePhone) -> None:
-        request = _request(line)
+    def _device(self, line: socket.socket, stream: BinaryIO, phone: FakePhone) -> None:
+        request = _request(stream)
         line.sendall(b"OKAY")
         if request.startswith("shell,v2:"):
             text = phone.shell(request.removeprefix("shell,v2:")).encode()
@@ -174,11 +174,11 @@ class AdbServer(LineServer):
         elif request.startswith("shell:"):
             line.sendall(phone.shell(request.removeprefix("shell:")).encode())
         elif request == "sync:":
-            self._sync(line, phone)
+            self._sync(line, stream, phone)
 
-    def _sync(self, line: socket.socket, phone: FakePhone) -> None:
-        command, size = struct.unpack("<4sI", _exactly(line, 8))
-        path = _exactly(line, size).decode()
+    def _sync(self, line: socket.socket, stream: BinaryIO, phone: FakePhone) -> None:
+        command, size = struct.unpack("<4sI", stream.read(8))
+        path = stream.read(size).decode()
         if command == b"LIST":
             entries = [(".", 0o040755, 0)]
             if path == phone.folder:
@@ -198,18 +198,8 @@ class AdbServer(LineServer):
             line.sendall(b"DONE" + bytes(4))
 
 
-def _exactly(line: socket.socket, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        piece = line.recv(count - len(data))
-        if not piece:
-            raise ConnectionError
-        data += piece
-    return data
-
-
-def _request(line: socket.socket) -> str:
-    return _exactly(line, int(_exactly(line, 4), 16)).decode()
+def _request(stream: BinaryIO) -> str:
+    return stream.read(int(stream.read(4), 16)).decode()
 
 
 def _block(line: socket.socket, text: str) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import smbus2
 
 from tests.drivers.fakes.adb_server import AdbServer, wait_little
+from tests.drivers.fakes.smbus import Bus
 from tests.drivers.fakes.sysfs import Sysfs
 from tests.drivers.laboratory import LABORATORY
 
@@ -27,6 +29,15 @@ def bench(driver, tmp_path, monkeypatch):
 def fake(bench):
     """What stands below the driver."""
     return bench.fake
+
+
+@pytest.fixture
+def bus(monkeypatch):
+    """An SMBus adapter, which every driver releases."""
+    adapter = Bus()
+    monkeypatch.setattr(smbus2, "SMBus", adapter)
+    yield adapter
+    assert adapter.opened == 0
 
 
 @pytest.fixture

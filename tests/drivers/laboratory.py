@@ -77,6 +77,12 @@ class Bench:
             yield
 
 
+def aside(path):
+    """Return how to unplug and plug what is a path, by its name."""
+    away = path.with_name("away")
+    return lambda: path.rename(away), lambda: away.rename(path)
+
+
 @contextmanager
 def on_loopback(server, options, tmp_path, monkeypatch, clock=VirtualClock):
     """An output to a server on loopback; unplugging breaks the connections and stops the server."""
@@ -98,11 +104,11 @@ def on_loopback(server, options, tmp_path, monkeypatch, clock=VirtualClock):
 @contextmanager
 def script(tmp_path, monkeypatch):
     """A program; unplugging deletes it."""
-    hook, away = tmp_path / "hook", tmp_path / "away"
+    hook = tmp_path / "hook"
     hook.write_text("#!/bin/sh\ncat > /dev/null\n")
     hook.chmod(0o755)
     options = {"command": [str(hook)], **WHEN, "timeout_s": 5}
-    yield Bench(options, lambda: hook.rename(away), lambda: away.rename(hook), gone=DeviceNotFound)
+    yield Bench(options, *aside(hook), gone=DeviceNotFound)
 
 
 @contextmanager
@@ -237,7 +243,7 @@ def v4l2(tmp_path, monkeypatch):
 @contextmanager
 def replay(tmp_path, monkeypatch):
     """A recording, unplugged by moving its folder away."""
-    path, away = tmp_path / "M1", tmp_path / "away"
+    path = tmp_path / "M1"
     head = Head("M1", "M1", 10.0, CameraSpec("c", Sensor(64, 48, 0.001)), {"lens": Channel()})
     field = TestField.build(["a", "b"], [[0, 0, 0], [1000, 0, 0]])
     image = np.zeros((48, 64), dtype=np.uint8)
@@ -245,13 +251,8 @@ def replay(tmp_path, monkeypatch):
         for i in range(1, 30):
             epoch = Epoch(i, 1.6e9 + 10 * i, 1.6e9 + 10 * i + 1, {"lens": 20.0 + 0.1 * i})
             writer.append(epoch, image=image)
-    yield Bench(
-        {"recording": str(path)},
-        unplug=lambda: path.rename(away),
-        plug=lambda: away.rename(path),
-        clock=VirtualClock(utc=1.6e9 + 1000.0),  # its times are in the past
-        gone=DeviceNotFound,
-    )
+    clock = VirtualClock(utc=1.6e9 + 1000.0)  # its times are in the past
+    yield Bench({"recording": str(path)}, *aside(path), clock=clock, gone=DeviceNotFound)
 
 
 @contextmanager

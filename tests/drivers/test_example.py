@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import smbus2
 
-from tests.drivers.fakes.smbus import Bus, Chip
+from tests.drivers.fakes.smbus import Chip
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceNotFound
 from thermocald.hal import Thermometer, VirtualClock
 
@@ -31,15 +31,6 @@ def example(monkeypatch):
     return device
 
 
-@pytest.fixture
-def bus(monkeypatch):
-    bus = Bus()
-    monkeypatch.setattr(smbus2, "SMBus", bus)
-    bus.chips[0x4D] = Chip({0: b"\x19", 1: b"\x40"})
-    yield bus
-    assert bus.opened == 0
-
-
 def test_the_readme_shows_this_file():
     code = (DRIVERS / "example_thermometer.py").read_text()
     assert f"```python\n{code}```" in (DRIVERS / "README.md").read_text()
@@ -47,6 +38,8 @@ def test_the_readme_shows_this_file():
 
 
 def test_it_keeps_the_contract(example, bus):
+    registers = {0: b"\x19", 1: b"\x40"}
+    bus.chips[0x4D] = Chip(dict(registers))
     with pytest.raises(ConfigurationError, match="address: is 80"):
         type(example)(clock=VirtualClock(), address=0x50)
     with pytest.raises(DeviceGone):
@@ -55,11 +48,10 @@ def test_it_keeps_the_contract(example, bus):
     with pytest.raises(DeviceNotFound):
         example.open()
     bus.error = 0
-    registers = bus.chips[0x4D].registers
     with example:
         assert isinstance(example, Thermometer)
         for raw, celsius in ((0x19, 25.0), (0xFF, -1.0), (0xBF, -65.0), (0, 0.0)):
-            registers[0] = bytes([raw])
+            bus.chips[0x4D].registers[0] = bytes([raw])
             reading = example.read()
             assert reading.values == {"temperature": celsius}
             assert (reading.monotonic, reading.utc) == (0.0, example.clock.utc())

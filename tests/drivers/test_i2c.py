@@ -3,21 +3,11 @@
 from __future__ import annotations
 
 import pytest
-import smbus2
 from thermocald_drivers.i2c import Lm75Thermometer, crc8
 
 from tests.drivers.fakes.chips import CHIPS, bme280, lm75, mcp9808, sht3x, tmp117
-from tests.drivers.fakes.smbus import Bus
 from thermocald import errors
 from thermocald.hal import VirtualClock, open_device
-
-
-@pytest.fixture
-def bus(monkeypatch):
-    adapter = Bus()
-    monkeypatch.setattr(smbus2, "SMBus", adapter)
-    yield adapter
-    assert adapter.opened == 0  # every driver releases the bus
 
 
 def thermometer(name, **options):

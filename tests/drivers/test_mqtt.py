@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import ssl
-import time
 from contextlib import closing
 
 import pytest
@@ -68,11 +67,6 @@ def test_a_line_that_breaks_leaves_the_will(bench):
     with bench.device() as device:
         device.emit(RESULT)
         bench.unplug()
-        deadline = time.monotonic() + 2
-        while device.connected and time.monotonic() < deadline:
-            time.sleep(0.01)
-        with pytest.raises(DeviceGone):
-            device.emit(RESULT)
     assert bench.fake.messages[-1] == ("thermocald/thermocald/available", b"offline", True)
 
 

@@ -49,6 +49,7 @@ WRONG = {
         ({"pattern": PATTERN, "framing": "9N1"}, "framing: '9N1' is not data bits, parity"),
         ({"instrument": "acme"}, "instrument: is 'acme'; must be 'papouch-tm'"),
         ({"pattern": PATTERN, "unit": "mA"}, "mA needs scale"),
+        ({"pattern": PATTERN, "scale": 0.0}, "0 makes every number the same"),
         ({"pattern": PATTERN, "chip": "sht99"}, "chip: 'sht99' is not one of"),
         ({"pattern": PATTERN, "command": "T°"}, "command"),
     ]),
@@ -77,12 +78,13 @@ WRONG = {
         ({"password_file": "y"}, "username"), ({"key": "y"}, "cert"),
         *(({"topic": topic}, "is not a topic") for topic in ("", "/$SYS", "a/#"))]),
     ("output", "alert_mail"): (OPEN, [
-        ({}, "without TLS"), ({"recipients": ["x"]}, r"recipients\[0\]: 'x' is not an e-mail")]),
+        ({}, "without TLS"), ({"username": None}, "one needs the other"),
+        ({"recipients": ["x"]}, r"recipients\[0\]: 'x' is not an e-mail")]),
     ("output", "alert_exec"): ({"command": ["true"]}, [
         ({"when": [when]}, "when") for when in (
             {}, {"drift": "c"}, {"drift": "c", "px": 1, "sds": 2}, {"temperature": "t"},
             {"no_result": 1, "px": 2}, {"temperature": "t", "above_c": 5, "below_c": 4})
-    ]),
+    ] + [({"when": [{"no_result": 1}] * 2}, "no_result is given twice")]),
     ("output", "jsonl"): ({}, [({"path": ""}, "path: '' is empty or holds a NUL")]),
 }  # fmt: skip
 MISSING = [

@@ -21,17 +21,11 @@ WHEN = [{"drift": "c", "px": 0.5}]
 
 def results(series, **fixed):
     """Return results of which the columns have the values of `series`, {column: values}."""
-    name, values = next(iter(series.items()))
+    ((name, values),) = series.items()
+    common = {"device": "cam", "status": "ok", **fixed}
     return [
-        {
-            "device": "cam",
-            "epoch": k,
-            "status": "ok",
-            "frame_time": 1.6e9 + 10 * k,
-            name: v,
-            **fixed,
-        }
-        for k, v in enumerate(values)
+        {**common, "epoch": k, "frame_time": 1.6e9 + 10 * k, name: value}
+        for k, value in enumerate(values)
     ]
 
 

@@ -165,8 +165,8 @@ def test_what_keeps_a_device_from_being_opened(bench, wrong, options, error, mes
 @pytest.mark.parametrize(COLUMNS, rows(NOT_USED))
 def test_what_makes_a_device_fail(bench, wrong, options, error, message):
     device, (kind, name) = bench.device(**options), bench.driver
-    begin = time.monotonic()
     with device:
+        begin = time.monotonic()
         with bench.broken(wrong), pytest.raises(error, match=message):
             use(kind, device)
         assert time.monotonic() - begin < 2.0

@@ -192,7 +192,7 @@ def test_opencv_where_linuxpy_is_missing(bench, monkeypatch):
         begin = time.monotonic()
         with pytest.raises(errors.DeviceTimeout, match=r"no new frame in 0\.5 s"):
             device.capture()
-    assert time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin < 2.0
     assert not capture.released
     capture.stall.set()
     deadline = time.monotonic() + 2.0

@@ -97,34 +97,23 @@ def test_measurements_come_without_a_picture(write):
     assert found.targets.tolist() == [0, 2]
     assert np.array_equal(found.points, seen.points)
     assert np.array_equal(found.covariances, seen.covariances)
+    for changed in ({"target": None}, {"x": [1.0]}, {"sxy": [0.0]}, {"sy": ["a"] * 2}):
+        with pytest.raises(TestFieldError, match="with an entry for each target"):
+            observations_from_lists(frame.observations | changed, field)
 
 
-@pytest.mark.parametrize(
-    "changed", [{"target": None}, {"x": [1.0]}, {"sxy": [0.0]}, {"sy": ["a"] * 2}]
-)
-def test_measurements_that_do_not_match_have_a_clear_error(changed):
-    lists = {"target": ["a", "b"], **{key: [1.0, 2.0] for key in ("x", "y", "sx", "sy")}}
-    field = TestField.build(["a", "b"], np.eye(3)[:2])
-    assert len(observations_from_lists(lists, field)) == 2
-    with pytest.raises(TestFieldError, match="with an entry for each target"):
-        observations_from_lists(lists | changed, field)
-
-
-@pytest.mark.parametrize("driver", ["replay", "mock"])
+@pytest.mark.parametrize(("driver", "size"), [("replay", (64, 48)), ("mock", (3280, 2464))])
 def test_a_sensor_of_another_size_than_its_frames_is_an_error_before_the_start(
-    write, tmp_path, driver
+    write, tmp_path, driver, size
 ):
     """Regression: frames had no result, one by one; recorded image points had a wrong x0, y0."""
-    path = write([IMAGE])
+    path, config = write([IMAGE]), tmp_path / "config.yaml"
     options = {"recording": path} if driver == "replay" else {}
     camera = {"name": "c", "driver": driver, "testfield": f"{path}/testfield.csv", **options}
-    sensor, size = {"pixel_pitch_mm": 0.001}, [(64, 48), (3280, 2464)][driver == "mock"]
-    text = {}
+    said = []
     for width, height in (size, (65, 48)):
-        sensor |= {"width_px": width, "height_px": height}
-        config = tmp_path / "config.yaml"
-        config.write_text(json.dumps({"cameras": [{**camera, "sensor": sensor}]}))
-        text[width] = answer("check", config)
-    assert text[size[0]].exit_code == 0
-    assert text[65].exit_code == 1
-    assert f"sensor has 65×48 px, but the driver's frames have {size[0]}" in str(text[65])
+        camera["sensor"] = {"width_px": width, "height_px": height, "pixel_pitch_mm": 0.001}
+        config.write_text(json.dumps({"cameras": [camera]}))
+        said.append(answer("check", config))
+    assert [result.exit_code for result in said] == [0, 1]
+    assert f"sensor has 65×48 px, but the driver's frames have {size[0]}×{size[1]}" in str(said[1])

@@ -34,7 +34,7 @@ from tests.drivers.fakes.sysfs import Sysfs, w1_slave
 from tests.drivers.fakes.v4l2_kernel import FakeCamera
 from tests.drivers.small_camera import write_small_camera
 from thermocald.epoch import Epoch
-from thermocald.errors import DeviceError, DeviceGone, DeviceNotFound
+from thermocald.errors import BadReading, DeviceError, DeviceGone, DeviceNotFound
 from thermocald.hal import Clock, SystemClock, VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
@@ -75,6 +75,17 @@ class Bench:
             for name, value in attributes.items():
                 patch.setattr(self.fake, name, value)
             yield
+
+
+def check_readings(device, put, steps):
+    """Read after each output that is put below a driver; steps: (output, °C or the refusal)."""
+    for output, expected in steps:
+        put(output)
+        if isinstance(expected, str):
+            with pytest.raises(BadReading, match=expected):
+                device.read()
+        else:
+            assert [*device.read().values.values()] == [pytest.approx(expected, abs=1e-9)], output
 
 
 def aside(path):

@@ -10,6 +10,7 @@ from thermocald_drivers.android import exif, exposure_start
 from thermocald_drivers.android_phone import AdbPhone
 
 from tests.drivers.fakes.adb_server import photograph, shoot
+from tests.drivers.laboratory import check_readings
 from thermocald import errors
 from thermocald.hal import VirtualClock
 
@@ -136,25 +137,22 @@ ASKED = r"unit of 45 is unknown; set units: \{soc: degC\}"
 
 @THERMOMETER
 @pytest.mark.parametrize(
-    ("source", "units", "numbers", "expected"),
+    ("source", "units", "steps"),
     [
-        ("zone:cpu", {}, (37000, 900), [37.0, 0.9]),  # and not 90 °C
-        ("zone:tsens_tz_sensor5", {}, (45, 309, 45, 0), [ASKED, 30.9, 4.5, 0.0]),
-        ("zone:tsens_tz_sensor5", {"soc": "tenths"}, (45,), [4.5]),
+        ("zone:cpu", {}, [(37000, 37.0), (900, 0.9)]),  # and not 90 °C
+        ("zone:tsens_tz_sensor5", {}, [(45, ASKED), (309, 30.9), (45, 4.5), (0, 0.0)]),
+        ("zone:tsens_tz_sensor5", {"soc": "tenths"}, [(45, 4.5)]),
         # in a frost
-        ("battery", {}, (55, 92, 61, 24, 5, 45), ["unknown unit", 9.2, 6.1, 2.4, 0.5, 4.5]),
+        ("battery", {}, [(55, "unknown unit"), (92, 9.2), (61, 6.1), (24, 2.4), (5, 0.5)]),
     ],
 )
-def test_a_unit_that_was_certain_once_is_kept(bench, fake, source, units, numbers, expected):
+def test_a_unit_that_was_certain_once_is_kept(bench, fake, source, units, steps):
+    def put(number):
+        fake.zones = f"{source.partition(':')[2]} {number}\n"
+        fake.battery = f"present: true\nvoltage: 3900\ntemperature: {number}\n"
+
     with bench.device(sensors={"soc": source}, units=units) as device:
-        for number, celsius in zip(numbers, expected, strict=True):
-            fake.zones = f"{source.partition(':')[2]} {number}\n"
-            fake.battery = f"present: true\nvoltage: 3900\ntemperature: {number}\n"
-            if isinstance(celsius, str):
-                with pytest.raises(errors.BadReading, match=celsius):
-                    device.read()
-            else:
-                assert device.read().values == {"soc": pytest.approx(celsius, abs=1e-9)}
+        check_readings(device, put, steps)
 
 
 @LOAD

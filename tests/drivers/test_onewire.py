@@ -11,6 +11,7 @@ import pytest
 from thermocald_drivers.onewire import decode
 
 from tests.drivers.fakes.sysfs import scratchpad, w1_slave
+from tests.drivers.laboratory import check_readings
 from thermocald.errors import BadReading, DeviceNotFound, DeviceTimeout
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
@@ -47,35 +48,36 @@ COUNTERFEIT = scratchpad("90 01 55 05 7f 7e 81 66", 25000)  # family D2 of C. Pe
 NEAR_10 = scratchpad("a8 00 4b 46 ff ff 0c 10", 84000)
 POWER_ON_10 = scratchpad("aa 00 4b 46 ff ff 0c 10", 85000)
 GX20MH01 = scratchpad("50 05 4b 46 ff ff 0c 10", 85046)  # 14 bits
-# (family, [(content, s until the next)], readings): a power-on value is accepted only near a
-# recent reading of another value
+IDLE = "power-on value"
+# (family, [(content and s before it, reading)]): a power-on value is accepted only near a recent
+# reading of another value
 AT_POWER_ON = {
-    "without a neighbour": ("28", [(NEAR, 0), (POWER_ON, 0)], [21.5, None]),
-    "on a ramp": ("28", [(HOT, 0), (POWER_ON, 0)], [84.937, 85.0]),
-    "long after a neighbour": ("28", [(HOT, 61), (POWER_ON, 0)], [84.937, None]),
-    "vouching for itself": ("28", [(HOT, 40), (POWER_ON, 40), (POWER_ON, 0)], [84.937, 85.0, None]),
-    "25 °C": ("28", [(COUNTERFEIT, 0), (NEAR, 0), (COUNTERFEIT, 0)], [None, 21.5, 25.0]),
-    "more bits": ("28", [(GX20MH01, 0), (HOT, 0), (GX20MH01, 0)], [None, 84.937, 85.046]),
-    "DS18S20": ("10", [(POWER_ON_10, 0), (NEAR_10, 0), (POWER_ON_10, 0)], [None, 84.0, 85.0]),
-    **{f"family {family}": (family, [(POWER_ON, 0), (HOT, 0), (POWER_ON, 0)], [None, 84.937, 85.0])
+    "without a neighbour": ("28", [((NEAR, 0), 21.5), ((POWER_ON, 0), IDLE)]),
+    "on a ramp": ("28", [((HOT, 0), 84.937), ((POWER_ON, 0), 85.0)]),
+    "long after a neighbour": ("28", [((HOT, 0), 84.937), ((POWER_ON, 61), IDLE)]),
+    "vouching for itself": (
+        "28", [((HOT, 0), 84.937), ((POWER_ON, 40), 85.0), ((POWER_ON, 40), IDLE)]),
+    "25 °C": ("28", [((COUNTERFEIT, 0), IDLE), ((NEAR, 0), 21.5), ((COUNTERFEIT, 0), 25.0)]),
+    "more bits": ("28", [((GX20MH01, 0), IDLE), ((HOT, 0), 84.937), ((GX20MH01, 0), 85.046)]),
+    "DS18S20": ("10", [((POWER_ON_10, 0), IDLE), ((NEAR_10, 0), 84.0), ((POWER_ON_10, 0), 85.0)]),
+    **{f"family {family}": (
+        family, [((POWER_ON, 0), IDLE), ((HOT, 0), 84.937), ((POWER_ON, 0), 85.0)])
        for family in ("22", "42", "3b")},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", AT_POWER_ON)
 def test_the_power_on_value_needs_a_neighbour(sysfs, case):
-    family, steps, expected = AT_POWER_ON[case]
+    family, steps = AT_POWER_ON[case]
     rom, clock = f"{family}-000000bfe244", VirtualClock()
+
+    def put(step):
+        sysfs.w1(rom, step[0])
+        clock.advance(step[1])
+
     sysfs.w1(rom, NEAR)
     with thermometer(sysfs, clock, sensors={"temperature": rom}) as device:
-        for (content, pause_s), celsius in zip(steps, expected, strict=True):
-            sysfs.w1(rom, content)
-            if celsius is None:
-                with pytest.raises(BadReading, match="power-on value"):
-                    device.read()
-            else:
-                assert device.read().values == {"temperature": celsius}
-            clock.advance(pause_s)
+        check_readings(device, put, steps)
 
 
 def test_a_crc_error_is_read_once_more(sysfs, monkeypatch):

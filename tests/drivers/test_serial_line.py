@@ -9,6 +9,7 @@ from contextlib import ExitStack, closing
 import pytest
 
 from tests.drivers.fakes.pty_instrument import Instrument
+from tests.drivers.laboratory import check_readings
 from thermocald import errors
 from thermocald.hal import SystemClock, open_device
 
@@ -145,29 +146,28 @@ def test_a_port_that_another_program_holds(instrument):
         asked(far).open()
 
 
+FEWER, ENDS = "fewer decimals than earlier lines", "begins or ends with its decimal point"
 CUT = {
-    "a decimal is lost": (["21.56", "21.57", "21.5"], [21.56, 21.57, None]),
-    "all decimals are lost": (["21.5", "21.4", "21"], [21.5, 21.4, None]),
-    "they end with the point": (["21.5", "21."], [21.5, None]),
-    "the first digits are lost": (["21.5", ".5", "-.5"], [21.5, None, None]),
-    "of a mantissa": (["2.156E+01", "2.15E+01"], [21.56, None]),
-    "again and again": (["21.50", "21.5", "21.4", "21.3", "21.51"], [21.5, *[None] * 3, 21.51]),
-    "trailing zeros are left out": (
-        ["21.56", "21.5", "21.4", "21", "21.3"], [21.56, None, None, 21.0, 21.3]),
-    "more decimals than before": (["9.5", "9.51"], [9.5, 9.51]),
-    "another sign and size": (["9.5", "10.5", "-1.5"], [9.5, 10.5, -1.5]),
+    "a decimal is lost": [("21.56", 21.56), ("21.57", 21.57), ("21.5", FEWER)],
+    "all decimals are lost": [("21.5", 21.5), ("21.4", 21.4), ("21", FEWER)],
+    "they end with the point": [("21.5", 21.5), ("21.", ENDS)],
+    "the first digits are lost": [("21.5", 21.5), (".5", ENDS), ("-.5", ENDS)],
+    "of a mantissa": [("2.156E+01", 21.56), ("2.15E+01", FEWER)],
+    "again and again": [("21.50", 21.5), ("21.5", FEWER), ("21.4", FEWER), ("21.3", FEWER),
+                        ("21.51", 21.51)],
+    "trailing zeros are left out": [("21.56", 21.56), ("21.5", FEWER), ("21.4", FEWER),
+                                    ("21", 21.0), ("21.3", 21.3)],
+    "more decimals than before": [("9.5", 9.5), ("9.51", 9.51)],
+    "another sign and size": [("9.5", 9.5), ("10.5", 10.5), ("-1.5", -1.5)],
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CUT)
 def test_a_number_that_lost_digits_is_none(instrument, case):
-    lines, expected = CUT[case]
-    far, found = instrument({}), []
+    far = instrument({})
+
+    def put(number):
+        far.answers[b"T?\r\n"] = f"T={number}\r\n".encode()
+
     with asked(far, pattern=r"T=(?P<temperature>\S+)") as device:
-        for line in lines:
-            far.answers[b"T?\r\n"] = f"T={line}\r\n".encode()
-            try:
-                found.append(device.read().values["temperature"])
-            except errors.BadReading:
-                found.append(None)
-    assert found == expected
+        check_readings(device, put, CUT[case])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from linuxpy.video import raw
 from thermocald_drivers.support import BAYER_ORDERS, FORMATS, decode, unpack_10
 
 from thermocald.errors import BadReading
@@ -38,7 +39,8 @@ def test_bayer_of_a_plain_colour_is_its_luminance(fourcc):
     """A wrong order would swap red and blue, 0.299 and 0.114, or their lowest bits."""
     eight = fourcc in ("RGGB", "BA81", "GBRG", "GRBG")
     colour = {"R": 200, "G": 100, "B": 40} if eight else {"R": 803, "G": 400, "B": 162}
-    tile = np.array([colour[letter] for letter in BAYER_ORDERS[fourcc]], "<u2").reshape(2, 2)
+    order = raw.PixelFormat(raw.v4l2_fourcc(*fourcc)).name[1:5]  # of the kernel: SGRBG10
+    tile = np.array([colour[letter] for letter in order], "<u2").reshape(2, 2)
     mosaic = np.tile(tile, (HEIGHT // 2, WIDTH // 2))
     data = (
         pack_10(mosaic) if fourcc.startswith("p") else mosaic.astype(np.uint8 if eight else "<u2")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 from thermocald_drivers.i2c import crc8
 
 from tests.drivers.fakes.smbus import Chip
@@ -54,16 +56,8 @@ def sht3x(temperature=0x6666, damage=0):
 
 
 # Calibration and raw values of the worked example of the BMP280 data sheet (BST-BMP280-DS001, 3.12)
-CALIBRATION = (
-    (27504).to_bytes(2, "little")
-    + (26435).to_bytes(2, "little", signed=True)
-    + (-1000).to_bytes(2, "little", signed=True)
-    + b"".join(
-        value.to_bytes(2, "little", signed=k > 0)
-        for k, value in enumerate((36477, -10685, 3024, 2855, 140, -7, 15500, -14600, 6000))
-    )
-    + bytes([0, 75])
-)
+# of the temperature: dig_T1 … dig_T3; the driver reads the 20 further bytes and ignores them
+CALIBRATION = struct.pack("<Hhh", 27504, 26435, -1000) + bytes(20)
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 

@@ -35,7 +35,7 @@ LONGEST = (
     "output/test_dashboard_browser", "cli/test_thermal_commands", "photogrammetry/test_circle",
     "test_secrets", "photogrammetry/test_mount", "analysis/test_thermal_model",
     "daemon/test_sessions", "cli/test_testfield", "output/test_dashboard", "analysis/test_gauge",
-    "output/test_board_print", "fleet/test_fleet", "drivers/test_sensor_properties",
+    "output/test_board_print", "fleet/test_fleet", "drivers/test_wrong_options",
     "analysis/test_missing_effect", "photogrammetry/test_adjustment", "fleet/test_reprocess",
     "analysis/test_online_filter", "store/test_hostile_input", "output/test_series_export",
     "cli/test_real_data", "test_names", "daemon/test_store_file", "store/test_wal",

@@ -26,6 +26,12 @@ def document(**changes) -> dict:
     }
 
 
+def camera(**changes) -> dict:
+    doc = document()
+    doc["cameras"][0] |= changes
+    return doc
+
+
 SENSOR = {"width_px": 3280, "height_px": 2464, "pixel_pitch_mm": 0.00112}
 
 
@@ -33,17 +39,12 @@ def parse(doc: dict, **kwargs) -> Config:
     return parse_config(doc, Path("/etc/thermocald/config.yaml"), **kwargs)
 
 
-def test_the_shipped_file_is_valid():
+def test_the_shipped_file_and_the_defaults():
     shipped = load_config(Path(__file__).parents[1] / "config.yaml", load_driver)
     assert [(c.name, c.driver) for c in shipped.cameras] == [("demo", "mock")]
     assert shipped.cameras[0].options == {"testfield": "markers", "seed": 1}
-    assert shipped.frames == parse(document()).frames.model_copy(
-        update={"folder": shipped.frames.folder}
-    )
-
-
-def test_defaults():
     config = parse(document(outputs=[{"name": "river", "driver": "mock"}]))  # the name of a camera
+    assert shipped.frames == config.frames.model_copy(update={"folder": shipped.frames.folder})
     assert config.store.durable
     assert config.cameras[0].period_s == 10.0
     assert config.cameras[0].calibration is None
@@ -60,40 +61,30 @@ def test_names_are_those_of_the_camera_model():
 
 def test_paths_are_relative_to_the_file(tmp_path):
     (tmp_path / "field.csv").touch()
-    doc = document(store={"path": "data/x.db"}, dashboard={"token_file": "~/token"})
-    doc["cameras"][0] |= {
-        "testfield": "field.csv",
-        "sensor": SENSOR,
-        "recording": "./M1",
-        "plain": "M1",
-        "options": {"testfield": "../f.csv", "list": [{"a": "./b"}]},
-    }
+    doc = camera(
+        testfield="field.csv", sensor=SENSOR, recording="./M1", plain="M1",
+        options={"testfield": "../f.csv", "list": [{"a": "./b"}]},
+    )  # fmt: skip
+    doc |= {"store": {"path": "data/x.db"}, "dashboard": {"token_file": "~/token"}}
     config = parse_config(doc, tmp_path / "config.yaml")
     assert config.store.path == tmp_path / "data" / "x.db"
     assert config.frames.folder == tmp_path / "frames"
     assert config.dashboard.token_file == Path("~/token").expanduser()
     assert config.cameras[0].testfield == tmp_path / "field.csv"
     assert config.cameras[0].options == {
-        "seed": 3,
-        "recording": str(tmp_path / "M1"),
-        "plain": "M1",
-        "testfield": str(tmp_path / "../f.csv"),
-        "list": [{"a": str(tmp_path / "b")}],
-    }
+        "seed": 3, "recording": str(tmp_path / "M1"), "plain": "M1",
+        "testfield": str(tmp_path / "../f.csv"), "list": [{"a": str(tmp_path / "b")}],
+    }  # fmt: skip
 
 
-def camera(**changes) -> dict:
-    doc = document()
-    doc["cameras"][0] |= changes
-    return doc
+def sensor(**changes) -> dict:
+    return camera(sensor={**SENSOR, **changes})
 
 
 BAD = [
     ({}, "neither a camera nor a thermometer"),
     ({"camera": []}, "camera: unknown; is 'cameras' meant?"),
     ({"format": "thermocald-model/1"}, "is a thermocald-model/1 file, not a configuration"),
-    (document(dashbord={}), "dashbord: unknown; is 'dashboard' meant?"),
-    (document(store={"pth": "x"}), "store.pth: unknown; is 'path' meant?"),
     (document(store={"path": ""}), "store.path: is ''; must not be empty"),
     (document(store={"xyz": 1}), "store.xyz: unknown; known are: path, durable"),
     (document(STORE={"path": "x"}), "STORE: unknown; is 'store' meant?"),
@@ -102,7 +93,6 @@ BAD = [
     (camera(period_s=0.01), "cameras[0].period_s: is 0.01; must be at least 0.05"),
     (camera(period_s="soon"), "cameras[0].period_s: is 'soon'; must be a number, without a unit"),
     (camera(period_s=True), "cameras[0].period_s: is True, as YAML reads yes, no, on, off; a num"),
-    (camera(principal_distance_mm=False), "cameras[0].principal_distance_mm: is False"),
     (camera(principal_distance_mm=0.00304), "cameras[0].principal_distance_mm: is 0.00304"),
     (camera(period_s=float("nan")), "cameras[0].period_s: is nan"),
     (camera(name=False), "cameras[0].name: is false; must be text; put it in quotes"),
@@ -110,69 +100,46 @@ BAD = [
     (camera(thermometers="lens"), "cameras[0].thermometers: is 'lens'; must be a list: [a, b]"),
     (document(calibration={"priors": {"c": 3}}), "priors.c: is 3; must hold `key: value` lines"),
     (document(forward={"to": "mysql://a/b"}), "forward.to: is 'mysql://a/b'; must begin with post"),
-    (camera(name="a b"), "cameras[0].name: is 'a b'"),
     (camera(name="../x"), "cameras[0].name: is '../x'"),
     (camera(driver=None), "cameras[0].driver: is empty; must be text"),
     (camera(testfield="f.csv"), "cameras[0]: `testfield` needs `sensor: {width_px: …"),
-    (
-        camera(testfield="none.csv", sensor=SENSOR),
-        "cameras[0].testfield: there is no file /etc/thermocald/none",
-    ),
+    (sensor(pixel_pitch_mm=1.12), "cameras[0].sensor.pixel_pitch_mm: is 1.12; must be at most 0.1"),
+    (camera(sensor={"width_px": 3280}), "cameras[0].sensor.height_px: is missing"),
     (camera(thermometers=["lens", "lens"]), "`thermometers` names one twice"),
     (camera(thermometers=["lense"]), "there is no thermometer 'lense'; is 'lens' meant?"),
-    (
-        camera(sensor={"width_px": 1, "height_px": 2464, "pixel_pitch_mm": 0.001}),
-        "cameras[0].sensor.width_px: is 1",
-    ),
-    (
-        camera(sensor={"width_px": 3280, "height_px": 2464, "pixel_pitch_mm": 1.12}),
-        "cameras[0].sensor.pixel_pitch_mm: is 1.12; must be at most 0.1",
-    ),
-    (camera(sensor={"width_px": 3280}), "cameras[0].sensor.height_px: is missing"),
-    (camera(calibration={"fre": []}), "cameras[0].calibration.fre: unknown; is 'free' meant?"),
     (document(calibration={"free": ["c", "f"]}), "calibration.free[1]: is 'f'"),
     (document(calibration={"free": ["c", "c"]}), "names a parameter twice"),
     (document(calibration={"fixed": {"c": 3.0}}), "c is both in `free` and in `fixed`"),
     (document(calibration={"priors": {"c": {"value": 3, "sd": 0}}}), "calibration.priors.c.sd"),
     (document(calibration={"priors": {"c": {"value": 0.003, "sd": 1}}}), "calibration: c is 0.003"),
-    (document(calibration={"free": [], "fixed": {"c": -3}}), "calibration: c is -3; a principal"),
-    (document(calibration={"exterior": "free"}), "'per_epoch'"),
     (document(frames={"keep": "some"}), "frames.keep: is 'some'"),
-    (document(frames={"max_size_gb": -1}), "frames.max_size_gb: is -1"),
     (document(dashboard={"host": "0.0.0.0"}), "give a token_file too"),
-    (document(dashboard={"port": 70000}), "dashboard.port: is 70000"),
-    (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
-    (document(cameras="none"), "cameras: is 'none'"),
     (camera(thermal_model="m", testfield="f"), "either `testfield` or `thermal_model`"),
     (camera(thermal_model="m", thermometers=[]), "`thermal_model` needs `thermometers`"),
-    (camera(thermal_model="m.yaml"), "cameras[0].thermal_model: there is no file"),
+    (
+        camera(thermal_model="m.yaml"),
+        "cameras[0].thermal_model: there is no file /etc/thermocald/m",
+    ),
     (camera(mount_sd_deg=0.01), "`mount_sd_deg` needs a `thermal_model`"),
     (camera(thermal_model="m", control_reference="r"), "`control_reference` needs `control_point"),
     (document(frames={"corrected": True}), "corrected needs a camera with a thermal_model"),
     (document(cameras=[{"name": "a", "driver": "m"}] * 2), "cameras: the name 'a' is duplicated"),
     (document(cameras=[{"name": "status", "driver": "m"}]), "choose another name"),
 ]
+OF_DRIVERS = [
+    (camera(sed=4), "cameras[0].sed: unknown; neither a key of this camera nor an option of"),
+    (camera(seed="b"), "cameras[0]: seed: is 'b'; must be a whole nu"),
+    (camera(driver="nikon"), "cameras[0].driver: there is no camera driver"),
+]
 
 
-@pytest.mark.parametrize(("doc", "message"), BAD)
+@pytest.mark.parametrize(("doc", "message"), [*BAD, *OF_DRIVERS])
 def test_what_is_wrong_is_named(doc, message):
+    load = load_driver if (doc, message) in OF_DRIVERS else None
     with pytest.raises(ConfigurationError, match=re.escape(message)) as caught:
-        parse(doc)
+        parse(doc, load_driver=load)
     assert str(caught.value).startswith("/etc/thermocald/config.yaml: ")
     assert "\n" not in str(caught.value)
-
-
-def test_options_are_checked_against_the_driver():
-    doc = camera(sed=4)
-    with pytest.raises(ConfigurationError, match=r"cameras\[0\].sed: unknown.* 'mock'; is 'seed'"):
-        parse(doc, load_driver=load_driver)
-    with pytest.raises(ConfigurationError, match=r"cameras\[0\]: seed: is 'b'; must be a whole nu"):
-        parse(camera(seed="b"), load_driver=load_driver)
-    with pytest.raises(ConfigurationError, match=r"\[0\].driver: there is no camera driver"):
-        parse(camera(driver="nikon"), load_driver=load_driver)
-    log = {"name": "log", "driver": "jsonl", "path": ""}
-    with pytest.raises(ConfigurationError, match=r"outputs\[0\]: path: '' is empty or holds a NUL"):
-        parse(document(outputs=[log]), load_driver=load_driver)
 
 
 def test_the_comments_of_config_yaml_name_drivers_that_exist():
@@ -190,16 +157,12 @@ def test_the_comments_of_config_yaml_name_drivers_that_exist():
 
 
 PLACES = {
-    "the store": ("./t.db", "is the store"),
-    "its -wal file": ("./t.db-wal", "is the store"),
-    "its -shm file": ("./t.db-shm", "is the store"),
-    "a link to the store": ("./link", "is the store"),
-    "a hard link to the store": ("./hard", "is the store"),
-    "a way round to the store": ("./a/../t.db", "is the store"),
-    "the configuration": ("./config.yaml", "is the configuration"),
-    "another output's": ("./one.jsonl", "is the file of output one"),
-    "another output's through a link": ("./alias", "is the file of output one"),
-}
+    **dict.fromkeys(("./t.db", "./t.db-wal", "./t.db-shm", "./link", "./hard", "./a/../t.db"),
+                    "is the store"),
+    "./config.yaml": "is the configuration",
+    "./one.jsonl": "is the file of output one",
+    "./alias": "is the file of output one",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -210,22 +173,17 @@ def test_outputs_do_not_write_into_what_is_not_theirs(tmp_path, place):
     (tmp_path / "alias").symlink_to("one.jsonl")
     os.link(tmp_path / "t.db", tmp_path / "hard")
     (tmp_path / "a").mkdir()
-    path, expected = PLACES[place]
-    document = {
-        "store": {"path": "t.db"},
-        "thermometers": [{"name": "housing", "driver": "mock"}],
-        "outputs": [{"name": "one", "driver": "jsonl", "path": "./one.jsonl"},
-                    {"name": "two", "driver": "jsonl", "path": path}],
-    }  # fmt: skip
-    with pytest.raises(ConfigurationError, match=expected) as caught:
-        parse_config(document, tmp_path / "config.yaml")
-    assert "outputs[1].path" in str(caught.value)
-    document["outputs"][1]["path"] = "./two.jsonl"
-    parse_config(document, tmp_path / "config.yaml")
-    document["frames"] = {"folder": "./t.db"}
+
+    def parse_places(two, one="./one.jsonl", **more):
+        outputs = [
+            {"name": n, "driver": "jsonl", "path": p} for n, p in (("one", one), ("two", two))
+        ]
+        doc = document(store={"path": "t.db"}, outputs=outputs, **more)
+        return parse_config(doc, tmp_path / "config.yaml")
+
+    with pytest.raises(ConfigurationError, match=rf"outputs\[1\]\.path.* {PLACES[place]}"):
+        parse_places(place)
+    parse_places("./two.jsonl")
     with pytest.raises(ConfigurationError, match=r"frames\.folder: is the store"):
-        parse_config(document, tmp_path / "config.yaml")
-    # several outputs may write to one device
-    outputs = [{"name": n, "driver": "jsonl", "path": "/dev/null"} for n in ("one", "two")]
-    document = {**document, "frames": {}, "outputs": outputs}
-    assert len(parse_config(document, tmp_path / "config.yaml").outputs) == 2
+        parse_places("./two.jsonl", frames={"folder": "./t.db"})
+    parse_places("/dev/null", "/dev/null")  # several outputs may write to one device

@@ -13,13 +13,13 @@ from thermocald import errors, hal
 from thermocald.errors import BadReading, ConfigurationError, DriverMissing, ThermocaldError
 from thermocald.hal import Frame, Reading, SystemClock, VirtualClock, load_driver
 
+IMAGE = np.zeros((4, 5), dtype=np.uint8)
+
 
 def test_a_frame_cannot_be_changed_and_holds_something():
-    frame = Frame(np.zeros((4, 5), dtype=np.uint8), 1.0, 2.0)
+    frame = Frame(IMAGE.copy(), 1.0, 2.0)
     with pytest.raises(ValueError, match="read-only"):
         frame.image[0, 0] = 1
-    with pytest.raises(AttributeError):
-        frame.utc = 3.0
     with pytest.raises(ValueError, match="needs an image"):
         Frame(None, 1.0, 2.0)
     assert Frame(None, 1.0, 2.0, encoded=b"\xff\xd8").image is None
@@ -38,29 +38,17 @@ def test_what_is_no_temperature_is_no_reading(value):
 
 @pytest.mark.parametrize("wrong", ["12", None, np.nan, np.inf])
 def test_times_and_settings_of_a_driver_are_numbers(wrong):
-    image = np.zeros((4, 5), dtype=np.uint8)
     for make in (
         lambda: Reading({"temperature": 20.0}, wrong, 2.0),
         lambda: Reading({"temperature": 20.0}, 1.0, wrong),
         lambda: Reading({}, 1.0, 2.0),
-        lambda: Frame(image, wrong, 2.0),
-        lambda: Frame(image, 1.0, wrong),
+        lambda: Frame(IMAGE, wrong, 2.0),
+        lambda: Frame(IMAGE, 1.0, wrong),
         lambda: Frame(None, 1.0, 2.0, encoded="text"),
-        lambda: Frame(image, 1.0, 2.0, settings={"focus": "near"}),
+        lambda: Frame(IMAGE, 1.0, 2.0, settings={"focus": wrong}),
     ):
         with pytest.raises(BadReading, match="its driver gives"):
             make()
-
-
-def test_virtual_clock_jumps_and_never_goes_back():
-    clock = VirtualClock(utc=1000.0, monotonic=5.0)
-    assert clock.sleep_until(3605.0)
-    assert (clock.monotonic(), clock.utc()) == (3605.0, 4600.0)
-    clock.sleep_until(10.0)
-    assert clock.monotonic() == 3605.0
-    clock.step_utc(-3600.0)
-    clock.advance(2.0)
-    assert (clock.monotonic(), clock.utc()) == (3607.0, 1002.0)
 
 
 @pytest.mark.parametrize("clock", [VirtualClock(), SystemClock()], ids=["virtual", "system"])
@@ -70,19 +58,30 @@ def test_clocks_keep_one_contract(clock):
     assert clock.sleep_until(begin + 0.02)
     assert clock.monotonic() >= begin + 0.02
     assert clock.utc() - utc == pytest.approx(clock.monotonic() - begin, abs=0.01)
-    assert clock.sleep_until(begin)  # a time in the past needs no waiting
+    assert clock.sleep_until(begin)  # a time in the past needs no waiting, and time never goes back
+    assert clock.monotonic() >= begin + 0.02
     wake = threading.Event()
     wake.set()
     assert not clock.sleep_until(clock.monotonic() + 60.0, wake)
 
 
-@pytest.mark.parametrize("kind", ["camera", "thermometer", "output"])
-def test_look_up_names_what_there_is(kind, monkeypatch):
-    assert "mock" in hal.driver_names(kind)
-    monkeypatch.setattr(hal.metadata, "entry_points", None)  # once, since all packages are searched
-    assert load_driver(kind, "mock").__name__.startswith("Mock")
-    with pytest.raises(ConfigurationError, match=f"no {kind} driver 'none'; installed are: .*mock"):
-        load_driver(kind, "none")
+def test_a_virtual_clock_jumps():
+    clock = VirtualClock(utc=1000.0, monotonic=5.0)
+    clock.sleep_until(3605.0)
+    clock.step_utc(-3600.0)
+    clock.advance(2.0)
+    assert (clock.monotonic(), clock.utc()) == (3607.0, 1002.0)
+
+
+def test_a_driver_is_looked_up_among_what_there_is(monkeypatch):
+    for kind in ("camera", "thermometer", "output"):
+        assert load_driver(kind, "mock").__name__.startswith("Mock")
+        with pytest.raises(ConfigurationError, match=f"no {kind} driver 'none'; .*are: .*mock"):
+            load_driver(kind, "none")
+    point = EntryPoint("lost", "thermocald_drivers.no_such_module:Lost", "thermocald.cameras")
+    monkeypatch.setattr(hal, "entry_points", lambda group: [point])
+    with pytest.raises(DriverMissing, match="'lost' cannot be imported"):
+        load_driver("camera", "lost")
 
 
 def test_a_devices_name_cannot_leave_its_comment():
@@ -90,21 +89,10 @@ def test_a_devices_name_cannot_leave_its_comment():
     assert found.about == "Cam?- {driver: evil}?[31m °"
 
 
-def test_a_driver_that_cannot_be_imported(monkeypatch):
-    point = EntryPoint("lost", "thermocald_drivers.no_such_module:Lost", "thermocald.cameras")
-    monkeypatch.setattr(hal, "entry_points", lambda group: [point])
-    with pytest.raises(DriverMissing, match="'lost' cannot be imported"):
-        load_driver("camera", "lost")
-
-
-def test_errors_are_one_tree_and_leaves_are_the_built_in_they_are():
+def test_errors_are_one_tree_as_it_is_drawn():
     tree = [c for _, c in inspect.getmembers(errors, inspect.isclass)]
+    assert all(f" {leaf.__name__}" in errors.__doc__ for leaf in tree)
     assert all(issubclass(leaf, ThermocaldError) for leaf in tree)
-    assert all(f" {leaf.__name__}" in errors.__doc__ for leaf in tree)  # as it is drawn
-    assert {leaf.exit_status for leaf in tree} == {1, 2, 3}
-    for leaf in tree:
-        if leaf is not ThermocaldError:
-            assert issubclass(leaf, ValueError | OSError)
-    transient, permanent = errors.TransientDeviceError, errors.PermanentDeviceError
     devices = {leaf for leaf in tree if issubclass(leaf, errors.DeviceError)} - {errors.DeviceError}
+    transient, permanent = errors.TransientDeviceError, errors.PermanentDeviceError
     assert all(issubclass(leaf, transient) != issubclass(leaf, permanent) for leaf in devices)

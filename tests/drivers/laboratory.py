@@ -1,4 +1,4 @@
-"""The laboratory: a bench for each driver, where the contract test sets it up and unplugs it.
+"""The laboratory: a bench for each driver, where tests set it up, break it and unplug it.
 
 `LABORATORY` has an entry (kind, driver) for each driver: a context manager of (tmp_path,
 monkeypatch) that yields a Bench and cleans up.
@@ -10,26 +10,32 @@ import errno
 import os
 import shutil
 import sys
-import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import gpiozero
+import linuxpy.ioctl
 import numpy as np
+import pytest
+import smbus2
+from gpiozero.pins.mock import MockFactory
 
 from tests.drivers.fakes import picamera2_stand_in
-from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph, wait_little
+from tests.drivers.fakes.adb_server import AdbServer, FakePhone, wait_little
 from tests.drivers.fakes.alert_servers import MailServer, WebServer
+from tests.drivers.fakes.chips import CHIPS
 from tests.drivers.fakes.mqtt_broker import Broker
 from tests.drivers.fakes.pty_instrument import Instrument
+from tests.drivers.fakes.smbus import Bus
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
 from tests.drivers.fakes.v4l2_kernel import FakeCamera
 from tests.drivers.small_camera import write_small_camera
 from thermocald.epoch import Epoch
-from thermocald.errors import DeviceError, DeviceGone, DeviceNotFound
-from thermocald.hal import Clock, SystemClock, VirtualClock
+from thermocald.errors import BadReading, DeviceError, DeviceGone, DeviceNotFound
+from thermocald.hal import Clock, SystemClock, VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.recording.head import CameraSpec, Channel, Head
@@ -45,15 +51,47 @@ class Bench:
 
     options: for the driver's constructor; unplug: makes the device vanish below the driver; plug:
     brings it back. clock: the driver's clock. says: the message of the first fault then; gone: the
-    error of an attempt to open it, which the daemon repeats.
+    error of an attempt to open it, which the daemon repeats. fake: what stands below the driver, of
+    which tests set attributes; driver: its (kind, name).
     """
 
     options: dict[str, Any]
     unplug: Callable[[], None]
     plug: Callable[[], None]
     clock: Clock = field(default_factory=VirtualClock)
-    says: str = ""
+    says: str | None = None
     gone: type[DeviceError] = DeviceGone
+    fake: Any = None
+    driver: tuple[str, str] = ("", "")
+
+    def device(self, **more: Any) -> Any:
+        """Construct the driver, with further options."""
+        return open_device(*self.driver, {**self.options, **more}, self.clock)
+
+    @contextmanager
+    def broken(self, attributes):
+        """Set attributes of the fake for a while."""
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in attributes.items():
+                patch.setattr(self.fake, name, value)
+            yield
+
+
+def check_readings(device, put, steps):
+    """Read after each output that is put below a driver; steps: (output, °C or the refusal)."""
+    for output, expected in steps:
+        put(output)
+        if isinstance(expected, str):
+            with pytest.raises(BadReading, match=expected):
+                device.read()
+        else:
+            assert [*device.read().values.values()] == [pytest.approx(expected, abs=1e-9)], output
+
+
+def aside(path):
+    """Return how to unplug and plug what is a path, by its name."""
+    away = path.with_name("away")
+    return lambda: path.rename(away), lambda: away.rename(path)
 
 
 @contextmanager
@@ -61,34 +99,27 @@ def on_loopback(server, options, tmp_path, monkeypatch, clock=VirtualClock):
     """An output to a server on loopback; unplugging breaks the connections and stops the server."""
     running = [server()]
     port = running[0].port
+    place = {"host": "127.0.0.1", "port": port}
+    if server is WebServer:
+        place = {"url": f"http://127.0.0.1:{port}/hook"}
     yield Bench(
-        {"port": port, "host": "127.0.0.1", **options},
+        {**place, "timeout_s": 1.0, **options},
         unplug=running[0].close,
         plug=lambda: running.append(server(port)),
         clock=clock(),
+        fake=running[0],
     )
     running[-1].close()
 
 
 @contextmanager
-def webhook(tmp_path, monkeypatch):
-    with on_loopback(WebServer, {**WHEN, "timeout_s": 2.0}, tmp_path, monkeypatch) as bench:
-        bench.options["url"] = (
-            f"http://{bench.options.pop('host')}:{bench.options.pop('port')}/hook"
-        )
-        yield bench
-
-
-@contextmanager
 def script(tmp_path, monkeypatch):
     """A program; unplugging deletes it."""
-    hook, away = tmp_path / "hook", tmp_path / "away"
+    hook = tmp_path / "hook"
     hook.write_text("#!/bin/sh\ncat > /dev/null\n")
     hook.chmod(0o755)
     options = {"command": [str(hook)], **WHEN, "timeout_s": 5}
-    bench = Bench(options, unplug=lambda: hook.rename(away), plug=lambda: away.rename(hook))
-    bench.gone = DeviceNotFound
-    yield bench
+    yield Bench(options, *aside(hook), gone=DeviceNotFound)
 
 
 @contextmanager
@@ -109,12 +140,7 @@ def on_sysfs(attach, says, options, tmp_path, monkeypatch):
 
 @contextmanager
 def on_i2c(name, tmp_path, monkeypatch):
-    """A chip on a fake SMBus adapter; unplugging frees its address."""
-    import smbus2
-
-    from tests.drivers.fakes.chips import CHIPS
-    from tests.drivers.fakes.smbus import Bus
-
+    """A chip on a fake SMBus adapter, which every driver releases; unplugging frees its address."""
     bus = Bus()
     monkeypatch.setattr(smbus2, "SMBus", bus)
     address, chip, _ = CHIPS[name]
@@ -123,14 +149,14 @@ def on_i2c(name, tmp_path, monkeypatch):
         {"bus": 1, "address": address},
         unplug=bus.chips.clear,
         plug=lambda: bus.chips.update({address: chip()}),
+        fake=bus,
     )
+    assert bus.opened == 0
 
 
 @contextmanager
 def on_pins(options, tmp_path, monkeypatch):
     """gpiozero's mock pins; unplugging removes the machine's pins."""
-    import gpiozero
-    from gpiozero.pins.mock import MockFactory
 
     def none(*_args):
         raise gpiozero.BadPinFactory("no pins here")
@@ -139,21 +165,15 @@ def on_pins(options, tmp_path, monkeypatch):
     monkeypatch.setattr(gpiozero.Device, "pin_factory", pins)
     monkeypatch.setattr(gpiozero.Device, "_default_pin_factory", staticmethod(none))
     put = partial(setattr, gpiozero.Device, "pin_factory")
-    yield Bench(options, lambda: put(None), lambda: put(pins), gone=DeviceNotFound)
+    yield Bench(options, lambda: put(None), lambda: put(pins), gone=DeviceNotFound, fake=pins)
     pins.close()
 
 
 @contextmanager
 def on_adb(options, tmp_path, monkeypatch):
     """A phone behind an adb server on loopback; unplugging removes it from the server's list."""
-
-    def shoot(phone):
-        when = phone.now()
-        taken = photograph(when, subsecond=f"{int(when % 1 * 1000):03d}")
-        phone.add(f"IMG_{len(phone.files):04d}.jpg", taken)
-
     wait_little(monkeypatch)
-    server, phone = AdbServer(), FakePhone(shoot=shoot)
+    server, phone = AdbServer(), FakePhone()
     phones = {"0A1B2C3D4E": phone}
     server.phones.update(phones)
     common = {"port": server.port, "start_server": False, "timeout_s": 2.0}
@@ -162,6 +182,7 @@ def on_adb(options, tmp_path, monkeypatch):
         unplug=server.phones.clear,
         plug=lambda: server.phones.update(phones),
         clock=SystemClock(),
+        fake=phone,
     )
     server.close()
 
@@ -198,28 +219,22 @@ def mock(options_of, tmp_path, monkeypatch):
 @contextmanager
 def picamera2(tmp_path, monkeypatch):
     """A stand-in with its API; unplugging empties libcamera's list and hangs captures."""
-    there = picamera2_stand_in.StandIn.cameras
     pi = type("Camera", (picamera2_stand_in.StandIn,), {"instances": []})
     monkeypatch.setitem(sys.modules, "picamera2", picamera2_stand_in.module(pi))
-    hung = threading.Event()
+    there = pi.cameras
 
-    def unplug():
-        pi.cameras, pi.hang = (), hung
+    def put(cameras, hang_s):
+        pi.cameras, pi.hang_s = cameras, hang_s
 
-    def plug():
-        hung.set()
-        pi.cameras, pi.hang = there, None
-
-    options = {"width": 96, "height": 64, "exposure_s": 0.002, "timeout_s": 0.3}
-    yield Bench(options, unplug, plug, clock=SystemClock())
-    hung.set()
+    options = {"width": 96, "height": 64, "exposure_s": 0.004, "timeout_s": 0.4}
+    yield Bench(
+        options, lambda: put((), 0.8), lambda: put(there, 0.0), clock=SystemClock(), fake=pi
+    )
 
 
 @contextmanager
 def v4l2(tmp_path, monkeypatch):
     """The ioctls of one camera; unplugging deletes the node, and they fail with ENODEV."""
-    import linuxpy.ioctl
-
     kernel = FakeCamera(tmp_path / "video0")
     monkeypatch.setattr(linuxpy.ioctl, "fcntl", SimpleNamespace(ioctl=kernel.ioctl))
     away = tmp_path / "away"
@@ -233,13 +248,13 @@ def v4l2(tmp_path, monkeypatch):
         kernel.errors = {}
 
     options = {"device": str(kernel.path), "width": 64, "height": 48, "pixel_format": "GREY"}
-    yield Bench({**options, "timeout_s": 0.5}, unplug, plug, SystemClock())
+    yield Bench({**options, "timeout_s": 0.5}, unplug, plug, SystemClock(), fake=kernel)
 
 
 @contextmanager
 def replay(tmp_path, monkeypatch):
     """A recording, unplugged by moving its folder away."""
-    path, away = tmp_path / "M1", tmp_path / "away"
+    path = tmp_path / "M1"
     head = Head("M1", "M1", 10.0, CameraSpec("c", Sensor(64, 48, 0.001)), {"lens": Channel()})
     field = TestField.build(["a", "b"], [[0, 0, 0], [1000, 0, 0]])
     image = np.zeros((48, 64), dtype=np.uint8)
@@ -247,13 +262,8 @@ def replay(tmp_path, monkeypatch):
         for i in range(1, 30):
             epoch = Epoch(i, 1.6e9 + 10 * i, 1.6e9 + 10 * i + 1, {"lens": 20.0 + 0.1 * i})
             writer.append(epoch, image=image)
-    yield Bench(
-        {"recording": str(path)},
-        unplug=lambda: path.rename(away),
-        plug=lambda: away.rename(path),
-        clock=VirtualClock(utc=1.6e9 + 1000.0),  # its times are in the past
-        gone=DeviceNotFound,
-    )
+    clock = VirtualClock(utc=1.6e9 + 1000.0)  # its times are in the past
+    yield Bench({"recording": str(path)}, *aside(path), clock=clock, gone=DeviceNotFound)
 
 
 @contextmanager
@@ -286,7 +296,7 @@ ROM = "28-000000bfe244"
 TMP117 = {"in_temp_raw": "1344", "in_temp_scale": "15.625"}
 
 
-def on_tree(attach, says="", **options):
+def on_tree(attach, says=None, **options):
     return partial(on_sysfs, attach, says, options)
 
 
@@ -320,14 +330,12 @@ LABORATORY = {
     ("thermometer", "replay"): replay,
     ("output", "alert_exec"): script,
     ("output", "alert_mail"): partial(on_loopback, MailServer, {**MAIL, "timeout_s": 2.0}),
-    ("output", "alert_mqtt"): partial(
-        on_loopback, Broker, {**WHEN, "timeout_s": 1.0}, clock=SystemClock
-    ),
-    ("output", "alert_webhook"): webhook,
+    ("output", "alert_mqtt"): partial(on_loopback, Broker, WHEN, clock=SystemClock),
+    ("output", "alert_webhook"): partial(on_loopback, WebServer, {**WHEN, "timeout_s": 2.0}),
     ("output", "android_load"): partial(on_adb, {"limit_c": 42, **PROGRAMME}),
     ("output", "jsonl"): fifo,
     ("output", "led"): partial(on_pins, {"pin": 17}),
-    ("output", "mqtt"): partial(on_loopback, Broker, {"timeout_s": 1.0}, clock=SystemClock),
+    ("output", "mqtt"): partial(on_loopback, Broker, {}, clock=SystemClock),
     ("output", "relay"): partial(on_pins, {"pin": 27, "limit_c": 60, **PROGRAMME}),
     ("output", "mock"): partial(mock, lambda _: {}),
 }

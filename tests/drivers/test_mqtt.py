@@ -5,86 +5,49 @@ from __future__ import annotations
 import json
 import re
 import ssl
-import time
+from contextlib import closing
 
 import pytest
 from thermocald_drivers.mqtt import discovery_messages, node_of
 
 from tests.drivers.fakes.certificate import own_context
 from tests.drivers.fakes.mqtt_broker import Broker
-from thermocald.errors import DeviceDenied, DeviceGone, DeviceTimeout
-from thermocald.hal import SystemClock, open_device
+from thermocald.errors import DeviceDenied, DeviceGone
 
+DRIVER = ("output", "mqtt")
+NODE = "thermocald/rpi_1-a6a219"
 RESULT = {"device": "rpi/1", "state": "steady", "status": "ok", "temperature": 31.25, "c": 3.041}
 
 
-@pytest.fixture
-def broker():
-    broker = Broker()
-    yield broker
-    broker.close()
-
-
-def output(broker, **options):
-    options = {"host": "127.0.0.1", "port": broker.port, "timeout_s": 0.5, **options}
-    return open_device("output", "mqtt", options, SystemClock())
-
-
-def topics(broker):
-    return [topic for topic, _, _ in broker.messages]
-
-
-def test_a_result_arrives_and_is_announced(broker):
-    with output(broker) as device:
+def test_a_result_arrives_and_is_announced(bench, tmp_path):
+    (tmp_path / "password").write_text("swordfish\n")
+    with bench.device(username="me", password_file=str(tmp_path / "password")) as device:
         device.emit(RESULT | {"sigma0": float("nan")})
         device.emit(RESULT)
-    topic = "thermocald/rpi_1-a6a219/result"
-    results = [json.loads(p) for t, p, _ in broker.messages if t == topic]
-    assert results == [RESULT | {"sigma0": None}, RESULT]
-    announced = [t for t in topics(broker) if t.startswith("homeassistant/")]
-    assert len(announced) == 11 == len(set(announced))
-    configuration = json.loads({t: p for t, p, _ in broker.messages}[announced[0]])
-    assert configuration["state_topic"] == "thermocald/rpi_1-a6a219/result"
-    assert configuration["unit_of_measurement"] == "°C"
-    sent = {t: json.loads(p) for t, p, _ in broker.messages if t in announced}
-    drift = next(m for t, m in sent.items() if "drift_x0_px" in t)
+    assert bench.fake.credentials == ("me", "swordfish")
+    by_topic = {}
+    for topic, payload, _ in bench.fake.messages:
+        by_topic.setdefault(topic, []).append(payload)
+    sent = [json.loads(payload) for payload in by_topic[f"{NODE}/result"]]
+    assert sent == [RESULT | {"sigma0": None}, RESULT]
+    assert by_topic[f"{NODE}/available"] == [b"online", b"offline"]
+    announced = {t: json.loads(p[0]) for t, p in by_topic.items() if t.startswith("homeassistant/")}
+    assert len(announced) == 11
+    first = next(iter(announced.values()))
+    assert (first["state_topic"], first["unit_of_measurement"]) == (f"{NODE}/result", "°C")
+    drift = next(m for t, m in announced.items() if "drift_x0_px" in t)
     assert (drift["unit_of_measurement"], drift["suggested_display_precision"]) == ("px", 2)
     # the last will is at `thermocald`: the device is available only together with it
     assert {a["topic"] for a in drift["availability"]} == {
-        "thermocald/rpi_1-a6a219/available", "thermocald/thermocald/available"
+        f"{NODE}/available", "thermocald/thermocald/available"
     }  # fmt: skip
-    available = [p for t, p, _ in broker.messages if t == "thermocald/rpi_1-a6a219/available"]
-    assert available == [b"online", b"offline"]
-
-
-def test_without_discovery(broker):
-    with output(broker, discovery=None) as device:
+    bench.fake.messages.clear()
+    with bench.device(discovery=None) as device:
         device.emit(RESULT)
-    assert not [t for t in topics(broker) if t.startswith("homeassistant/")]
+    assert not [t for t, *_ in bench.fake.messages if t.startswith("homeassistant/")]
 
 
-def test_username_and_password_file(broker, tmp_path):
-    (tmp_path / "password").write_text("swordfish\n")
-    with output(broker, username="me", password_file=str(tmp_path / "password")):
-        pass
-    assert broker.credentials == ("me", "swordfish")
-
-
-@pytest.mark.parametrize(
-    ("knobs", "error", "message"),
-    [
-        ({"refuse": 5}, DeviceDenied, "check username"),
-        ({"refuse": 3}, DeviceGone, "Server unavailable"),  # it only starts: asked again
-        ({"answer_connect": False}, DeviceTimeout, "no answer"),
-    ],
-)
-def test_a_broker_that_lets_nobody_in(broker, knobs, error, message):
-    vars(broker).update(knobs)
-    with pytest.raises(error, match=message):
-        output(broker).open()
-
-
-def test_a_certificate_is_not_yet_valid_until_the_clock_is_set(broker, monkeypatch):
+def test_a_certificate_is_not_yet_valid_until_the_clock_is_set(bench, monkeypatch):
     """A Raspberry Pi without a battery boots before the certificate's time."""
     error = ssl.SSLCertVerificationError(1, "certificate verify failed")
     error.verify_code, error.verify_message = 9, "certificate is not yet valid"
@@ -94,50 +57,30 @@ def test_a_certificate_is_not_yet_valid_until_the_clock_is_set(broker, monkeypat
 
     monkeypatch.setattr("paho.mqtt.client.Client.connect", refuse)
     with pytest.raises(DeviceGone, match="not yet valid"):
-        output(broker, tls=True).open()
+        bench.device(tls=True).open()
     error.verify_code = 10
     with pytest.raises(DeviceDenied, match="check ca"):
-        output(broker, tls=True).open()
+        bench.device(tls=True).open()
 
 
-def test_a_broker_that_stops_to_acknowledge(broker):
-    with output(broker) as device:
+def test_a_line_that_breaks_leaves_the_will(bench):
+    with bench.device() as device:
         device.emit(RESULT)
-        broker.acknowledge = False
-        begin = time.monotonic()
-        with pytest.raises(DeviceTimeout, match="acknowledgement"):
-            device.emit(RESULT)
-        assert time.monotonic() - begin < 1.0
-        broker.acknowledge = True
-
-
-def test_a_line_that_breaks_leaves_the_will(broker):
-    device = output(broker)
-    device.open()
-    device.emit(RESULT)
-    broker.close()
-    deadline = time.monotonic() + 2
-    while device.connected and time.monotonic() < deadline:
-        time.sleep(0.01)
-    with pytest.raises(DeviceGone):
-        device.emit(RESULT)
-    device.close()
-    assert broker.messages[-1] == ("thermocald/thermocald/available", b"offline", True)
+        bench.unplug()
+    assert bench.fake.messages[-1] == ("thermocald/thermocald/available", b"offline", True)
 
 
 # paho leaves the socket of a refused handshake to the garbage collector, which warns
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_tls(tmp_path):
+def test_tls(bench, tmp_path):
     ca, context = own_context(tmp_path)
-    broker = Broker(context=context)
-    try:
-        with output(broker, ca=str(ca), timeout_s=5) as device:
+    with closing(Broker(context=context)) as broker:
+        bench.options |= {"port": broker.port, "timeout_s": 5}
+        with bench.device(ca=str(ca)) as device:
             device.emit(RESULT)
-        assert "thermocald/rpi_1-a6a219/result" in topics(broker)
+        assert f"{NODE}/result" in [topic for topic, *_ in broker.messages]
         with pytest.raises(DeviceDenied, match="not trusted"):
-            output(broker, tls=True, timeout_s=5).open()
-    finally:
-        broker.close()
+            bench.device(tls=True).open()
 
 
 @pytest.mark.parametrize(

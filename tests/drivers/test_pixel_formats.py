@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from thermocald_drivers.support import BAYER_ORDERS, FORMATS, decode
+from linuxpy.video import raw
+from thermocald_drivers.support import BAYER_ORDERS, FORMATS, decode, unpack_10
 
 from thermocald.errors import BadReading
 
@@ -20,63 +21,45 @@ def grey(data: bytes, fourcc: str, stride: int = 0):
 
 def test_luminance_planes():
     noise = rng.integers(0, 255, RAMP.shape, np.uint8)
-    assert np.array_equal(grey(RAMP.tobytes(), "GREY"), RAMP)
-    assert np.array_equal(grey(np.stack([RAMP, noise], -1).tobytes(), "YUYV"), RAMP)
-    assert np.array_equal(grey(np.stack([noise, RAMP], -1).tobytes(), "UYVY"), RAMP)
-    planar = RAMP.tobytes() + bytes(HEIGHT * WIDTH // 2)
-    assert np.array_equal(grey(planar, "NV12"), RAMP)
-    assert np.array_equal(grey(planar, "YU12"), RAMP)
-
-
-def test_ten_bits_stay_ten_bits():
+    planar = np.concatenate([RAMP, noise[: HEIGHT // 2]])
     deep = RAMP.astype("<u2") * 4 + 3
-    assert np.array_equal(grey(deep.tobytes(), "Y10 "), deep)
-
-
-def test_rows_may_be_padded_and_the_last_one_cut():
-    padded = np.zeros((HEIGHT, WIDTH + 24), np.uint8)
-    padded[:, :WIDTH] = RAMP
-    assert np.array_equal(grey(padded.tobytes()[:-24], "GREY", WIDTH + 24), RAMP)
+    padded = np.hstack([RAMP, noise])
+    for fourcc, data, stride, expected in (
+        ("GREY", RAMP, 0, RAMP), ("YUYV", np.stack([RAMP, noise], -1), 0, RAMP),
+        ("UYVY", np.stack([noise, RAMP], -1), 0, RAMP), ("NV12", planar, 0, RAMP),
+        ("YU12", planar, 0, RAMP), ("Y10 ", deep, 0, deep),
+        # rows may be padded, and the last one cut
+        ("GREY", padded.ravel()[:-WIDTH], 2 * WIDTH, RAMP),
+    ):  # fmt: skip
+        assert np.array_equal(grey(data.tobytes(), fourcc, stride), expected), fourcc
 
 
 @pytest.mark.parametrize("fourcc", sorted(BAYER_ORDERS))
 def test_bayer_of_a_plain_colour_is_its_luminance(fourcc):
-    """A wrong order would swap red and blue, 0.299 and 0.114."""
-    red, green, blue = 200, 100, 40
-    colour = {"R": red, "G": green, "B": blue}
-    tile = np.array([colour[letter] for letter in BAYER_ORDERS[fourcc]], np.uint16).reshape(2, 2)
+    """A wrong order would swap red and blue, 0.299 and 0.114, or their lowest bits."""
+    eight = fourcc in ("RGGB", "BA81", "GBRG", "GRBG")
+    colour = {"R": 200, "G": 100, "B": 40} if eight else {"R": 803, "G": 400, "B": 162}
+    order = raw.PixelFormat(raw.v4l2_fourcc(*fourcc)).name[1:5]  # of the kernel: SGRBG10
+    tile = np.array([colour[letter] for letter in order], "<u2").reshape(2, 2)
     mosaic = np.tile(tile, (HEIGHT // 2, WIDTH // 2))
-    scale = 1
-    if fourcc in ("RGGB", "BA81", "GBRG", "GRBG"):
-        data = mosaic.astype(np.uint8).tobytes()
-    elif fourcc.startswith("p"):
-        scale = 4
-        data = pack_10(mosaic * 4).tobytes()
-    else:
-        scale = 4
-        data = (mosaic * 4).astype("<u2").tobytes()
-    luminance = (0.299 * red + 0.587 * green + 0.114 * blue) * scale
-    centre = grey(data, fourcc)[4:-4, 4:-4]
-    assert centre == pytest.approx(luminance, abs=1.5 * scale)
+    data = (
+        pack_10(mosaic) if fourcc.startswith("p") else mosaic.astype(np.uint8 if eight else "<u2")
+    )
+    centre = grey(data.tobytes(), fourcc)[4:-4, 4:-4]
+    luminance = 0.299 * colour["R"] + 0.587 * colour["G"] + 0.114 * colour["B"]
+    assert centre == pytest.approx(luminance, abs=1.0)
 
 
 def pack_10(values):
     """Pack MIPI CSI-2 RAW10 by the standard's byte order, independently of the decoder."""
-    rows = []
-    for row in values:
-        packed = []
-        for k in range(0, len(row), 4):
-            four = [int(v) for v in row[k : k + 4]]
-            packed += [v >> 2 for v in four] + [sum((v & 3) << 2 * n for n, v in enumerate(four))]
-        rows.append(packed)
-    return np.array(rows, np.uint8)
+    four = values.reshape(HEIGHT, -1, 4)
+    low = np.sum((four & 3) << np.arange(0, 8, 2), axis=-1, keepdims=True)
+    return np.concatenate([four >> 2, low], axis=-1).astype(np.uint8)
 
 
 def test_packed_ten_bits_come_back():
-    from thermocald_drivers.support import unpack_10
-
     values = rng.integers(0, 1024, (HEIGHT, WIDTH), np.uint16)
-    assert np.array_equal(unpack_10(pack_10(values)), values)
+    assert np.array_equal(unpack_10(pack_10(values).reshape(HEIGHT, -1)), values)
 
 
 def test_mjpeg_is_decoded_and_kept():

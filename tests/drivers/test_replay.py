@@ -9,12 +9,7 @@ import pytest
 
 from tests.commands import answer
 from thermocald.epoch import Epoch
-from thermocald.errors import (
-    BadReading,
-    DeviceFinished,
-    PermanentDeviceError,
-    TestFieldError,
-)
+from thermocald.errors import BadReading, DeviceFinished, TestFieldError
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import (
@@ -34,61 +29,55 @@ def write(tmp_path):
     head = Head("M1", "M1", 10.0, CameraSpec("c", Sensor(64, 48, 0.001)), {"lens": Channel()})
     field = TestField.build(["a", "b", "c"], np.eye(3) * 1000)
 
-    def write_epochs(*epochs):
+    def write_epochs(images, lens=20.0, seen=None):
+        """Write an epoch for each image."""
         with RecordingWriter(tmp_path / "M1", head, field) as writer:
-            for epoch, image in epochs:
-                writer.append(epoch, image=image)
+            for k, image in enumerate(images, 1):
+                time, values = BEGIN + 10 * k, {"lens": np.broadcast_to(lens, len(images))[k - 1]}
+                one = Epoch(k, time, time + 1.5, values, observations=seen)
+                writer.append(one, image=image)
         return str(tmp_path / "M1")
 
     return write_epochs
 
 
-def epoch(i: int, temperature: float = 20.0, seen: Observations | None = None) -> Epoch:
-    time = BEGIN + 10 * i
-    return Epoch(i, time, time + 1.5, {"lens": temperature + i}, observations=seen)
-
-
-def test_frames_keep_their_instants_and_bytes(write):
-    jpeg = b"\xff\xd8 not decoded here"
-    path = write((epoch(1), IMAGE), (epoch(2), jpeg))
+def replay(kind, path, **options):
     clock = VirtualClock(utc=BEGIN + 100.0, monotonic=7.0)
-    with open_device("camera", "replay", {"recording": path}, clock) as camera:
-        first, second = camera.capture(), camera.capture()
-    assert np.array_equal(first.image, IMAGE)
-    assert (second.image, second.encoded) == (None, jpeg)
-    assert [f.utc - BEGIN for f in (first, second)] == [10.0, 20.0]
-    assert [f.monotonic for f in (first, second)] == pytest.approx([7.0 - 90.0, 7.0 - 80.0])
-    assert [f.sequence for f in (first, second)] == [1, 2]
+    return open_device(kind, "replay", {"recording": path, **options}, clock)
 
 
-def test_measurements_come_without_a_picture(write):
-    targets, points = np.array([2, 0]), np.array([[1.5, 2.5], [3.25, 4.0]])
-    seen = Observations(targets, points, np.full((2, 2), 0.04), np.array([1e-4, -1e-4]))
-    path = write((epoch(1, seen=seen), None))
-    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
-        frame = camera.capture()
-    field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: by name, not by row
-    found = observations_from_lists(frame.observations, field)
-    assert frame.image is None
-    assert found.targets.tolist() == [0, 2]
-    assert np.array_equal(found.points, seen.points)
-    assert np.array_equal(found.covariances, seen.covariances)
+def test_frames_keep_their_instants_and_bytes(write, tmp_path):
+    """Regression: an empty file was no epoch, and a JPEG that is cut off was a `bad_frame`."""
+    jpeg = b"\xff\xd8 not decoded here"
+    camera = replay("camera", write([IMAGE, jpeg, IMAGE, IMAGE, IMAGE, None]))
+    (tmp_path / "M1/frames/000003.png").write_bytes(b"")
+    (tmp_path / "M1/frames/000004.png").write_bytes(b"no picture")
+    frames = []
+    for _ in range(4):
+        with camera:  # closed and opened, it goes on
+            frames.append(camera.capture())
+    assert np.array_equal(frames[0].image, IMAGE)
+    assert [f.encoded for f in frames] == [None, jpeg, b"", b"no picture"]
+    assert [f.utc - BEGIN for f in frames] == [10.0, 20.0, 30.0, 40.0]
+    assert [f.monotonic for f in frames[:2]] == pytest.approx([7.0 - 90.0, 7.0 - 80.0])
+    assert [f.sequence for f in frames] == [1, 2, 3, 4]
+    (tmp_path / "M1/frames/000005.png").unlink()
+    for error, message in (
+        (BadReading, "000005.png: cannot be read: No such file"),
+        (BadReading, "epoch 6 has no frame"),
+        (DeviceFinished, "has ended"),
+    ):
+        with camera, pytest.raises(error, match=message):
+            camera.capture()
 
 
-@pytest.mark.parametrize(
-    "changed", [{"target": None}, {"x": [1.0]}, {"sxy": [0.0]}, {"sy": ["a"] * 2}]
-)
-def test_measurements_that_do_not_match_have_a_clear_error(changed):
-    lists = {"target": ["a", "b"], **{key: [1.0, 2.0] for key in ("x", "y", "sx", "sy")}}
-    field = TestField.build(["a", "b"], np.eye(3)[:2])
-    assert len(observations_from_lists(lists, field)) == 2
-    with pytest.raises(TestFieldError, match="with an entry for each target"):
-        observations_from_lists(lists | changed, field)
+def test_loop_goes_on_in_time(write):
+    with replay("camera", write([IMAGE] * 2), loop=True) as camera:
+        assert [camera.capture().utc - BEGIN for _ in range(5)] == [10, 20, 30, 40, 50]
 
 
 def test_readings_keep_their_own_instants(write):
-    path = write((epoch(1), IMAGE), (epoch(2, np.nan), IMAGE), (epoch(3), IMAGE))
-    with open_device("thermometer", "replay", {"recording": path}, VirtualClock()) as device:
+    with replay("thermometer", write([IMAGE] * 3, lens=[21.0, np.nan, 23.0])) as device:
         first = device.read()
         with pytest.raises(BadReading, match="epoch 2 has no temperature"):
             device.read()
@@ -97,55 +86,34 @@ def test_readings_keep_their_own_instants(write):
     assert [r.utc - BEGIN for r in (first, third)] == [11.5, 31.5]
 
 
-@pytest.mark.parametrize("driver", ["replay", "mock"])
+def test_measurements_come_without_a_picture(write):
+    targets, points = np.array([2, 0]), np.array([[1.5, 2.5], [3.25, 4.0]])
+    seen = Observations(targets, points, np.full((2, 2), 0.04), np.array([1e-4, -1e-4]))
+    with replay("camera", write([None], seen=seen)) as camera:
+        frame = camera.capture()
+    field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: by name, not by row
+    found = observations_from_lists(frame.observations, field)
+    assert frame.image is None
+    assert found.targets.tolist() == [0, 2]
+    assert np.array_equal(found.points, seen.points)
+    assert np.array_equal(found.covariances, seen.covariances)
+    for changed in ({"target": None}, {"x": [1.0]}, {"sxy": [0.0]}, {"sy": ["a"] * 2}):
+        with pytest.raises(TestFieldError, match="with an entry for each target"):
+            observations_from_lists(frame.observations | changed, field)
+
+
+@pytest.mark.parametrize(("driver", "size"), [("replay", (64, 48)), ("mock", (3280, 2464))])
 def test_a_sensor_of_another_size_than_its_frames_is_an_error_before_the_start(
-    write, tmp_path, driver
+    write, tmp_path, driver, size
 ):
     """Regression: frames had no result, one by one; recorded image points had a wrong x0, y0."""
-    path = write((epoch(1), IMAGE))
+    path, config = write([IMAGE]), tmp_path / "config.yaml"
     options = {"recording": path} if driver == "replay" else {}
     camera = {"name": "c", "driver": driver, "testfield": f"{path}/testfield.csv", **options}
-    sensor, size = {"pixel_pitch_mm": 0.001}, [(64, 48), (3280, 2464)][driver == "mock"]
-    text = {}
+    said = []
     for width, height in (size, (65, 48)):
-        sensor |= {"width_px": width, "height_px": height}
-        config = tmp_path / "config.yaml"
-        config.write_text(json.dumps({"cameras": [{**camera, "sensor": sensor}]}))
-        text[width] = answer("check", config)
-    assert text[size[0]].exit_code == 0
-    assert text[65].exit_code == 1
-    assert f"sensor has 65×48 px, but the driver's frames have {size[0]}" in str(text[65])
-
-
-def test_loop_goes_on_in_time(write):
-    path = write((epoch(1), IMAGE), (epoch(2), IMAGE))
-    options = {"recording": path, "loop": True}
-    with open_device("camera", "replay", options, VirtualClock()) as camera:
-        assert [camera.capture().utc - BEGIN for _ in range(5)] == [10, 20, 30, 40, 50]
-
-
-def test_closed_and_opened_it_goes_on_to_its_end_which_is_permanent(write):
-    path = write(*((epoch(i), IMAGE) for i in (1, 2, 3)))
-    camera = open_device("camera", "replay", {"recording": path}, VirtualClock())
-    numbers = []
-    for _ in range(3):
-        with camera:
-            numbers.append(camera.capture().sequence)
-    assert numbers == [1, 2, 3]
-    with camera, pytest.raises(DeviceFinished, match="has ended"):
-        camera.capture()
-    assert issubclass(DeviceFinished, PermanentDeviceError)
-
-
-def test_what_is_broken_comes_as_recorded_and_what_is_missing_is_a_bad_reading(write, tmp_path):
-    """Regression: an empty file was no epoch, and a JPEG that is cut off was a `bad_frame`."""
-    path = write(*((epoch(k), IMAGE) for k in (1, 2, 3)), (epoch(4), None))
-    frames = tmp_path / "M1" / "frames"
-    for number, data in enumerate((b"", b"no picture"), 1):
-        (frames / f"00000{number}.png").write_bytes(data)
-    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
-        assert [camera.capture().encoded for _ in range(2)] == [b"", b"no picture"]
-        (frames / "000003.png").unlink()
-        for message in ("000003.png: cannot be read: No such file", "epoch 4 has no frame"):
-            with pytest.raises(BadReading, match=message):
-                camera.capture()
+        camera["sensor"] = {"width_px": width, "height_px": height, "pixel_pitch_mm": 0.001}
+        config.write_text(json.dumps({"cameras": [camera]}))
+        said.append(answer("check", config))
+    assert [result.exit_code for result in said] == [0, 1]
+    assert f"sensor has 65×48 px, but the driver's frames have {size[0]}×{size[1]}" in str(said[1])

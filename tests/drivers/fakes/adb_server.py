@@ -11,11 +11,10 @@ import io
 import re
 import socket
 import struct
-import threading
 import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -35,27 +34,37 @@ def wait_little(monkeypatch) -> None:
     monkeypatch.setattr(adbutils._adb, "time", SimpleNamespace(sleep=lambda _: None))
 
 
-def photograph(
-    when: float, *, iso=100, distance=None, subsecond="250", size=(96, 64), zone=None, zoom=None
-) -> bytes:
+TAGS = {"iso": 0x8827, "distance": 0x9206, "subsecond": 0x9291, "zone": 0x9011, "zoom": 0xA404}
+FOCUS = """  android.lens.focusDistance (80007): float[1]
+        [0.25 ]
+"""
+
+
+def photograph(when: float, size=(96, 64), **stated) -> bytes:
     """Return a JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
     image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
     tags = Image.Exif()
     sub = tags.get_ifd(0x8769)
-    sub[0x829A], sub[0x8827] = 1 / 60, iso
+    sub[0x829A] = 1 / 60
     sub[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(when))
-    if subsecond is not None:
-        sub[0x9291] = subsecond
-    if zone is not None:
-        sub[0x9011] = zone
-    if zoom is not None:
-        sub[0xA404] = zoom
-    if distance is not None:
-        sub[0x9206] = distance
-    tags[0x010F], tags[0x0110] = "Acme", "Phone 4a"
+    usual = {"iso": 100, "distance": 1.5, "subsecond": f"{int(when % 1 * 1000):03d}"}
+    for name, value in (usual | stated).items():
+        if value is not None:
+            sub[TAGS[name]] = value
     out = io.BytesIO()
     image.save(out, "JPEG", quality=95, exif=tags)
     return out.getvalue()
+
+
+def shoot(count=1, writing_s=0.0, **stated) -> Callable[[FakePhone], None]:
+    """Return a camera app that writes `count` photographs per trigger."""
+
+    def write(phone: FakePhone) -> None:
+        for k in range(count):
+            name = f"IMG_{len(phone.files):04d}_{k}.jpg"
+            phone.add(name, photograph(phone.now(), **stated), writing_s)
+
+    return write
 
 
 @dataclass
@@ -71,12 +80,13 @@ class FakePhone:
     stays_locked: bool = False
     free_kb: int = 5_000_000
     trigger: str = "input keyevent 27"
-    shoot: Callable[[FakePhone], None] | None = None
+    shoot: Callable[[FakePhone], None] | None = field(default_factory=shoot)
+    state: str = "device"
     battery: str = "  voltage: 4100\n  temperature: 287\n"
     thermal: str = ""
     zones: str = ""
-    media_camera: str = ""
-    hang: threading.Event | None = None
+    media_camera: str = FOCUS
+    hang_s: float = 0.0
     cut_transfer: bool = False
     load: bool = False
     commands: list[str] = field(default_factory=list)
@@ -90,11 +100,8 @@ class FakePhone:
             self.growing[name] = (time.monotonic(), writing_s)
 
     def content(self, name: str) -> bytes:
-        data = self.files[name]
-        if name in self.growing:
-            begin, takes = self.growing[name]
-            return data[: int(len(data) * min(1.0, (time.monotonic() - begin) / takes))]
-        return data
+        data, (begin, takes) = self.files[name], self.growing.get(name, (0.0, 1e-9))
+        return data[: int(len(data) * min(1.0, (time.monotonic() - begin) / takes))]
 
     def shell(self, command: str) -> str:
         self.commands.append(command)
@@ -102,29 +109,21 @@ class FakePhone:
             self.awake, self.locked = True, self.stays_locked
         if command == self.trigger and self.shoot:
             self.shoot(self)
-        if command.startswith("date"):
-            return f"{self.now():.9f} +0000\n"
-        if command.startswith("dumpsys power"):
-            return (
-                f"  mWakefulness={'Awake' if self.awake else 'Asleep'}\n"
-                f"  mShowingLockscreen={str(self.locked).lower()}\n"
-            )
-        if command.startswith("df"):
-            return f"Filesystem 1K-blocks Used Available Use% On\n/dev/x 9 9 {self.free_kb} 9% /\n"
         if match := re.match(r"rm -f '(.*)'", command):
             self.files.pop(match[1].rsplit("/", 1)[1], None)
-        if "thermal_zone*" in command:
-            return self.zones
-        if "thermocald_load" in command and command.startswith("timeout"):
-            self.load = True
-        if command.startswith("pkill"):
-            self.load = False
+        if command.startswith(("timeout", "pkill")):
+            self.load = command.startswith("timeout")
         answers = {
+            "date": f"{self.now():.9f} +0000\n",
+            "dumpsys power": f"  mWakefulness={'Awake' if self.awake else 'Asleep'}\n"
+            f"  mShowingLockscreen={str(self.locked).lower()}\n",
+            "df": f"Filesystem 1K-blocks Used Available Use% On\n/dev/x 9 9 {self.free_kb} 9% /\n",
+            "for z in /sys/class/thermal": self.zones,
             "dumpsys battery": self.battery,
             "dumpsys thermalservice": self.thermal,
             "dumpsys media.camera": self.media_camera,
         }
-        return answers.get(command, "")
+        return next((text for begin, text in answers.items() if command.startswith(begin)), "")
 
 
 class AdbServer(LineServer):
@@ -135,22 +134,16 @@ class AdbServer(LineServer):
         self.listing: str | None = None
         super().__init__("adb")
 
-    def close(self) -> None:
-        for phone in self.phones.values():
-            if phone.hang is not None:
-                phone.hang.set()
-        super().close()
-
     def _serve(self, line: socket.socket) -> None:
         with line, contextlib.suppress(OSError, ValueError, struct.error):
-            self._host(line)
+            self._host(line, line.makefile("rb"))
 
-    def _host(self, line: socket.socket) -> None:
-        request = _request(line)
+    def _host(self, line: socket.socket, stream: BinaryIO) -> None:
+        request = _request(stream)
         if request == "host:version":
             _block(line, "0029")
         elif request == "host:devices":
-            mine = "".join(f"{serial}\tdevice\n" for serial in self.phones)
+            mine = "".join(f"{serial}\t{p.state}\n" for serial, p in self.phones.items())
             _block(line, mine if self.listing is None else self.listing)
         elif match := re.fullmatch(r"host-serial:(.*):features", request):
             if self._phone(line, match[1]):
@@ -159,21 +152,19 @@ class AdbServer(LineServer):
             phone = self._phone(line, match[1])
             if phone:
                 line.sendall(b"OKAY" + struct.pack("<Q", 1))
-                self._device(line, phone)
+                self._device(line, stream, phone)
 
     def _phone(self, line: socket.socket, serial: str) -> FakePhone | None:
         phone = self.phones.get(serial)
         if phone is None:
             text = f"device '{serial}' not found"
             line.sendall(b"FAIL" + f"{len(text):04x}{text}".encode())
-        elif phone.hang is not None:
-            phone.hang.wait()
-        else:
-            return phone
-        return None
+            return None
+        time.sleep(phone.hang_s)
+        return phone
 
-    def _device(self, line: socket.socket, phone: FakePhone) -> None:
-        request = _request(line)
+    def _device(self, line: socket.socket, stream: BinaryIO, phone: FakePhone) -> None:
+        request = _request(stream)
         line.sendall(b"OKAY")
         if request.startswith("shell,v2:"):
             text = phone.shell(request.removeprefix("shell,v2:")).encode()
@@ -183,11 +174,11 @@ class AdbServer(LineServer):
         elif request.startswith("shell:"):
             line.sendall(phone.shell(request.removeprefix("shell:")).encode())
         elif request == "sync:":
-            self._sync(line, phone)
+            self._sync(line, stream, phone)
 
-    def _sync(self, line: socket.socket, phone: FakePhone) -> None:
-        command, size = struct.unpack("<4sI", _exactly(line, 8))
-        path = _exactly(line, size).decode()
+    def _sync(self, line: socket.socket, stream: BinaryIO, phone: FakePhone) -> None:
+        command, size = struct.unpack("<4sI", stream.read(8))
+        path = stream.read(size).decode()
         if command == b"LIST":
             entries = [(".", 0o040755, 0)]
             if path == phone.folder:
@@ -207,18 +198,8 @@ class AdbServer(LineServer):
             line.sendall(b"DONE" + bytes(4))
 
 
-def _exactly(line: socket.socket, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        piece = line.recv(count - len(data))
-        if not piece:
-            raise ConnectionError
-        data += piece
-    return data
-
-
-def _request(line: socket.socket) -> str:
-    return _exactly(line, int(_exactly(line, 4), 16)).decode()
+def _request(stream: BinaryIO) -> str:
+    return stream.read(int(stream.read(4), 16)).decode()
 
 
 def _block(line: socket.socket, text: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 from thermocald_drivers.i2c import crc8
 
 from tests.drivers.fakes.smbus import Chip
@@ -54,20 +56,12 @@ def sht3x(temperature=0x6666, damage=0):
 
 
 # Calibration and raw values of the worked example of the BMP280 data sheet (BST-BMP280-DS001, 3.12)
-CALIBRATION = (
-    (27504).to_bytes(2, "little")
-    + (26435).to_bytes(2, "little", signed=True)
-    + (-1000).to_bytes(2, "little", signed=True)
-    + b"".join(
-        value.to_bytes(2, "little", signed=k > 0)
-        for k, value in enumerate((36477, -10685, 3024, 2855, 140, -7, 15500, -14600, 6000))
-    )
-    + bytes([0, 75])
-)
+# of the temperature: dig_T1 … dig_T3; the driver reads the 20 further bytes and ignores them
+CALIBRATION = struct.pack("<Hhh", 27504, 26435, -1000) + bytes(20)
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 
-def bme280(adc_t=ADC_T, identity=0x60, status=0):
+def bme280(adc_t=ADC_T, adc_h=ADC_H, identity=0x60, status=0):
     def block(first, data):
         chip.registers.update({first + k: bytes([byte]) for k, byte in enumerate(data)})
 
@@ -78,7 +72,7 @@ def bme280(adc_t=ADC_T, identity=0x60, status=0):
     def measure(self, register, data):
         if register == 0xF4 and data[0] & 3:
             raw = (ADC_P << 4).to_bytes(3, "big") + (adc_t << 4).to_bytes(3, "big")
-            block(0xF7, raw + ADC_H.to_bytes(2, "big"))
+            block(0xF7, raw + adc_h.to_bytes(2, "big"))
 
     chip.on_write = measure
     return chip

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 import ssl
+from typing import BinaryIO
 
 from tests.drivers.fakes.line_server import LineServer
 
@@ -32,7 +33,8 @@ class Broker(LineServer):
                 )
                 self._lines.append(line)
                 line.do_handshake()
-            while packet := self._packet(line):
+            stream = line.makefile("rb")
+            while packet := self._packet(stream):
                 kind, flags, body = packet
                 if kind == 1:
                     will = self._connect(line, body)
@@ -68,21 +70,14 @@ class Broker(LineServer):
         return None if self.refuse else will
 
     @staticmethod
-    def _packet(line: socket.socket) -> tuple[int, int, bytes] | None:
-        head = line.recv(1)
+    def _packet(stream: BinaryIO) -> tuple[int, int, bytes] | None:
+        head = stream.read(1)
         if not head:
             return None
         size = shift = 0
-        while True:
-            (byte,) = line.recv(1)
+        more = True
+        while more:
+            (byte,) = stream.read(1)
             size |= (byte & 0x7F) << shift
-            shift += 7
-            if not byte & 0x80:
-                break
-        body = b""
-        while len(body) < size:
-            piece = line.recv(size - len(body))
-            if not piece:
-                return None
-            body += piece
-        return head[0] >> 4, head[0] & 15, body
+            shift, more = shift + 7, bool(byte & 0x80)
+        return head[0] >> 4, head[0] & 15, stream.read(size)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import time
 from types import ModuleType
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
-
-if TYPE_CHECKING:
-    import threading
 
 
 class Request:
@@ -29,15 +26,15 @@ class Request:
 
 
 class StandIn:
-    """One camera; tests set its class attributes."""
+    """A camera with a focusing lens, such as the Camera Module 3; tests set its attributes."""
 
     cameras = ({"Model": "imx219", "Id": "/base/soc/i2c0mux/i2c@1/imx219@10"},)
     sensor_resolution = (96, 64)
-    camera_controls: ClassVar[dict] = {"ExposureTime": (), "AnalogueGain": ()}
+    camera_controls: ClassVar[dict] = {"LensPosition": (0.0, 32.0, 1.0)}
     extra: ClassVar[dict] = {}
-    standing: ClassVar[dict] = {}
+    standing: ClassVar[dict] = {"LensPosition": 1.5, "ColourGains": (1.75, 1.5)}
     stale = 0
-    hang: threading.Event | None = None
+    hang_s = 0.0
     busy = False
     cut = False
     instances: ClassVar[list] = []
@@ -73,8 +70,8 @@ class StandIn:
         self.configuration["controls"] |= controls
 
     def capture_request(self) -> Request:
-        if type(self).hang is not None:
-            type(self).hang.wait()
+        if type(self).hang_s:
+            time.sleep(type(self).hang_s)
             raise RuntimeError("closed while waiting")
         controls = {"ExposureTime": 8000, "AnalogueGain": 2.0, **type(self).standing}
         controls |= self.configuration["controls"]

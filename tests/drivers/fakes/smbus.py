@@ -21,21 +21,18 @@ class Chip:
 
     registers: dict[int, bytes] = field(default_factory=dict)
     on_write: Callable[[Chip, int, bytes], None] | None = None
-    on_read: Callable[[Chip, int], None] | None = None
     reply: bytes = b""
-    error: int = 0
 
     def word(self, register: int, value: int) -> None:
         self.registers[register] = value.to_bytes(2, "big")
 
 
 class Bus:
-    """Chips by address; opened as `smbus2.SMBus(number)`."""
+    """Chips by address; opened as `smbus2.SMBus(number)`; open_error, error: of every call."""
 
     def __init__(self) -> None:
         self.chips: dict[int, Chip] = {}
-        self.open_error = 0
-        self.opened = 0
+        self.open_error = self.error = self.opened = 0
 
     def __call__(self, number: int) -> Bus:
         if self.open_error:
@@ -47,17 +44,12 @@ class Bus:
         self.opened -= 1
 
     def _chip(self, address: int) -> Chip:
-        if address not in self.chips:
-            raise os_error(errno.EREMOTEIO)
-        chip = self.chips[address]
-        if chip.error:
-            raise os_error(chip.error)
-        return chip
+        if self.error or address not in self.chips:
+            raise os_error(self.error or errno.EREMOTEIO)
+        return self.chips[address]
 
     def _read(self, address: int, register: int, count: int) -> bytes:
         chip = self._chip(address)
-        if chip.on_read:
-            chip.on_read(chip, register)
         data = b"".join(
             chip.registers.get(register + k, b"")
             for k in range(count)

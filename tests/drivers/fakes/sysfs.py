@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-CRC_TABLE_POLYNOMIAL = 0x8C
-
 
 class Sysfs:
     """A tree; `root` is the drivers' option `sysfs`."""
@@ -51,13 +49,17 @@ class Sysfs:
 
 
 def w1_slave(celsius: float) -> str:
-    """Return w1_therm's text for a DS18B20 at 12 bits; the CRC is not by the driver's code."""
+    """Return w1_therm's text for a DS18B20 at 12 bits."""
     raw = round(celsius * 16)
     pad = raw.to_bytes(2, "little", signed=True) + bytes.fromhex("4b467fff")
-    pad += bytes([(0x10 - (raw & 0x0F)), 0x10])
-    crc = w1_crc(pad)
-    text = " ".join(f"{b:02x}" for b in [*pad, crc])
-    return f"{text} : crc={crc:02x} YES\n{text} t={int(raw * 1000 / 16)}"
+    return scratchpad((pad + bytes([0x10 - (raw & 0x0F), 0x10])).hex(), int(raw * 1000 / 16))
+
+
+def scratchpad(pad: str, milli: int) -> str:
+    """Return w1_therm's text for 8 bytes; the CRC is not by the driver's code."""
+    data = bytes.fromhex(pad)
+    text = f"{data.hex(' ')} {w1_crc(data):02x}"
+    return f"{text} : crc={w1_crc(data):02x} YES\n{text} t={milli}"
 
 
 def w1_crc(data: bytes) -> int:
@@ -66,5 +68,5 @@ def w1_crc(data: bytes) -> int:
     for byte in data:
         for bit in range(8):
             mix = (crc ^ (byte >> bit)) & 1
-            crc = (crc >> 1) ^ (CRC_TABLE_POLYNOMIAL if mix else 0)
+            crc = (crc >> 1) ^ (0x8C if mix else 0)
     return crc

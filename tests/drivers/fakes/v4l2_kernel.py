@@ -25,8 +25,12 @@ PAGE = mmap.PAGESIZE
 INTEGER = 1
 
 
+AUTO_FOCUS, FOCUS, ZOOM, STABILISE = 0x9A090C, 0x9A090A, 0x9A090D, 0x9A0916
+AUTO_EXPOSURE, EXPOSURE, GAIN, FREQUENCY = 0x9A0901, 0x9A0902, 0x980913, 0x980918
+
+
 class FakeCamera:
-    """A camera with controls {id: [name, minimum, maximum, step, value]}."""
+    """A camera with controls {id: [name, minimum, maximum, step, value]}; it focuses by itself."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -37,10 +41,14 @@ class FakeCamera:
         self.stamp: Callable[[float], float] = lambda now: now
         self.encode: Callable[[np.ndarray, str], bytes] = encode
         self.controls = {
-            0x009A0901: ["Auto Exposure", 0, 3, 1, 3],
-            0x009A0902: ["Exposure Time, Absolute", 3, 2047, 1, 250],
-            0x00980913: ["Gain", 0, 255, 1, 64],
-            0x00980918: ["Power Line Frequency", 0, 2, 1, 2],
+            AUTO_EXPOSURE: ["Auto Exposure", 0, 3, 1, 3],
+            EXPOSURE: ["Exposure Time, Absolute", 3, 2047, 1, 250],
+            GAIN: ["Gain", 0, 255, 1, 64],
+            FREQUENCY: ["Power Line Frequency", 0, 2, 1, 2],
+            AUTO_FOCUS: ["Focus, Automatic Continuous", 0, 1, 1, 1],
+            FOCUS: ["Focus, Absolute", 0, 255, 5, 35],
+            ZOOM: ["Zoom, Absolute", 100, 500, 1, 120],
+            STABILISE: ["Image Stabilization", 0, 1, 1, 1],
         }
         self.obeys: Callable[[int, int], int] = lambda _control, value: value
         self.errors: dict[str, int] = {}
@@ -53,6 +61,16 @@ class FakeCamera:
         self._filled: deque[tuple[int, int, float, int]] = deque()
         self._next_at = 0.0
         self._sequence = 0
+
+    @property
+    def values(self) -> dict[int, int]:
+        """The controls' values, which the camera itself may change."""
+        return {number: control[4] for number, control in self.controls.items()}
+
+    @values.setter
+    def values(self, changed: dict[int, int]) -> None:
+        for number, value in changed.items():
+            self.controls[number][4] = value
 
     def ioctl(self, device, request, argument=None) -> None:
         name = request.name

@@ -8,8 +8,6 @@ non-linear parameters.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -24,43 +22,31 @@ from thermocald.store.recording.reader import read_recording
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import series_input
 
-PX = 0.00112
-
-# effect: true values of about a third of a pixel, and initial values of the fit
-CASES = {
-    "thermal_lag": ({"tau": 84.0}, {"tau": 10.0}),
-    "time_offset": ({"d": 12.0}, {"d": 0.0}),
-    "hysteresis": ({"half_width": 0.8}, {"half_width": 0.1}),
-    "nonlinear_expansion": ({"c": 1e-6, "x0": 4e-6, "y0": -3e-6}, {}),
-    "softening": ({"T_k": 36.0, "c": 2e-5, "x0": 8e-5, "y0": 4e-5}, {"T_k": 25.0}),
-    "thermal_gradient": ({"c": 2e-3, "x0": 8e-3, "y0": -5e-3}, {}),
-    "permanent_set": ({"c": 1e-5, "x0": 4e-5, "y0": 3e-5}, {}),
-    "self_heating": ({"tau": 260.0, "c": 2e-4, "x0": 6e-4, "y0": -4e-4}, {"tau": 1000.0}),
-    "creep": ({"c": 1e-7, "x0": 4e-7, "y0": -2e-7}, {}),
-    "slip": ({"time": 803.0, "c": 1e-4, "x0": 6e-4, "y0": 2e-4}, {"time": 100.0}),
-    "cyclic_interference": (
-        {"P": 143.0, "phase": 0.9, "c": 5e-5, "x0": 4e-4, "y0": -2e-4},
-        {"P": 30.0, "phase": 0.0},
-    ),
-    "second_heat_source": (
-        {"channel": "board_temperature", "c": 2e-5, "x0": 8e-5, "y0": -5e-5},
-        {"channel": "board_temperature"},
-    ),
-    "defocus": ({"factor": 0.08}, {}),
-    "housing_tilt": ({"omega": 4e-6, "phi": -6e-6, "kappa": 3e-6}, {}),
-    "mount_motion": (
-        {"tau": 200.0, "omega": 4e-6, "phi": -6e-6, "kappa": 3e-6, "X0": 4e-3, "Z0": -3e-3},
-        {"tau": 40.0},
-    ),
-    "radial_distortion_drift": ({"A1": 6e-6}, {}),
-    "decentering_drift": ({"B1": 4e-6, "B2": -3e-6}, {}),
-    "affinity_drift": ({"C1": 6e-6, "C2": -4e-6}, {}),
-    "test_field_expansion": ({"X": 1.2e-5, "Y": 2e-5, "Z": -1e-5}, {}),
-    "target_displacement": (
-        {"time": 905.0, "targets": ("x33", "y52"), "dX": 0.15, "dY": -0.1, "dZ": 0.2},
-        {"time": 100.0, "targets": ("x33", "y52")},
-    ),
-}
+# effects of about a third of a pixel; the fit begins at their parameters' defaults
+TRUE = {
+    "thermal_lag": {"tau": 84.0},
+    "time_offset": {"d": 12.0},
+    "hysteresis": {"half_width": 0.8},
+    "nonlinear_expansion": {"c": 1e-6, "x0": 4e-6, "y0": -3e-6},
+    "softening": {"T_k": 36.0, "c": 2e-5, "x0": 8e-5, "y0": 4e-5},
+    "thermal_gradient": {"c": 2e-3, "x0": 8e-3, "y0": -5e-3},
+    "permanent_set": {"c": 1e-5, "x0": 4e-5, "y0": 3e-5},
+    "self_heating": {"tau": 260.0, "c": 2e-4, "x0": 6e-4, "y0": -4e-4},
+    "creep": {"c": 1e-7, "x0": 4e-7, "y0": -2e-7},
+    "slip": {"time": 803.0, "c": 1e-4, "x0": 6e-4, "y0": 2e-4},
+    "cyclic_interference": {"P": 143.0, "phase": 0.9, "c": 5e-5, "x0": 4e-4, "y0": -2e-4},
+    "second_heat_source": {"channel": "board_temperature", "c": 2e-5, "x0": 8e-5, "y0": -5e-5},
+    "defocus": {"factor": 0.08},
+    "housing_tilt": {"omega": 4e-6, "phi": -6e-6, "kappa": 3e-6},
+    "mount_motion": {"tau": 200.0, "omega": 4e-6, "phi": -6e-6, "kappa": 3e-6, "X0": 4e-3,
+                     "Z0": -3e-3},
+    "radial_distortion_drift": {"A1": 6e-6},
+    "decentering_drift": {"B1": 4e-6, "B2": -3e-6},
+    "affinity_drift": {"C1": 6e-6, "C2": -4e-6},
+    "test_field_expansion": {"X": 1.2e-5, "Y": 2e-5, "Z": -1e-5},
+    "target_displacement": {"time": 905.0, "targets": ("x33", "y52"), "dX": 0.15, "dY": -0.1,
+                            "dZ": 0.2},
+}  # fmt: skip
 
 
 def record(tmp_path, effect, seed=8):
@@ -83,18 +69,18 @@ def record(tmp_path, effect, seed=8):
 
 
 def test_every_effect_is_here():
-    assert set(CASES) == set(catalogue.names())
+    assert set(TRUE) == set(catalogue.names())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", TRUE)
 def test_parameters_are_recovered(tmp_path, name):
-    true, known = CASES[name]
+    true, kind = TRUE[name], catalogue.get(name)
     simulation, recording = record(tmp_path, ModelEffect(name, true))
     series = reduce_series(series_input(recording), strict=False)
-    kind = catalogue.get(name)
-    start = {**dict.fromkeys(kind.usual, 0.0), **known}
-    fitted = fit_thermal_model([series], [ModelEffect(name, start)], T0=simulation.model.T0)
+    start = {k: true[k] if p.text else p.default for k, p in kind.nonlinear.items()}
+    start = ModelEffect(name, {**dict.fromkeys(kind.usual, 0.0), **start})
+    fitted = fit_thermal_model([series], [start], T0=simulation.model.T0)
     (found,) = fitted.model.effects
     for key, value in true.items():
         if isinstance(value, str | tuple):
@@ -113,9 +99,4 @@ def test_parameters_are_recovered(tmp_path, name):
         # leaves some 180 / 8 independent values, so 3 sd are 45 %
         noise = fitted.fitted["series"][0].thermometer_sd / np.hypot(0.04, 0.0625 / 12**0.5)
         assert abs(noise - 1) < 0.45
-        exact = replace(simulation.model, exterior=simulation.exterior)
-        drift, expected = (
-            m.predict(simulation.true_history).iop[:, 1:3] for m in (fitted.model, exact)
-        )
-        assert np.abs(drift - drift[0] - expected + expected[0]).max() < 0.05 * PX
         assert sd < 10.0 / 3.0

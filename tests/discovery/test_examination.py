@@ -39,13 +39,6 @@ def test_the_time_of_a_weak_displacement_is_as_accurate_as_stated():
     assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.3
 
 
-def test_no_effect_no_name(evidence_of):
-    evidence, _ = evidence_of(seed=23, epochs=45, with_m2=False)
-    found = discover_series(evidence)
-    assert (found.verdict, found.effects) == ("adequate", ())
-    assert "field" not in found.as_dict()  # which stands still
-
-
 @pytest.mark.parametrize("epochs", [20, pytest.param(50, marks=pytest.mark.slow)])
 def test_recordings_of_two_cameras_contradict_each_other(epochs):
     """M2 is of another camera of the same type; M1 alone lacks no effect.
@@ -94,24 +87,6 @@ def test_a_lag_and_a_delay_that_do_the_same_stay_alternatives(evidence_of, effec
     names = {found.effects[0].effect, *found.effects[0].alternative_names}
     assert {"thermal_lag", "time_offset"} <= names
     assert "experiment" in found.effects[0].alternatives[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("effect", "px", "seed", "constant"),
-    [("time_offset", 0.3, 330, "d"), ("hysteresis", 0.1, 360, "half_width")],
-)
-def test_what_readings_hide_is_named(evidence_of, effect, px, seed, constant):
-    """A lag smooths the thermometer's noise, so that a smooth image would favour it to a delay.
-
-    Of a play shorter than an interval the extreme is not read; taking the largest reading for it
-    would exclude every play.
-    """
-    evidence, truth = evidence_of(effect, px=px, seed=seed)
-    found = discover_series(evidence)
-    assert [e.effect for e in found.effects] == [effect]
-    said = found.effects[0].estimates[constant]
-    assert abs(said["value"] - truth["effects"][0][0][constant]) < 3 * said["sd"]
 
 
 def test_a_lag_as_long_as_the_series_has_no_delay_beside_it(evidence_of):
@@ -191,9 +166,7 @@ def test_a_poor_thermometer_does_not_lengthen_a_lag(evidence_of):
 @pytest.mark.slow
 @pytest.mark.parametrize(("px", "separable"), [(0.1, True), (0.006, False)])
 def test_the_recording_decides_whether_shift_and_tilt_are_separable(evidence_of, px, separable):
-    evidence, _ = evidence_of("creep", px=px, seed=1)
-
-    (found,) = discover_series(evidence).effects
+    (found,) = discover_series(evidence_of("creep", px=px, seed=1)[0]).effects
 
     assert found.effect == "creep"  # the cause in time, either way
     part = found.evidence["shift_and_tilt"]
@@ -210,32 +183,26 @@ def test_a_mount_that_bends_late_or_at_once_is_named(evidence_of, seed, late):
     (found,) = discover_series(evidence).effects
 
     assert (found.effect, "tau" in found.estimates) == ("mount_motion", late)
-    if not late:
-        assert "at once" in found.statement
-        return
-    tau = found.estimates["tau"]
-    assert tau["value"] == pytest.approx(truth["effects"][0][0]["tau"], abs=3 * tau["sd"])
-    assert found.evidence["shift_and_tilt"]["chi2_difference"] < -100  # a tilt, not a shift
-
-
-DISTORTION = [{"decentering_drift"}, {"radial_distortion_drift"}]
+    assert ("at once" in found.statement) is not late
+    if late:
+        tau = found.estimates["tau"]
+        assert tau["value"] == pytest.approx(truth["effects"][0][0]["tau"], abs=3 * tau["sd"])
+        assert found.evidence["shift_and_tilt"]["chi2_difference"] < -100  # a tilt, not a shift
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("preset", "expected"),
-    [
-        # a bending mount, with six coefficients, explains nearly as much as the two drifts
-        ("nexus5-cold", DISTORTION),
-        ("galaxy-s8-cold", [{"defocus"}, *DISTORTION[1:]]),
-    ],
+    ("preset", "first"),
+    # a bending mount, with six coefficients, explains nearly as much as the two drifts
+    [("nexus5-cold", "decentering_drift"), ("galaxy-s8-cold", "defocus")],
 )
-def test_effects_of_a_preset_are_named(preset, expected, tmp_path):
+def test_effects_of_a_preset_are_named(preset, first, tmp_path):
     m1, m2 = (tc.simulate(preset, seed=k, series=f"M{k}", out=tmp_path / f"M{k}") for k in (1, 2))
 
     found = tc.discover(m1, verify=[m2])
 
-    assert [{e.effect, *e.alternative_names} for e in found.effects] == expected
+    named = [{e.effect, *e.alternative_names} for e in found.effects]
+    assert named == [{first}, {"radial_distortion_drift"}]
     assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.02)
 
 
@@ -255,8 +222,6 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     assert 0 <= first < last <= evidence[0].source.numbers[-1]
     assert last > 24  # epochs, not rows
     page = report_html(found, "long")
-    assert "<svg" in page
-    assert re.search(r"Made on \d{4}-\d\d-\d\d at \d\d:\d\d UTC with thermocald", page)
     source = evidence[0].source
     assert f"{source.camera}, {source.sensor.width} × {source.sensor.height}\xa0px of" in page
     links = re.findall(r'href="#(chapter-1-\d)"', page)
@@ -283,8 +248,12 @@ def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [32, 35])
-def test_two_small_effects_are_no_motion_of_the_mount(seed, tmp_path):
+@pytest.mark.parametrize(
+    ("seed", "name", "listed"),
+    [(32, "decentering_drift", "decentering_drift"),
+     (35, "mount_motion", "decentering_drift+radial_distortion_drift")],
+)  # fmt: skip
+def test_two_small_effects_are_no_motion_of_the_mount(seed, name, listed, tmp_path):
     """The distortion of the preset's camera drifts radially and by decentering.
 
     The mount's six coefficients imitate these together better than one of them fits alone.
@@ -292,9 +261,7 @@ def test_two_small_effects_are_no_motion_of_the_mount(seed, tmp_path):
     found = tc.discover(tc.simulate("rpi-v2.1-heating", seed=seed, out=tmp_path / "M1"))
 
     (entry,) = [e for e in found.effects if e.effect in ("mount_motion", "decentering_drift")]
-    listed = [entry.effect, *(a["effect"] for a in entry.alternatives)]
-    assert {32: "decentering_drift", 35: "decentering_drift+radial_distortion_drift"}[
-        seed
-    ] in listed
-    assert (entry.effect == "decentering_drift") == (seed == 32)
-    assert "radial_distortion_drift" not in listed
+    names = [entry.effect, *(a["effect"] for a in entry.alternatives)]
+    assert entry.effect == name
+    assert listed in names
+    assert "radial_distortion_drift" not in names

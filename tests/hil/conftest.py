@@ -83,10 +83,8 @@ def video(machine):
 
 @pytest.fixture(scope="session")
 def i2c_bus(machine):
-    """Return the number of an SMBus: LM75 0x48, 0x49, MCP9808 0x18, BME280 0x76."""
-    machine.run(
-        "modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x18,0x76"
-    )
+    """Return the number of an SMBus: LM75 0x48, 0x49, BME280 0x76."""
+    machine.run("modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x76")
     find = "grep -l 'SMBus stub' /sys/class/i2c-dev/*/name"
     return int(machine.wait(f"{find} | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' | grep ."))
 

@@ -55,11 +55,10 @@ def test_recordings_of_two_cameras_contradict_each_other(epochs):
     assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.06)
 
 
-def test_a_step_of_the_last_epoch_may_be_any_cause_that_begins_there(evidence_of):
+def test_a_step_of_the_last_epoch_may_be_any_cause_that_begins_there(discovered):
     """Regression: a large softening was named `slip` alone, with equal χ²."""
-    evidence, _ = evidence_of("softening", px=5.0, seed=7031, epochs=33, with_m2=False)
-
-    assert discover_series(evidence).headline == "effects_found: slip or softening"
+    found, _ = discovered("softening", px=5.0, seed=7031, epochs=33, with_m2=False)
+    assert found.headline == "effects_found: slip or softening"
 
 
 def test_epochs_with_few_targets_have_no_weight(evidence_of):
@@ -80,13 +79,12 @@ def test_epochs_with_few_targets_have_no_weight(evidence_of):
     ("effect", "px", "seed"),
     [("thermal_lag", 0.03, 0), ("time_offset", 0.3, 321)],  # small; under a steady ramp
 )
-def test_a_lag_and_a_delay_that_do_the_same_stay_alternatives(evidence_of, effect, px, seed):
-    evidence, truth = evidence_of(effect, px=px, seed=seed)
+def test_a_lag_and_a_delay_that_do_the_same_stay_alternatives(discovered, effect, px, seed):
+    found, truth = discovered(effect, px=px, seed=seed)
     assert truth["effects"][0][0].get("tau", 0.0) < 3
-    found = discover_series(evidence)
-    names = {found.effects[0].effect, *found.effects[0].alternative_names}
-    assert {"thermal_lag", "time_offset"} <= names
-    assert "experiment" in found.effects[0].alternatives[0]
+    first = found.effects[0]
+    assert {"thermal_lag", "time_offset"} <= {first.effect, *first.alternative_names}
+    assert "experiment" in first.alternatives[0]
 
 
 def test_a_lag_as_long_as_the_series_has_no_delay_beside_it(evidence_of):
@@ -165,9 +163,8 @@ def test_a_poor_thermometer_does_not_lengthen_a_lag(evidence_of):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("px", "separable"), [(0.1, True), (0.006, False)])
-def test_the_recording_decides_whether_shift_and_tilt_are_separable(evidence_of, px, separable):
-    (found,) = discover_series(evidence_of("creep", px=px, seed=1)[0]).effects
-
+def test_the_recording_decides_whether_shift_and_tilt_are_separable(discovered, px, separable):
+    (found,) = discovered("creep", px=px, seed=1)[0].effects
     assert found.effect == "creep"  # the cause in time, either way
     part = found.evidence["shift_and_tilt"]
     assert part["separable"] is separable
@@ -177,11 +174,9 @@ def test_the_recording_decides_whether_shift_and_tilt_are_separable(evidence_of,
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "late"), [(3, True), (1, False)])
-def test_a_mount_that_bends_late_or_at_once_is_named(evidence_of, seed, late):
-    evidence, truth = evidence_of("mount_motion", px=0.1, seed=seed)
-
-    (found,) = discover_series(evidence).effects
-
+def test_a_mount_that_bends_late_or_at_once_is_named(discovered, seed, late):
+    discovery, truth = discovered("mount_motion", px=0.1, seed=seed)
+    (found,) = discovery.effects
     assert (found.effect, "tau" in found.estimates) == ("mount_motion", late)
     assert ("at once" in found.statement) is not late
     if late:
@@ -214,33 +209,30 @@ def short_blocks(monkeypatch):
     )
 
 
-def test_an_effect_in_a_long_series(short_blocks, evidence_of):
-    evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, epochs=72, with_m2=False)
-    found = discover_series(evidence)
-    assert [e.effect for e in found.effects] == ["nonlinear_expansion"]
+def test_an_effect_in_a_long_series(short_blocks, discovered):
+    found, truth = discovered("nonlinear_expansion", px=0.2, seed=12, epochs=72, with_m2=False)
+    assert found.headline == "effects_found: nonlinear_expansion"
     first, last = found.effects[0].where["epochs"]
-    assert 0 <= first < last <= evidence[0].source.numbers[-1]
-    assert last > 24  # epochs, not rows
+    assert 0 <= first < 24 < last <= 72  # epochs, not rows
     page = report_html(found, "long")
-    source = evidence[0].source
-    assert f"{source.camera}, {source.sensor.width} × {source.sensor.height}\xa0px of" in page
+    assert f"{truth['camera']}, " in page
     links = re.findall(r'href="#(chapter-1-\d)"', page)
     assert links == re.findall(r'<details id="(chapter-1-\d)"', page)
     assert len(links) >= 4
 
 
-def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
+def test_what_is_unexplained_in_a_long_series(short_blocks, discovered):
     """Its size is the image's movement, its parameters are those that moved.
 
     The temperature's rate is of all epochs and the misfit of blocks: np.gradient of both.
     """
-    evidence, truth = evidence_of("outside", px=0.3, seed=24, epochs=120, with_m2=False)
-    found = discover_series(evidence)
+    found, truth = discovered("outside", seed=24, epochs=120, with_m2=False)
     assert found.headline == "unexplained: unnamed"
     (entry,) = found.effects
     assert entry.estimates["size"]["value"] == pytest.approx(0.3, rel=0.05)
-    assert entry.where["parameters"]
-    assert {f"a_{p}" for p in entry.where["parameters"]} <= set(truth["effects"][0][0])
+    moved = {f"a_{p}" for p in entry.where["parameters"]}
+    assert moved
+    assert moved <= set(truth["effects"][0][0])
     assert entry.evidence["bridge"]["transferable"] is False
     rows = found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]
     assert "rate of temperature" in [row["what"] for row in rows]

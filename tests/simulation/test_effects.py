@@ -84,6 +84,11 @@ FORMULAS = {
 }  # fmt: skip
 
 
+def test_every_effect_has_its_formula_here():
+    of_points_and_noise = {"defocus", "test_field_expansion", "target_displacement"}
+    assert {name.split()[0] for name in FORMULAS} | of_points_and_noise == set(NAMES)
+
+
 @pytest.mark.parametrize("name", FORMULAS)
 def test_an_effect_adds_its_formula_to_its_parameters_alone(name):
     values, coefficients, expected = FORMULAS[name]

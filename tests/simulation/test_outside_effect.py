@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import ast
-import re
 import subprocess
 import sys
 from pathlib import Path
-
-from thermocald.physics import catalogue
 
 OUTSIDE = '''
 """Saturation: a spring that gives less and less."""
 
 import numpy as np
 
-from thermocald.physics.effect import Effect, Steady
-from thermocald.physics.effect import Parameter, coefficient_units
+from thermocald.physics.effect import Effect, Parameter, coefficient_units
 
 
 class Saturation(Effect):
@@ -98,21 +93,3 @@ def test_other_classes_than_effects_are_refused(tmp_path):
     ran = run_with(tmp_path, "class Saturation:\n    pass\n", program)
     assert "ConfigurationError" in ran.stderr
     assert "saturation:Saturation, which is not an Effect" in ran.stderr
-
-
-def test_no_module_outside_the_catalogue_names_an_effect():
-    """Neither as a string nor as a class; only modules without the catalogue may use words."""
-    names = set(catalogue.names())
-    names |= {type(catalogue.get(name)).__name__ for name in names}
-    found = []
-    for path in sorted((ROOT / "thermocald").rglob("*.py")):
-        source = path.read_text(encoding="utf-8")
-        if path.parent.name == "effects" or not re.search(
-            r"thermocald\.(physics|thermal|discovery|analysis\.thermal)", source
-        ):
-            continue
-        for node in ast.walk(ast.parse(source)):
-            text = node.value if isinstance(node, ast.Constant) else getattr(node, "id", "")
-            if isinstance(text, str) and text in names:
-                found.append(f"{path}:{node.lineno} {text}")
-    assert found == []

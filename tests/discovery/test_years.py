@@ -12,8 +12,7 @@ from benchmarks.long_recording import INTERVAL_S, RATES, field_of, write_long_re
 from tests.blocks import InBlocks
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.discovery.result import discover_series
-from thermocald.photogrammetry.camera.camera_model import Sensor, project
-from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.physics.model import follow_angle
 from thermocald.thermal.reduce import reduce_series
@@ -80,32 +79,30 @@ def test_nothing_is_found_in_a_year_without_an_effect():
     assert discover_series(year(outdoors, lambda _, T: T, 3)).verdict == "adequate"
 
 
-E, T = 7200, 9
-SIGMA = 0.05
+E = 7200
+
+
+def series_of(field, points, times, T, sigma):
+    weights = np.zeros((*points.shape[:2], 3))
+    weights[..., :2] = 1.0 / sigma**2
+    return SeriesInput(
+        "long", "camera", SENSOR, field, INTERIOR.c, times, times, {"temperature": T},
+        {"temperature": None}, ObservationGrid(points, weights), np.arange(len(times)) + 1,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def recorded():
     """A sine of 80 s for one of 30 hours; one point in epoch 4001 has a gross error."""
     rng = np.random.default_rng(1)
-    places = rng.uniform(200, 2800, (T, 2))
-    t = 15.0 * np.arange(E)
+    t, field = 15.0 * np.arange(E), field_of(9)
     fast = np.where((t > 20 * 3600) & (t < 21 * 3600), 0.5 * np.sin(2 * np.pi * t / 600), 0.0)
-    points = places + fast[:, None, None] + rng.normal(0, SIGMA, (E, T, 2))
+    points = rng.uniform(200, 2800, (9, 2)) + fast[:, None, None] + rng.normal(0, 0.05, (E, 9, 2))
     points[4001, 3] += 30.0
-    weights = np.zeros((E, T, 3))
-    weights[..., :2] = 1 / SIGMA**2
-    weights[100:150, 2] = 0.0
-    points[100:150, 2] = np.nan
-    T_read = 20 + 5 * np.sin(t / 40_000) + rng.normal(0, 0.03, E)
-    names = [str(i) for i in range(T)]
-    field = TestField.build(names, rng.uniform(0, 500, (T, 3)))
-    empty = np.empty((0, T, 3))
-    whole = SeriesInput(
-        "long", "camera", Sensor(3280, 2464, 0.00112), field, 3.0, t, t, {"temperature": T_read},
-        {"temperature": None}, ObservationGrid(empty[..., :2], empty), np.arange(E) + 1,
-    )  # fmt: skip
-    return whole, ObservationGrid(points, weights)
+    hidden = np.zeros((E, 9), dtype=bool)
+    hidden[100:150, 2] = True
+    whole = series_of(field, points, t, 20 + 5 * np.sin(t / 40_000) + rng.normal(0, 0.03, E), 0.05)
+    return whole, whole.grid.reject(hidden)
 
 
 def test_rows_are_weighted_means_without_gross_errors_and_short_where_it_is_fast(recorded):
@@ -141,30 +138,17 @@ def test_the_blocks_that_are_read_do_not_matter(recorded):
 NAMES = ("c", "x0", "y0")
 
 
-def series_of(epochs):
+def test_the_rates_of_a_large_range():
     """A year of image points without noise: 36 K, more on one side of the mean."""
-    field = field_of(21)
-    u = np.linspace(0, 1, epochs)
+    u = np.linspace(0, 1, 300)
     T = 16 + 12 * np.sin(2 * np.pi * u) + 6 * np.sin(4 * np.pi * u + 1)
-    values = np.tile(INTERIOR.as_array(), (epochs, 1))
+    values = np.tile(INTERIOR.as_array(), (300, 1))
     for column, rate in RATES.items():
         values[:, column] += rate * (T - 15.0)
-    values = follow_angle(values, INTERIOR.c)
-    points = project(SENSOR, values, np.tile(EXTERIOR.as_array(), (epochs, 1)), field.points)
-    weights = np.zeros((*points.shape[:2], 3))
-    weights[..., :2] = 1e4
-    times = INTERVAL_S * np.arange(epochs)
-    return SeriesInput(
-        name="far", series="far", camera="rpi", sensor=SENSOR, field=field,
-        grid=ObservationGrid(points, weights), numbers=np.arange(epochs), frame_times=times,
-        reading_times=times, readings={"temperature": T}, resolutions={"temperature": None},
-        principal_distance=INTERIOR.c,
-    )  # fmt: skip
-
-
-def test_the_rates_of_a_large_range():
-    reduced = reduce_series(series_of(300), strict=False)
-    fitted = fit_thermal_model([reduced], [])
+    exterior, field = np.tile(EXTERIOR.as_array(), (300, 1)), field_of(21)
+    points = project(SENSOR, follow_angle(values, INTERIOR.c), exterior, field.points)
+    series = series_of(field, points, INTERVAL_S * np.arange(300), T, 0.01)
+    fitted = fit_thermal_model([reduce_series(series, strict=False)], [])
     for column, name in enumerate(NAMES):
         assert fitted.model.rates[name] == pytest.approx(RATES[column], rel=3e-6)
 

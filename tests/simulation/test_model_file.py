@@ -43,6 +43,7 @@ def test_round_trip(tmp_path):
     write_model(tmp_path / "m.yaml", full_model())
     model = read_model(tmp_path / "m.yaml")
     assert model == full_model()
+    assert model.version == 4
     names = ("thermal_lag.tau", "second_heat_source.c", "interior.c", "interior.A1")
     known = model.covariance_of(names)
     assert np.allclose(np.diag(known), [3.6, 1e-14, 1e-8, 0.0], rtol=1e-12, atol=0.0)

@@ -7,7 +7,6 @@ import contextlib
 import os
 import shutil
 import socket
-import threading
 import zipfile
 from pathlib import Path
 from py_compile import PycInvalidationMode
@@ -15,7 +14,7 @@ from py_compile import PycInvalidationMode
 import pytest
 
 from tests.hil.machine import Machine
-from tests.hil.one_wire import Adapter, Probe
+from tests.hil.one_wire import Adapter, Plugged, Probe
 from tests.hil.phone import Phone
 
 HERE = Path(__file__).parent
@@ -89,19 +88,10 @@ def i2c_bus(machine):
     return int(machine.wait(f"{find} | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' | grep ."))
 
 
-class Instrument:
+class Instrument(Plugged):
     """A thermometer at the guest's USB serial adapter, which answers `T?` with T=…"""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.celsius = path, 21.25
-        self._socket: socket.socket | None = None
-        self._thread: threading.Thread | None = None
-
-    def plug(self) -> None:
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.connect(str(self.path))
-        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name="instrument")
-        self._thread.start()
+    celsius = 21.25
 
     def _serve(self, line: socket.socket) -> None:
         pending = b""
@@ -111,13 +101,6 @@ class Instrument:
                 command, pending = pending.split(b"\n", 1)
                 if command.strip() == b"T?":
                     line.sendall(f"T={self.celsius:+.3f}\r\n".encode())
-
-    def pull(self) -> None:
-        if self._socket is not None:
-            self._socket.shutdown(socket.SHUT_RDWR)
-            self._socket.close()
-            self._thread.join()
-            self._socket = None
 
 
 @contextlib.contextmanager

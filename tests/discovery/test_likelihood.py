@@ -43,8 +43,9 @@ def test_the_likelihood_is_that_of_the_dense_covariance(evidence_of, moves):
         for block, operator, _ in fitter.list_operators(fit.terms, fit.blocks, 0)
     ) * e.state_sd("temperature")
     S = images + errors @ errors.T
-    for direction, operator in e.movement.operators if moves else ():
-        S += carried(direction, operator) @ carried(direction, operator).T
+    for direction, sd in zip(e.movement.directions.T, e.movement.sd, strict=True) if moves else ():
+        J = carried(direction, e.movement.trajectories * sd)
+        S += J @ J.T
     rng = np.random.default_rng(0)
     C = rng.normal(size=(len(e.times), 3))
     C -= C.mean(axis=0)

@@ -31,7 +31,8 @@ def test_the_likelihood_is_that_of_the_dense_covariance(evidence_of, moves):
     keep = U[:, size > 1e-3 * np.median(size)]  # the well-determined combinations
     images = block_diag(*np.linalg.inv(np.einsum("pi,epq,qj->eij", keep, e.N, keep)))
     if moves:
-        e = replace(e, movement=Movement(keep[:, -2:], waves(e.times, 4), np.full((2, 4), 0.5)))
+        directions = keep[:, -2:] / np.sqrt(size[-2:])  # which have the noise as unit
+        e = replace(e, movement=Movement(directions, waves(e.times, 4), np.full((2, 4), 2.0)))
     fitter = HypothesisFitter([e])
     fit = fitter.fit((Term("nonlinear_expansion"),))
 
@@ -47,7 +48,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance(evidence_of, moves):
         J = carried(direction, e.movement.trajectories * sd)
         S += J @ J.T
     rng = np.random.default_rng(0)
-    C = rng.normal(size=(len(e.times), 3))
+    C = rng.normal(size=(len(e.times), 3)).cumsum(axis=0)
     C -= C.mean(axis=0)
     V = keep @ rng.normal(size=(keep.shape[1], 3))
     expected = products(S, C, keep.T @ V)

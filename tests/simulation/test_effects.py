@@ -160,6 +160,11 @@ def test_two_drives_are_applied_in_order():
     np.testing.assert_allclose(both, lagged, atol=1e-5)
 
 
+def test_a_mount_that_moves_later_is_said_with_its_lag():
+    late = {"tau": {"value": 400.0, "sd": 9.0, "unit": "s"}}
+    assert "with a lag of 400.0 ± 9.0 s" in catalogue.get("mount_motion").sentence(late)
+
+
 def test_every_pair_of_effects_has_an_experiment():
     lag, play = catalogue.get("thermal_lag"), catalogue.get("hysteresis")
     assert lag.experiment_against(play) == (

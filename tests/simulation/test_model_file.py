@@ -135,6 +135,7 @@ BAD = {
         (("camera", "width"), 3280.5, "whole number"),
         (("camera", "pixel_pitch"), 1.12, "thousandths of a mm"),
         (("reference_temperature",), {"value": 298.0, "unit": "K"}, "'K'; it must be 'degC'"),
+        (("exterior", "Z0"), None, "exterior.Z0: is missing"),
         (("covariance", "matrix"), [[1.0]], "2 × 2"),
         (("covariance", "matrix"), [[1.0, 2.0], [0.0, 1.0]], "not symmetric"),
         (("validity", "temperature"), [50.0, 20.0], "begins at 50"),

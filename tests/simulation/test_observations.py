@@ -63,8 +63,11 @@ def test_errors_of_thermometers():
 
 
 def test_frames_and_readings_have_their_own_instants(simulation):
-    uneven = {"jitter": 0.3, "reading_offset": 0.2, "reading_spread": 1.0}
+    """A programme without an initial temperature begins at the ambient one."""
+    uneven = {"jitter": 0.3, "reading_offset": 0.2, "reading_spread": 1.0, "initial": None}
     s = replace(simulation, programme=replace(simulation.programme, **uneven))
+    ambient = s.programme.boundaries["ambient"].at(s.frame_times[:1])
+    assert s.true_history.temperature()[:1] == pytest.approx(ambient, abs=0.01)
     shift = s.reading_times - s.frame_times
     assert -0.8 <= shift.min() < -0.7
     assert 1.1 < shift.max() <= 1.2

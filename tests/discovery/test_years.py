@@ -58,20 +58,20 @@ def test_the_afternoon_keeps_short_rows():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("temperature", "drives", "effect", "number", "true"),
+    ("temperature", "drives", "effect", "number", "true", "sds"),
     [
-        (cellar, behind, "thermal_lag", "tau", LAG_S),
+        (cellar, behind, "thermal_lag", "tau", LAG_S, 3),
         (outdoors, lambda at, T: T + 2.0 * at / (365 * DAY), "creep", "a_c",
-         2.0 * 2e-4 / (365 * DAY)),
-        (outdoors, lambda at, T: T + 1.5 * (at > 123.6 * DAY), "slip", "time", 123.6 * DAY),
+         2.0 * 2e-4 / (365 * DAY), 4),
+        (outdoors, lambda at, T: T + 1.5 * (at > 123.6 * DAY), "slip", "time", 123.6 * DAY, 3),
     ],
     ids=["hidden in one afternoon", "takes a year", "comes on one day"],
 )  # fmt: skip
-def test_an_effect_in_a_year_is_named(temperature, drives, effect, number, true):
+def test_an_effect_in_a_year_is_named(temperature, drives, effect, number, true, sds):
     found = discover_series(year(temperature, drives, 3))
     assert [e.effect for e in found.effects] == [effect]
     said = found.effects[0].estimates[number]
-    assert said["value"] == pytest.approx(true, abs=3 * said["sd"])
+    assert said["value"] == pytest.approx(true, abs=sds * said["sd"])
 
 
 @pytest.mark.slow

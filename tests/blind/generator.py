@@ -82,22 +82,21 @@ def generate(case: Case) -> tuple[list[Series], dict]:
     rng.normal(0, 1, 6)  # unused, but keeps the recordings of a seed unchanged
     turned = rng.normal(0, 1, 6) * np.array([2e-3, 2e-3, 2e-3, 3, 3, 3])
     views = [camera.base[10:], camera.base[10:] + turned]
-    shift = np.zeros(16)
-    shift[:3] = rng.normal(0, 1, 3) * np.array([2, 1, 1]) * camera.sensor[2]
-    offsets = [np.zeros(16), shift]
-    frame_axis = []
-    for _ in programmes:
-        f = case.interval * np.arange(case.epochs)
-        if case.hard:
-            f = f + rng.uniform(-2, 2, case.epochs)
-            f -= f[0]
-        frame_axis.append(f)
+    offsets = [np.zeros(16), np.zeros(16)]
+    offsets[1][:3] = rng.normal(0, 1, 3) * np.array([2, 1, 1]) * camera.sensor[2]
+    frame_axis = [case.interval * np.arange(case.epochs) for _ in programmes]
+    for s, regular in enumerate(frame_axis if case.hard else ()):
+        uneven = regular + rng.uniform(-2, 2, case.epochs)
+        frame_axis[s] = uneven - uneven[0]
     per_series = [[fresh(rng, e, k == 0, seconds) for e in hidden] for k in range(2)]
+
+    def predicted(s: int, effects: list[dict], points: np.ndarray) -> tuple[np.ndarray, ...]:
+        return true_parameters(camera, effects, climates[s], unknowns[s], frame_axis[s], points,
+                               views[s], offsets[s])  # fmt: skip
 
     def leftover(size: float, which: int) -> float:
         e = dict(per_series[0][which], size=size)
-        p, X, nf = true_parameters(camera, [e], climates[0], unknowns[0], frame_axis[0], nominal,
-                                   views[0], offsets[0])  # fmt: skip
+        p, X, nf = predicted(0, [e], nominal)
         if e["effect"] == "defocus":
             return float(np.sqrt(np.mean((case.noise_px * nf) ** 2 - case.noise_px**2)))
         T = np.interp(frame_axis[0], np.arange(seconds), T1)
@@ -128,12 +127,10 @@ def generate(case: Case) -> tuple[list[Series], dict]:
             s[k]["size"] = size
 
     built = []
-    count = 2 if case.with_m2 else 1
     field_error = rng.normal(0, 0.02, nominal.shape) if case.hard else np.zeros_like(nominal)
-    for s in range(count):
+    for s in range(1 + case.with_m2):
         frames = frame_axis[s]
-        p, X, noise = true_parameters(camera, per_series[s], climates[s], unknowns[s], frames,
-                                      nominal + field_error, views[s], offsets[s])  # fmt: skip
+        p, X, noise = predicted(s, per_series[s], nominal + field_error)
         if case.field_motion and s == 0:
             X = moved_field(np.random.default_rng([case.seed, 79]), case.field_motion, X, frames)
         uv = image(X, p, camera.sensor)
@@ -143,7 +140,7 @@ def generate(case: Case) -> tuple[list[Series], dict]:
             one = replace(one, columns={"humidity": read})
         built.append(one)
     truth = {
-        "case": dict(case.__dict__.items()),
+        "case": vars(case),
         "camera": camera_name,
         "programmes": list(programmes),
         "effects": [[_plain(e) for e in s] for s in per_series],
@@ -155,11 +152,10 @@ def _plain(e: dict) -> dict:
     """Return the truth of an effect in the units of EFFECTS.md."""
     name, size = e["effect"], e["size"]
     out: dict = {"effect": name}
+    scaled = size if name in ("thermal_lag", "time_offset", "hysteresis") else 1
     for key in ("tau", "d", "half_width"):
         if key in e:
-            out[key] = e[key] * (
-                size if name in ("thermal_lag", "time_offset", "hysteresis") else 1
-            )
+            out[key] = e[key] * scaled
     for key in ("T_k", "P", "channel", "targets", "time", "happens", "phase"):
         if key in e:
             out[key] = e[key]
@@ -206,9 +202,7 @@ def _measure(
             L = np.linalg.cholesky(np.exp(-0.5 * (d / 250.0) ** 2) + 1e-6 * np.eye(n))
             measured += 0.01 * np.einsum("ij,ejk->eik", L, rng.normal(size=uv.shape))
     width, height = CAMERAS[camera][:2]
-    seen = (
-        (uv[..., 0] > 5) & (uv[..., 0] < width - 5) & (uv[..., 1] > 5) & (uv[..., 1] < height - 5)
-    )
+    seen = np.all((uv > 5) & (uv < np.array([width, height]) - 5), axis=-1)
     seen &= rng.random((E, n)) > 0.02
     gross = rng.random((E, n)) < 0.002
     away = rng.uniform(0.5, 8, (E, n, 1)) * rng.choice([-1, 1], (E, n, 2))

@@ -66,49 +66,50 @@ def _direction(rng: np.random.Generator, camera: Camera) -> np.ndarray:
     return out
 
 
-def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> dict:
+def _scattered(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+# the constants of an effect, drawn with what is known of both series
+CONSTANTS: dict[str, Callable[[np.random.Generator, dict], dict]] = {
+    "thermal_lag": lambda rng, _: {"tau": _scattered(rng, 25, 240)},
+    "time_offset": lambda rng, _: {"d": float(rng.choice([-1, 1]) * rng.uniform(8, 60))},
+    "hysteresis": lambda rng, _: {"half_width": float(rng.uniform(0.4, 2.5))},
+    "softening": lambda rng, known: {"T_k": float(known["T_quantile"](rng.uniform(0.35, 0.7)))},
+    "self_heating": lambda rng, _: {"tau": _scattered(rng, 60, 600)},
+    "cyclic_interference": lambda rng, _: {"P": _scattered(rng, 45, 500)},
+    "second_heat_source": lambda *_: {"channel": "board_temperature"},
+    "target_displacement": lambda rng, _: {
+        "targets": sorted(int(v) for v in rng.choice(147, rng.integers(1, 5), replace=False)),
+        "vector": rng.normal(size=3)},
+    # the noise depends on temperature equally in both series
+    "defocus": lambda _, known: {"coldest": known["coldest"]},
+    # a bracket of some decimetres that bends with or without a lag
+    "mount_motion": lambda rng, _: {"tau": float(rng.choice([1e-3, _scattered(rng, 60, 500)]))},
+    "test_field_expansion": lambda rng, _: {"axes": rng.uniform(0.2, 1.0, 3) * 1e-5},
+}  # fmt: skip
+
+
+def hide(rng: np.random.Generator, name: str, camera: Camera, known: dict) -> dict:
     """Draw the constants of one effect; its size is scaled afterwards."""
-    e: dict = {"effect": name, "size": 1.0}
-    if name == "thermal_lag":
-        e["tau"] = float(np.exp(rng.uniform(np.log(25), np.log(240))))
-    elif name == "time_offset":
-        e["d"] = float(rng.choice([-1, 1]) * rng.uniform(8, 60))
-    elif name == "hysteresis":
-        e["half_width"] = float(rng.uniform(0.4, 2.5))
-    elif name == "softening":
-        e["T_k"] = float(truth["T_quantile"](rng.uniform(0.35, 0.7)))
-    elif name == "self_heating":
-        e["tau"] = float(np.exp(rng.uniform(np.log(60), np.log(600))))
-    elif name == "cyclic_interference":
-        e["P"] = float(np.exp(rng.uniform(np.log(45), np.log(500))))
-    elif name == "second_heat_source":
-        e["channel"] = "board_temperature"
-    elif name == "target_displacement":
-        e["targets"] = sorted(int(v) for v in rng.choice(147, rng.integers(1, 5), replace=False))
-        e["vector"] = rng.normal(size=3)
-    elif name == "defocus":
-        e["coldest"] = truth["coldest"]  # the noise depends on temperature equally in both series
+    e: dict = {"effect": name, "size": 1.0, **CONSTANTS.get(name, lambda *_: {})(rng, known)}
     along = np.zeros(16)
     if name in ("nonlinear_expansion", "softening", "thermal_gradient", "permanent_set",
                 "self_heating", "creep", "slip", "cyclic_interference", "second_heat_source",
                 OUTSIDE):  # fmt: skip
         along = _direction(rng, camera)
-    elif name == "housing_tilt":
+    elif name in ("housing_tilt", "mount_motion"):
         along[10:13] = rng.normal(size=3) * 1e-5
-    elif name == "mount_motion":  # a bracket of some decimetres that bends with or without a lag
-        e["tau"] = float(rng.choice([1e-3, np.exp(rng.uniform(np.log(60), np.log(500)))]))
-        along[10:13] = rng.normal(size=3) * 1e-5
-        along[13:16] = rng.normal(size=3) * 1e-2
+        if name == "mount_motion":
+            along[13:16] = rng.normal(size=3) * 1e-2
     elif name == "radial_distortion_drift":
         along[3] = 1e-5
         if rng.random() < 0.4:
             along[4] = rng.normal() * 2e-6
-    elif name == "decentering_drift":
-        along[6:8] = rng.normal(size=2) * 1e-5
-    elif name == "affinity_drift":
-        along[8:10] = rng.normal(size=2) * 1e-5
-    elif name == "test_field_expansion":
-        e["axes"] = rng.uniform(0.2, 1.0, 3) * 1e-5
+    elif name in ("decentering_drift", "affinity_drift"):
+        first = 6 if name == "decentering_drift" else 8
+        along[first : first + 2] = rng.normal(size=2) * 1e-5
     return {**e, "along": along} if along.any() else e
 
 

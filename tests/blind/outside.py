@@ -9,17 +9,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tests.blind.world import backlash, lagged, smooth_unknown
+from tests.blind.world import backlash, lagged, smooth_unknown, stepped
 
 Climate = dict[str, np.ndarray]
 
 
 def _leaking(x: np.ndarray, tau: float) -> np.ndarray:
-    out, state = np.empty_like(x), x[0]
-    for i, v in enumerate(x):
-        state = v if v > state else v + (state - v) * np.exp(-1.0 / tau)
-        out[i] = state
-    return out
+    left = np.exp(-1.0 / tau)
+    return stepped(x, x[0], lambda state, v: v if v > state else v + (state - v) * left)
 
 
 def _humidity(rng: np.random.Generator, seconds: int) -> np.ndarray:

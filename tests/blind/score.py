@@ -125,18 +125,13 @@ def run(
 
 
 def _show(part: str, o: Outcome) -> None:
-    """Print what is wrong with an outcome."""
-    wrong = [f"{name} wrong by {p:.1f} sd" for name, p in o.pulls.items() if abs(p) > 3]
-    if o.gap_closed is not None and o.gap_closed < 0.9:
-        wrong.append(f"gap closed by {o.gap_closed:.2f}")
-    if not o.right:
-        wrong.append(
-            f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, "
-            f"left {o.misfit_px:.4f} px"
-        )
-    if wrong:
-        hidden = "+".join(o.case.effects) or "none"
-        print(f"  {part} seed {o.case.seed} {hidden}: {'; '.join(wrong)}", flush=True)
+    """Print an outcome in which something is wrong."""
+    far = {name: f"{pull:.1f} sd" for name, pull in o.pulls.items() if abs(pull) > 3}
+    if far or not o.right or (o.gap_closed or 1.0) < 0.9:
+        print(
+            f"  {part} seed {o.case.seed} {o.case.effects}: {o.found} ({o.verdict}), listed "
+            f"{o.listed}, {far}, gap closed {o.gap_closed}, left {o.misfit_px:.4f} px", flush=True,
+        )  # fmt: skip
 
 
 def main() -> None:

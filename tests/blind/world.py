@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 
@@ -45,15 +47,15 @@ def image(points: np.ndarray, p: np.ndarray, sensor: tuple[int, int, float]) -> 
     return np.stack([u, w], -1)
 
 
+def stepped(x: np.ndarray, state: float, rule: Callable[[float, float], float]) -> np.ndarray:
+    """Return the state after each second, which a rule computes from the one before and x."""
+    return np.array([state := rule(state, v) for v in x])
+
+
 def _warmed(power: np.ndarray, tau: float, start: float) -> np.ndarray:
     """Return the temperature of a body with one time constant, in steps of one second."""
-    out = np.empty_like(power)
-    state = start
     decay = 1.0 - np.exp(-1.0 / tau)
-    for i, q in enumerate(power):
-        state += (q - state) * decay
-        out[i] = state
-    return out
+    return stepped(power, start, lambda state, q: state + (q - state) * decay)
 
 
 def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str, np.ndarray]:
@@ -62,15 +64,14 @@ def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str,
     ambient = rng.uniform(16, 26) + rng.uniform(-1.5, 1.5) * np.sin(
         2 * np.pi * t / rng.uniform(2500, 6000) + rng.uniform(0, 6.3)
     )
-    load = np.zeros(seconds)
-    lamp = np.zeros(seconds)
+    load, lamp = np.zeros(seconds), np.zeros(seconds)
     scale = seconds / 1800.0
     if programme in ("lamp", "lamp2"):
         at = rng.uniform(60, 180) * scale
-        cycles = 1 if programme == "lamp" else 2
+        cycles, shorter = (1, 1) if programme == "lamp" else (2, 1.5)
         for _ in range(cycles):
-            on = rng.uniform(400, 620) * scale / (1 if cycles == 1 else 1.5)
-            off = rng.uniform(400, 700) * scale / (1 if cycles == 1 else 1.5)
+            on = rng.uniform(400, 620) * scale / shorter
+            off = rng.uniform(400, 700) * scale / shorter
             lamp[(t >= at) & (t < at + on)] = rng.uniform(14, 28)
             at += on + off
     elif programme == "steps":
@@ -126,11 +127,7 @@ def lagged(x: np.ndarray, tau: float) -> np.ndarray:
 
 
 def backlash(x: np.ndarray, half: float) -> np.ndarray:
-    out, state = np.empty_like(x), x[0]
-    for i, v in enumerate(x):
-        state = max(min(state, v + half), v - half)
-        out[i] = state
-    return out
+    return stepped(x, x[0], lambda state, v: max(min(state, v + half), v - half))
 
 
 def delayed(x: np.ndarray, d: float) -> np.ndarray:

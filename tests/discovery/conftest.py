@@ -11,6 +11,7 @@ import pytest
 
 from tests.blind.bridge import generated
 from tests.blind.case import Case
+from thermocald.discovery.result import discover_series
 from thermocald.thermal.reduce import reduce_together
 
 
@@ -24,3 +25,14 @@ def evidence_of():
         return reduce_together(inputs), truth
 
     return build
+
+
+@pytest.fixture(scope="session")
+def discovered(evidence_of):
+    """Return what is discovered in a blind case, and its truth."""
+
+    def discover(*effects: str, **case):
+        evidence, truth = evidence_of(*effects, **case)
+        return discover_series(evidence), truth
+
+    return discover

@@ -9,7 +9,6 @@ import pytest
 
 from tests.analysis.test_thermal_model import for_fit, simulated
 from tests.blind.world import lagged
-from tests.discovery.test_movement import trembling
 from thermocald.discovery.entries import find_tied_constants, lagging_thermometer
 from thermocald.discovery.result import discover_series
 from thermocald.physics import catalogue
@@ -20,38 +19,37 @@ from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import epochs_input
 
-
-@pytest.fixture(scope="module")
-def lagging():
-    return HypothesisFitter(trembling(("thermal_lag",), 0.0, 3))
-
-
 T = Node("", name="temperature")
 
 
-def fitted(fitter, formula):
-    """A formula in c, x0, y0, with its constants as unknowns."""
+def lags(first, second):
+    return Node("lag", (Node("lag", (T,), (first,)),), (second,))
+
+
+@pytest.mark.parametrize(
+    ("formula", "said"),
+    [
+        pytest.param(
+            lags(30.0, 30.0),
+            "tau, tau_2 and the size are best known together, as they correlate by 1.0000",
+            id="two equal lags",
+        ),
+        pytest.param(lags(20.0, 150.0), None, id="a short and a long lag"),
+        # its tail is an exponential: middle and size are one number
+        pytest.param(
+            Node("saturation", (T,), (3783.7, 288.2)),
+            "k and the size are known only together, as other values fit as well: slope and ",
+            id="a saturation far outside the recorded range",
+        ),
+        pytest.param(Node("saturation", (T,), (30.0, 8.0)), None, id="one within the range"),
+    ],
+)
+def test_constants_that_are_known_only_together(evidence_of, formula, said):
+    fitter = HypothesisFitter(evidence_of("thermal_lag", seed=3)[0])
     structure, values = formula.named()
     fit = fitter.fit((Term(structure.text(), BASE, tuple(values.items())),))
-    return fitter.refine(fit, max_iterations=0)
-
-
-def twice_lagging(fitter, first, second):
-    return fitted(fitter, Node("lag", (Node("lag", (T,), (first,)),), (second,)))
-
-
-def saturating(fitter, middle, width):
-    """A saturation of the temperature."""
-    return fitted(fitter, Node("saturation", (T,), (middle, width)))
-
-
-def test_two_equal_lags_are_known_only_together(lagging):
-    found = find_tied_constants(lagging, twice_lagging(lagging, 30.0, 30.0), 0)
-
-    assert say_together(found) == (
-        "tau, tau_2 and the size are best known together, as they correlate by 1.0000"
-    )
-    assert find_tied_constants(lagging, twice_lagging(lagging, 20.0, 150.0), 0) is None
+    found = find_tied_constants(fitter, fitter.refine(fit, max_iterations=0), 0)
+    assert (found and say_together(found)[: len(said or "")]) == said
 
 
 @pytest.mark.parametrize(
@@ -62,9 +60,7 @@ def test_two_equal_lags_are_known_only_together(lagging):
 def test_a_foreign_thermometer_is_said_by_its_label(name, label):
     channel = {"channel": {"value": name, "sd": None, "unit": "name"}}
     product = Node("product", (T, Node("", name=name))).text()
-
     heats = catalogue.get("second_heat_source").sentence(channel)
-
     assert heats == f"{label} heats the camera too"
     assert label in catalogue.get(product).sentence({"a_c": {}})
 
@@ -72,56 +68,29 @@ def test_a_foreign_thermometer_is_said_by_its_label(name, label):
 def test_a_thermometer_that_is_stuck_is_as_if_there_were_none(evidence_of):
     """Neither a second source of heat nor a cause of noise."""
     (e,), _ = evidence_of("thermal_lag", epochs=30, with_m2=False)
-    stuck = np.full(30, 21.0)
-    source = replace(e.source, readings={**e.source.readings, "board_temperature": stuck})
+    stuck = {**e.source.readings, "board_temperature": np.full(30, 21.0)}
 
-    found = discover_series([reduce_series(source)])
+    found = discover_series([reduce_series(replace(e.source, readings=stuck))])
 
     assert found.headline == "effects_found: thermal_lag"
 
 
-def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alone(lagging):
-    """Its tail is an exponential: middle and size are one number."""
-    found = find_tied_constants(lagging, saturating(lagging, 3783.7, 288.2), 0)
+def test_only_what_follows_the_cameras_rates_may_be_a_lag_of_the_thermometer():
+    rates, tau = simulated(1, listed=()).model.rates, 60.0
 
-    assert found["parameters"] == ["k"]
-    assert found["exchanged"]
-    assert "known only together, as other values fit as well: slope and " in say_together(found)
+    def alternative(seed, **gradients):
+        s = simulated(seed, listed=(ModelEffect("thermal_gradient", gradients),))
+        source = epochs_input(s.head, s.field, list(s.epochs()), s.programme.series)
+        fitter = HypothesisFitter([for_fit(source)])
+        return lagging_thermometer(
+            fitter.refine(fitter.fit((Term("thermal_gradient", tuple(gradients)),))), 0
+        )
 
-
-def test_a_saturation_within_the_recorded_range_is_known(lagging):
-    middle = float(lagging.series[0].history.temperature().mean())
-    assert find_tied_constants(lagging, saturating(lagging, middle, 8.0), 0) is None
-
-
-NAMES = ("c", "x0", "y0")
-TAU = 60.0
-
-
-def alternative(seed: int, gradients: dict[str, float]):
-    s = simulated(seed, listed=(ModelEffect("thermal_gradient", gradients),))
-    source = epochs_input(s.head, s.field, list(s.epochs()), s.programme.series)
-    fitter = HypothesisFitter([for_fit(source)])
-    fit = fitter.fit((Term("thermal_gradient", NAMES),))
-    return lagging_thermometer(fitter.refine(fit), 0)
-
-
-def test_a_lag_of_the_thermometer_is_offered_with_its_time_and_an_experiment():
-    rates = simulated(1, listed=()).model.rates
-    off = []
-    for seed in range(3):
-        found = alternative(seed, {n: TAU * rates[n] for n in NAMES})
-        assert found is not None
-        assert "thermometer" in found["experiment"]
-        off.append(abs(found["values"]["tau"] - TAU))
-    assert np.max(off) < 2.0  # about four standard deviations
-
-
-def test_a_mount_that_bends_is_no_lag_of_the_thermometer():
-    assert alternative(1, {"c": 8e-3, "x0": 3e-2, "y0": 1e-2}) is None
-    rates = simulated(1, listed=()).model.rates
-    early = {n: -TAU * rates[n] for n in NAMES}
-    assert alternative(2, early) is None
+    late = {n: tau * rates[n] for n in ("c", "x0", "y0")}
+    off = [alternative(seed, **late)["values"]["tau"] - tau for seed in range(3)]
+    assert np.abs(off).max() < 2.0  # about four standard deviations
+    assert alternative(1, c=8e-3, x0=3e-2, y0=1e-2) is None  # a mount that bends
+    assert alternative(2, **{n: -v for n, v in late.items()}) is None  # the thermometer is early
 
 
 def test_a_slow_thermometer_is_offered_beside_a_negative_delay(evidence_of):
@@ -139,3 +108,4 @@ def test_a_slow_thermometer_is_offered_beside_a_negative_delay(evidence_of):
     assert (effect.effect, effect.alternative_names) == ("time_offset", ["lagging_thermometer"])
     assert effect.statement.startswith("the thermometer follows the camera after a pure delay of 1")
     assert abs(effect.alternatives[-1]["values"]["tau"] - 12.0) < 1.0
+    assert "thermometer" in effect.alternatives[-1]["experiment"]

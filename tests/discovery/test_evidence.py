@@ -7,32 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.blind.bridge import generated
-from tests.blind.case import Case
-from tests.real_corners.generator import CAMERAS
-from thermocald.discovery.result import discover_series
 from thermocald.errors import DataError
 from thermocald.store.recording.reader import read_recording
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.reduce import find_spikes, reduce_series
-from thermocald.thermal.series import in_blocks
 from thermocald.thermal.source import series_input
 
 
 @pytest.fixture(scope="module")
-def source():
-    return generated(Case(("creep",), 0.3, 4, with_m2=False))[0][0]
+def e(evidence_of):
+    return evidence_of("creep", seed=4, with_m2=False)[0][0]
 
 
-@pytest.fixture(scope="module")
-def e(source):
-    return reduce_series(source)
-
-
-def test_noise_is_found(e):
+def test_noise_is_found_and_gross_errors_are_taken_out(e):
     assert np.sqrt(e.variance) * 0.04 == pytest.approx(0.04, rel=0.02)
     assert np.median(e.sigma0) == pytest.approx(1.0, abs=0.02)
+    share = 1.0 - (e.weights[..., 0] > 0).sum() / e.source.grid.observed.sum()
+    assert 0.001 < share < 0.004  # 0.2 % were added, some too small to be seen
+    normal = e.residuals * np.sqrt(e.weights[..., :2])
+    assert np.nanmax(np.abs(normal)) < 6.0
 
 
 def test_turning_points_of_a_drift_are_no_gross_errors_and_jumps_are():
@@ -51,109 +45,67 @@ def test_turning_points_of_a_drift_are_no_gross_errors_and_jumps_are():
     assert (np.abs(near).max(axis=2).min(axis=1) <= 2).all()
 
 
-def test_gross_errors_are_taken_out(e):
-    share = 1.0 - (e.weights[..., 0] > 0).sum() / e.source.grid.observed.sum()
-    assert 0.001 < share < 0.004  # 0.2 % were added, some too small to be seen
-    normal = e.residuals * np.sqrt(e.weights[..., :2])
-    assert np.nanmax(np.abs(normal)) < 6.0
-
-
-def test_wrong_field_coordinates_do_not_matter(source, e):
+def test_wrong_field_coordinates_do_not_matter(e):
     """A constant error of each target's coordinates leaves the trajectories as they were."""
-    rng = np.random.default_rng(0)
-    moved = source.field.points + rng.normal(0, 0.1, source.field.points.shape)
-    other = replace(source, field=replace(source.field, points=moved))
+    field = e.source.field
+    moved = field.points + np.random.default_rng(0).normal(0, 0.1, field.points.shape)
+    other = reduce_series(replace(e.source, field=replace(field, points=moved)))
 
-    fits = [HypothesisFitter([x]).fit((Term("creep"),)) for x in (e, reduce_series(other))]
+    fits = [HypothesisFitter([x]).fit((Term("creep"),)) for x in (e, other)]
 
     creep = [f.coefficients[3:] for f in fits]
     # 0.1 mm in 1 m changes the partial derivatives by 1e-4, the linearisation slightly more
     assert np.linalg.norm(creep[0] - creep[1]) < 0.005 * np.linalg.norm(creep[0])
     # 18 combinations of parameters per epoch, their levels, 6 coefficients; three sigma of χ²
-    free = 18 * (len(source.frame_times) - 1) - 6
+    free = 18 * (len(e.times) - 1) - 6
     for fit in fits:
         assert abs(fit.chi2 - free) < 3 * np.sqrt(2 * free)
 
 
-def test_weak_input_is_refused(source):
-    none = {"temperature": np.full(len(source.frame_times), np.nan)}
-    constant = {"temperature": np.full(len(source.frame_times), 21.0)}
-    flat = source.field.points.copy()
-    flat[:, 2] = 0.0
+def weakened(source, case):
+    n, field = len(source.frame_times), source.field
     ten = slice(0, 10)
-    cases = {
-        "no temperature": replace(source, readings={}),
-        "holds fewer": replace(source, readings=none),
-        "constant": replace(source, readings=constant),
-        "one plane": replace(source, field=replace(source.field, points=flat)),
-        "of 10 epochs": replace(
-            source,
-            frame_times=source.frame_times[ten],
-            reading_times=source.reading_times[ten],
-            readings={k: v[ten] for k, v in source.readings.items()},
-            grid=type(source.grid)(source.grid.points[ten], source.grid.weights[ten]),
-            numbers=source.numbers[ten],
-        ),
-    }
-    for words, weak in cases.items():
-        with pytest.raises(DataError, match=words):
-            reduce_series(weak)
+    return replace(source, **{
+        "no temperature": {"readings": {}},
+        "holds fewer": {"readings": {"temperature": np.full(n, np.nan)}},
+        "constant": {"readings": {"temperature": np.full(n, 21.0)}},
+        "one plane": {"field": replace(field, points=field.points * [1, 1, 0])},
+        "lasts 50 s": {"frame_times": np.linspace(0, 50, n),
+                       "reading_times": np.linspace(0, 50, n)},
+        "of 10 epochs": {
+            "frame_times": source.frame_times[ten], "reading_times": source.reading_times[ten],
+            "readings": {k: v[ten] for k, v in source.readings.items()},
+            "grid": type(source.grid)(source.grid.points[ten], source.grid.weights[ten]),
+            "numbers": source.numbers[ten],
+        },
+    }[case])  # fmt: skip
 
 
-def test_blocks_keep_the_slow_courses(e):
-    short = in_blocks(e, rows=60)
+@pytest.mark.parametrize(
+    "case",
+    ["no temperature", "holds fewer", "constant", "one plane", "lasts 50 s", "of 10 epochs"],
+)
+def test_weak_input_is_refused(e, case):
+    with pytest.raises(DataError, match=case):
+        reduce_series(weakened(e.source, case))
 
-    assert len(short.times) == 60
-    assert short.N.sum(axis=0) == pytest.approx(e.N.sum(axis=0))
-    assert short.b.sum(axis=0) == pytest.approx(e.b.sum(axis=0))
-    assert short.averaged(e.times) == pytest.approx(short.times)
 
-
-def test_the_place_of_linearisation_has_all_parameters():
+def test_the_place_of_linearisation_has_all_parameters(evidence_of):
     """If C1 = 4e-3 were held at 0, y0 and B2 would absorb it, and the drifts would be biased."""
-    (series,), _ = generated(Case(("affinity_drift",), 0.3, 210, with_m2=False))
-
-    at = reduce_series(series).at
+    at = evidence_of("affinity_drift", seed=210, with_m2=False)[0][0].at
 
     assert at.iop[8] == pytest.approx(1.6e-3, abs=4e-4)  # C1 of the base and of the mean T
     assert abs(at.iop[7]) < 2e-4  # B2, drawn with 1e-4
 
 
-def with_a_ramp(shared, camera, stretched=1.0):
-    """A recording without thermal effects, with an invented temperature that rises.
-
-    stretched: factor of all times, so that fifty seconds become a quarter of an hour. Other courses
-    are the part `none` of tests/real_corners.
-    """
-    source = series_input(read_recording(shared / "data" / camera))
-    t = source.frame_times - source.frame_times[0]
-    T = 20 + 15 * t / t[-1] + np.random.default_rng(7).normal(0, 0.04, len(t))
-    times = source.frame_times[0] + t * stretched
-    return replace(
-        source, frame_times=times, reading_times=times, resolutions={"temperature": 0.0625},
-        readings={"temperature": np.round(T / 0.0625) * 0.0625},
-    )  # fmt: skip
-
-
-def test_fifty_seconds_are_too_short(shared):
-    with pytest.raises(DataError, match="lasts 50 s"):
-        reduce_series(with_a_ramp(shared, "aviary-cam2"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_an_invented_temperature_names_no_effect(shared, camera):
-    """Tag 22 of cam2 and camera 6 as a whole do move slightly, which may be `unnamed`."""
-    found = discover_series([reduce_series(with_a_ramp(shared, camera, 20.0))])
-
-    assert {e.effect for e in found.effects} <= {"unnamed"}
-
-
 def test_a_hidden_board_does_not_pull_at_the_cameras(shared):
     """Offsets and cameras are solved together: each target's residuals have no mean."""
-    e = reduce_series(with_a_ramp(shared, "aviary-cam2", 20.0))
-    seen = e.weights[..., 0] > 0
-    often = seen.sum(axis=0) > 50
+    source = series_input(read_recording(shared / "data" / "aviary-cam2"))
+    t = source.frame_times - source.frame_times[0]
+    warm = {"temperature": np.round(20 + 15 * t / t[-1], 1)}
+    times = source.frame_times[0] + 20.0 * t  # fifty seconds become a quarter of an hour
+    e = reduce_series(replace(source, frame_times=times, reading_times=times, readings=warm))
+    often = (e.weights[..., 0] > 0).sum(axis=0) > 50
 
     mean = np.nanmean(e.residuals[:, often], axis=0)
 

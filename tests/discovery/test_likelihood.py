@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -9,14 +11,7 @@ from scipy.linalg import block_diag
 from thermocald.discovery.validation import is_confirmed, measure_block_gains
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
-
-
-def of_images(e):
-    """The well-determined combinations (P, k), and the covariance of the images alone."""
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    keep = U[:, size > 1e-3 * np.median(size)]
-    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
-    return keep, block_diag(*np.linalg.inv(N))
+from thermocald.thermal.series import Movement, waves
 
 
 def products(S, C, V):
@@ -28,45 +23,46 @@ def products(S, C, V):
     return X.T @ (inverse - L @ np.linalg.solve(level.T @ L, L.T)) @ X
 
 
-@pytest.fixture(scope="module")
-def dense(evidence_of):
-    """A short series, a fit with two carried trajectories, and S built entry by entry."""
-    evidence, _ = evidence_of("nonlinear_expansion", seed=5, epochs=30, with_m2=False)
-    fitter = HypothesisFitter(evidence)
+@pytest.mark.parametrize("moves", [False, True], ids=["a fixed mount", "a mount that moves"])
+def test_the_likelihood_is_that_of_the_dense_covariance(evidence_of, moves):
+    """Of images, of the thermometer's errors through each trajectory, and of a movement."""
+    (e,), _ = evidence_of("nonlinear_expansion", seed=5, epochs=30, with_m2=False)
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    keep = U[:, size > 1e-3 * np.median(size)]  # the well-determined combinations
+    images = block_diag(*np.linalg.inv(np.einsum("pi,epq,qj->eij", keep, e.N, keep)))
+    if moves:
+        directions = keep[:, -2:] / np.sqrt(size[-2:])  # which have the noise as unit
+        e = replace(e, movement=Movement(directions, waves(e.times, 4), np.full((2, 4), 2.0)))
+    fitter = HypothesisFitter([e])
     fit = fitter.fit((Term("nonlinear_expansion"),))
-    e = evidence[0]
-    keep, images = of_images(e)
-    J = np.zeros((len(images), len(e.state_sd("temperature"))))
-    for block, operator, _ in fitter.list_operators(fit.terms, fit.blocks, 0):
-        d = keep.T @ fit.direction(block)[0]
-        J += np.einsum("k,er->ekr", d, operator).reshape(J.shape)
-    S = images + J @ np.diag(e.state_sd("temperature") ** 2) @ J.T
-    return e, fit, keep, S, images
 
+    def carried(direction, operator):
+        return np.einsum("k,er->ekr", keep.T @ direction, operator).reshape(len(images), -1)
 
-def test_inner_products_equal_the_dense_ones(dense):
-    e, fit, keep, S, images = dense
+    errors = sum(
+        carried(fit.direction(block)[0], operator)
+        for block, operator, _ in fitter.list_operators(fit.terms, fit.blocks, 0)
+    ) * e.state_sd("temperature")
+    S = images + errors @ errors.T
+    for direction, sd in zip(e.movement.directions.T, e.movement.sd, strict=True) if moves else ():
+        J = carried(direction, e.movement.trajectories * sd)
+        S += J @ J.T
     rng = np.random.default_rng(0)
-    C = rng.normal(size=(len(e.times), 3))
+    C = rng.normal(size=(len(e.times), 3)).cumsum(axis=0)
     C -= C.mean(axis=0)
     V = keep @ rng.normal(size=(keep.shape[1], 3))
-
-    A = fit.weightings[0].reduce(C, V)[0]
-
     expected = products(S, C, keep.T @ V)
-    assert pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected).max()) == A
+
+    found = fit.weightings[0].reduce(C, V)[0]
+
+    limit = np.abs(expected).max()
+    assert found == pytest.approx(expected, rel=2e-3, abs=2e-3 * limit)
     # the thermometer's part of S matters: image noise alone gives other values
-    alone = products(images, C, keep.T @ V)
-    assert np.abs(alone - expected).max() > 0.02 * np.abs(expected).max()
-
-
-def test_determinant(dense):
-    _, fit, keep, S, images = dense
-    expected = np.linalg.slogdet(S)[1] - np.linalg.slogdet(images)[1]
-    assert (
-        expected > keep.shape[1]
-    )  # readings are noisier than images: the determinants differ greatly
-    assert fit.weightings[0].logdet == pytest.approx(expected, rel=1e-3)
+    assert np.abs(products(images, C, keep.T @ V) - expected).max() > 0.02 * limit
+    if not moves:  # the size of a movement is estimated by restricted likelihood
+        larger = np.linalg.slogdet(S)[1] - np.linalg.slogdet(images)[1]
+        assert larger > keep.shape[1]  # readings are noisier than images
+        assert fit.weightings[0].logdet == pytest.approx(larger, rel=1e-3)
 
 
 def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
@@ -86,12 +82,10 @@ def test_a_step_within_the_block_left_out_is_no_fault(evidence_of):
     """Without the block that holds an early slip in M2, its size is undetermined."""
     evidence, truth = evidence_of("slip", px=0.2, seed=91, epochs=90)
     lab = HypothesisFitter(evidence)
-    times = [s["time"] for (s,) in truth["effects"] if s["happens"]]
-    own = [
-        (("time", float(e.times[np.searchsorted(e.times, t)])),)
-        for e, t in zip(lab.series, times, strict=False)
-    ]
-    fresh = tuple(own) + (None,) * (len(lab.series) - len(own))
+    fresh = tuple(
+        (("time", float(e.times[np.searchsorted(e.times, s["time"])])),) if s["happens"] else None
+        for e, (s,) in zip(lab.series, truth["effects"], strict=True)
+    )
 
     (gain,) = measure_block_gains(lab, lab.refine(lab.fit([Term("slip", fresh=fresh)])))
 

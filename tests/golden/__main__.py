@@ -10,14 +10,13 @@ import argparse
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from tests.golden import corpora
 from tests.golden.cases import CASES
-from tests.golden.corpora import CORPORA, check
-from tests.golden.workshop import DATA, Workshop, store, wrong
+from tests.golden.workshop import DATA, Workshop
 
 
 def main() -> int:
@@ -26,43 +25,22 @@ def main() -> int:
     options.add_argument("--corpora", action="store_true", help="the longer corpora of discovery")
     options.add_argument("names", nargs="*")
     given = options.parse_args()
-    if given.corpora:
-        return _corpora(given.update)
-    known = {case.name for case in CASES}
-    if unknown := set(given.names) - known:
+    known = list(corpora.CORPORA) if given.corpora else [case.name for case in CASES]
+    if unknown := set(given.names) - set(known):
         options.error(f"no such golden: {', '.join(sorted(unknown))}")
-    failed = 0
+    without_data = {case.name for case in CASES if case.needs_data and not DATA.is_dir()}
+    failed = False
     with tempfile.TemporaryDirectory() as folder:
-        workshop = Workshop(Path(folder))
-        for case in CASES:
-            if given.names and case.name not in given.names:
+        check = corpora.check if given.corpora else Workshop(Path(folder)).check
+        for name in given.names or known:
+            if name in without_data:
+                print(f"skipped  {name}: the reference data are absent")
                 continue
-            if case.needs_data and not DATA.is_dir():
-                print(f"skipped  {case.name}: the reference data are absent")
-                continue
-            begin = time.process_time()
-            found = workshop.result(case.name)
-            seconds = time.process_time() - begin
-            different = wrong(case, found)
-            if given.update and different:
-                store(case, found)
+            different, _ = check(name, given.update)
             word = "unchanged" if not different else "updated  " if given.update else "DIFFERENT"
-            print(f"{word}  {case.name} ({seconds:.1f} s)")
-            for line in different[:20]:
-                print(f"    {line}")
-            failed += bool(different) and not given.update
-    return int(failed > 0)
-
-
-def _corpora(update: bool) -> int:
-    failed = 0
-    for name in CORPORA:
-        different, _ = check(name, update)
-        failed += len(different)
-        print(f"{name}: {len(different)} differences")
-        for line in different:
-            print(f"    {line}")
-    return int(failed > 0 and not update)
+            print("\n    ".join([f"{word}  {name}", *different[:20]]))
+            failed |= bool(different) and not given.update
+    return int(failed)
 
 
 if __name__ == "__main__":

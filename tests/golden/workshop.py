@@ -23,9 +23,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 _LINES = 60
 _BY_NAME = {case.name: case for case in CASES}
 _LAG = """format: thermocald-effect/1
-effects:
-  - effect: thermal_lag
-    parameters: {tau: {value: 75.0, sd: 2.0, unit: s}}
+effects: [{effect: thermal_lag, parameters: {tau: {value: 75.0, sd: 2.0, unit: s}}}]
 """
 PROGRAMME = """format: thermocald-programme/1
 name: warm-up
@@ -57,6 +55,22 @@ class Workshop:
             self.found[name] = _run(case, self.folder)
         return self.found[name]
 
+    def check(self, name: str, update: bool = False) -> tuple[list[str], Any]:
+        """Return the differences from the stored result, and the result; `update` stores it.
+
+        Numbers are stored with 14 digits.
+        """
+        found, path = self.result(name), EXPECTED / f"{name}.json"
+        wrong = [f"{path.name} is missing: python -m tests.golden --update {name}"]
+        if path.is_file():
+            expected = json.loads(path.read_text())
+            wrong = list(differences(expected, found, _BY_NAME[name].tolerance))
+        if update and wrong:
+            text = json.dumps(_rounded(found), separators=(",", ":"), ensure_ascii=False)
+            # one entry per line, for readable diffs
+            path.write_text(text.replace(',"', ',\n"').replace(":{", ":\n{") + "\n")
+        return wrong, found
+
 
 def _run(case: Case, folder: Path) -> dict[str, Any]:
     for name in case.writes:
@@ -75,23 +89,6 @@ def _run(case: Case, folder: Path) -> dict[str, Any]:
     if "printed" in out and len(out["printed"]) <= _LINES:
         short["printed"] = out["printed"]
     return short
-
-
-def wrong(case: Case, found: dict[str, Any]) -> list[str]:
-    """Return the differences from the stored result, or a line if there is none."""
-    path = EXPECTED / f"{case.name}.json"
-    if not path.is_file():
-        return [f"{path.name} is missing: python -m tests.golden --update {case.name}"]
-    return list(differences(json.loads(path.read_text()), found, case.tolerance))
-
-
-def store(case: Case, found: dict[str, Any]) -> None:
-    """Store a result as the expected one, with 14 digits of each number."""
-    EXPECTED.mkdir(exist_ok=True)
-    text = json.dumps(_rounded(found), separators=(",", ":"), ensure_ascii=False)
-    # one entry per line, for readable diffs
-    text = text.replace(',"', ',\n"').replace(":{", ":\n{")
-    (EXPECTED / f"{case.name}.json").write_text(text + "\n")
 
 
 def _rounded(value: Any) -> Any:
@@ -133,9 +130,11 @@ def photographs(folder: Path) -> None:
     for i in range(6):
         tags = {TAKEN: f"2026:06:14 12:00:{10 * i:02d}", FOCAL: 3.04}
         save_photograph(folder / "photos" / f"{i}.jpg", tags)
-    rows = [f"14.06.2026;12:0{i // 4}:{15 * (i % 4):02d};{21 + 0.25 * i:.2f}" for i in range(8)]
-    text = "Datum;Uhrzeit;Temperatur °C\n" + "\n".join(r.replace(".", ",", 0) for r in rows) + "\n"
-    (folder / "log.csv").write_text(text.replace("21.", "21,").replace("22.", "22,"), "latin-1")
+    rows = "".join(
+        f"14.06.2026;12:0{i // 4}:{15 * (i % 4):02d};{21 + 0.25 * i:.2f}\n".replace("21.", "21,")
+        .replace("22.", "22,") for i in range(8)
+    )  # fmt: skip
+    (folder / "log.csv").write_text("Datum;Uhrzeit;Temperatur °C\n" + rows, "latin-1")
 
 
 def blind(

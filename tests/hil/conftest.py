@@ -7,7 +7,6 @@ import contextlib
 import os
 import shutil
 import socket
-import threading
 import zipfile
 from pathlib import Path
 from py_compile import PycInvalidationMode
@@ -15,7 +14,7 @@ from py_compile import PycInvalidationMode
 import pytest
 
 from tests.hil.machine import Machine
-from tests.hil.one_wire import Adapter, Probe
+from tests.hil.one_wire import Adapter, Plugged, Probe
 from tests.hil.phone import Phone
 
 HERE = Path(__file__).parent
@@ -83,27 +82,16 @@ def video(machine):
 
 @pytest.fixture(scope="session")
 def i2c_bus(machine):
-    """Return the number of an SMBus: LM75 0x48, 0x49, MCP9808 0x18, BME280 0x76."""
-    machine.run(
-        "modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x18,0x76"
-    )
+    """Return the number of an SMBus: LM75 0x48, 0x49, BME280 0x76."""
+    machine.run("modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x76")
     find = "grep -l 'SMBus stub' /sys/class/i2c-dev/*/name"
     return int(machine.wait(f"{find} | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' | grep ."))
 
 
-class Instrument:
+class Instrument(Plugged):
     """A thermometer at the guest's USB serial adapter, which answers `T?` with T=…"""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.celsius = path, 21.25
-        self._socket: socket.socket | None = None
-        self._thread: threading.Thread | None = None
-
-    def plug(self) -> None:
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.connect(str(self.path))
-        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name="instrument")
-        self._thread.start()
+    celsius = 21.25
 
     def _serve(self, line: socket.socket) -> None:
         pending = b""
@@ -113,13 +101,6 @@ class Instrument:
                 command, pending = pending.split(b"\n", 1)
                 if command.strip() == b"T?":
                     line.sendall(f"T={self.celsius:+.3f}\r\n".encode())
-
-    def pull(self) -> None:
-        if self._socket is not None:
-            self._socket.shutdown(socket.SHUT_RDWR)
-            self._socket.close()
-            self._thread.join()
-            self._socket = None
 
 
 @contextlib.contextmanager

@@ -120,23 +120,17 @@ class Wire:
             probe.selected = whom(probe)
 
 
-class Adapter:
-    """The adapter, which serves in its own thread while plugged in."""
+class Plugged:
+    """A device at one of QEMU's sockets, which serves in its own thread while plugged in."""
 
-    def __init__(self, path: Path, *probes: Probe) -> None:
-        self.path, self.probes = path, list(probes)
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self._socket: socket.socket | None = None
-        self._thread: threading.Thread | None = None
 
     def plug(self) -> None:
-        self._wire = Wire(self.probes)
-        self._written, self._read = bytearray(), bytearray()
-        self._waiting: list[bytes] = []
-        self._listening = False
-        self._alternate = 0
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.connect(str(self.path))
-        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name="1-wire")
+        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name="plugged")
         self._thread.start()
 
     def pull(self) -> None:
@@ -145,6 +139,22 @@ class Adapter:
             self._thread.join()
             self._socket.close()
             self._socket = None
+
+
+class Adapter(Plugged):
+    """The adapter."""
+
+    def __init__(self, path: Path, *probes: Probe) -> None:
+        super().__init__(path)
+        self.probes = list(probes)
+
+    def plug(self) -> None:
+        self._wire = Wire(self.probes)
+        self._written, self._read = bytearray(), bytearray()
+        self._waiting: list[bytes] = []
+        self._listening = False
+        self._alternate = 0
+        super().plug()
 
     def _serve(self, line: socket.socket) -> None:
         # the greeting has the short header of the first versions

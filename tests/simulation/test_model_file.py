@@ -39,28 +39,16 @@ def full_model():
 
 
 def test_round_trip(tmp_path):
-    model = full_model()
-    write_model(tmp_path / "m.yaml", model)
-    assert read_model(tmp_path / "m.yaml") == model
+    """A number outside the matrix keeps its standard deviation."""
+    write_model(tmp_path / "m.yaml", full_model())
+    model = read_model(tmp_path / "m.yaml")
+    assert model == full_model()
     assert model.version == 4
-
-
-def test_a_number_outside_the_matrix_keeps_its_standard_deviation():
     names = ("thermal_lag.tau", "second_heat_source.c", "interior.c", "interior.A1")
-    known = full_model().covariance_of(names)
+    known = model.covariance_of(names)
     assert np.allclose(np.diag(known), [3.6, 1e-14, 1e-8, 0.0], rtol=1e-12, atol=0.0)
     assert known[0, 2] == known[2, 0] == 1e-6
     assert not known[1, [0, 2]].any()
-
-
-def change(document, path, value):
-    *parents, last = path
-    for key in parents:
-        document = document[key]
-    if value is None:
-        del document[last]
-    else:
-        document[last] = value
 
 
 CAMERA = {
@@ -86,34 +74,12 @@ CAMERA = {
 }
 
 
-def write(path, document):
-    path.write_text(dump_yaml(document))
-    return path
-
-
-def test_camera_file(tmp_path):
-    device = read_camera_device(write(tmp_path / "c.yaml", CAMERA))
-    assert device.reference == "temperature"
-    assert device.thermometers["temperature"].stuck == (100.0, 200.0)
-    assert device.measuring.missed == 0.1
-    assert device.look.blur_px == 1.1
-    assert device.network.boundaries == ("ambient",)
-
-
-def test_a_given_camera_and_model_replace_those_of_a_preset(tmp_path):
-    sensor = Sensor(1640, 1232, 0.00224)
-    write_model(tmp_path / "m.yaml", replace(full_model(), sensor=sensor))
-    camera = write(tmp_path / "c.yaml", CAMERA)
-    found = given_simulation("nexus5-cold", tmp_path / "m.yaml", camera, None, None)
-    assert found.model.sensor == found.device.sensor == sensor
-
-
 PROGRAMME = {
     "format": "thermocald-programme/1",
     "name": "lamp",
     "epochs": 100,
     "interval": 10.0,
-    "ambient": 21.0,
+    "ambient": {"log": "log.csv", "time": "t", "value": "air", "largest_gap": 500.0},
     "sources": {
         "lens": [
             {"from": 0, "to": 100, "value": 0},
@@ -122,13 +88,36 @@ PROGRAMME = {
         ]
     },
 }
+LOG = "t,air\n100,20\n600,30\n1100,25\n"
 
 
-def test_programme_file(tmp_path):
-    programme = read_programme(write(tmp_path / "p.yaml", PROGRAMME))
-    lamp = programme.sources["lens"]
+def write(folder, document, log=LOG):
+    """Write a document, and the log that a programme names; return the document's path."""
+    (folder / "log.csv").write_text(log)
+    path = folder / "m.yaml"
+    path.write_text(dump_yaml(document))
+    return path
+
+
+def test_a_camera_file_replaces_the_camera_of_a_preset(tmp_path):
+    sensor = Sensor(1640, 1232, 0.00224)
+    write_model(tmp_path / "model.yaml", replace(full_model(), sensor=sensor))
+    camera = write(tmp_path, CAMERA)
+    found = given_simulation("nexus5-cold", tmp_path / "model.yaml", camera, None, None)
+    device = found.device
+    assert found.model.sensor == device.sensor == sensor
+    assert device.reference == "temperature"
+    assert device.thermometers["temperature"].stuck == (100.0, 200.0)
+    assert (device.measuring.missed, device.look.blur_px) == (0.1, 1.1)
+    assert device.network.boundaries == ("ambient",)
+
+
+def test_a_programme_file_with_a_log_that_drives_a_boundary(tmp_path):
+    programme = read_programme(write(tmp_path, PROGRAMME))
+    lamp, air = programme.sources["lens"], programme.boundaries["ambient"]
     np.testing.assert_allclose(lamp.at([50.0, 250.0, 400.0, 999.0]), [0, 1.0, 0.5, 0.5])
     np.testing.assert_allclose(lamp.at([400.0], "left"), [2.0])
+    np.testing.assert_allclose(air.at([0, 250, 1000]), [20, 25, 25])
 
 
 BAD = {
@@ -140,7 +129,6 @@ BAD = {
         (("effects", 0, "parameters", "tau", "value"), -5.0, "negative"),
         (("effects", 0, "parameters", "tau", "value"), float("nan"), "not a finite number"),
         (("effects", 0, "parameters", "tua"), 5.0, "did you mean 'tau'"),
-        (("rates", "x0", "unit"), "px/K", "it must be 'mm/K'"),
         (("rates", "A1"), 1e-5, "unknown"),
         (("rates", "x0", "sd"), -1e-5, "not negative"),
         (("interior", "c"), None, "interior.c: is missing"),
@@ -156,14 +144,11 @@ BAD = {
     "camera": [
         (("heat", "bodies", "lens", "capacity"), -2.0, "-2 J/K; it must be above 0"),
         (("heat", "links", 0, "conductance"), 0.0, "0 W/K; it must be above 0"),
-        (("heat", "links", 0, "between"), ["lens"], "must be a list of two names"),
         (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be a list of two names"),
         (("thermometers", "temperature", "body"), "lans", "is 'lans'; bodies are lens, board"),
         (("thermometers", "air", "missing"), 1.0, "share below 1"),
         (("measuring", "sigma"), 0.0, "above 0"),
         (("look", "paper"), 300, "at most 255"),
-        (("pixel_pitch",), {"value": 2.24, "unit": "um"}, "'um'; it must be 'mm'"),
-        (("width",), None, "width: is missing"),
     ],
     "programme": [
         (("sources", "lens", 1, "from"), 130, "ends at 100 s: a gap"),
@@ -171,11 +156,9 @@ BAD = {
         (("sources", "lens", 2, "to"), 800, "covers 0 to 800 s; the programme lasts from 0 to 990"),
         (("sources", "lens", 0, "to"), 0, "not after 0 s"),
         (("ambient",), None, "ambient: is missing"),
-        (("ambient",), {"value": 294.0, "unit": "K"}, "'K'; it must be 'degC'"),
         (("ambient",), {"log": "none.csv"}, "cannot be read"),
         (("epochs",), 0, "at least 1"),
         (("interval",), -1, "above 0"),
-        (("sources", "lens", 0, "value"), "bright", "not a finite number"),
     ],
 }
 FILES = {
@@ -191,32 +174,28 @@ FILES = {
 )
 def test_a_fault_is_reported_with_file_and_key(tmp_path, kind, path, value, reason):
     read, right = FILES[kind]
-    document = copy.deepcopy(right)
-    change(document, path, value)
+    document = part = copy.deepcopy(right)
+    *parents, last = path
+    for key in parents:
+        part = part[key]
+    part[last] = value
+    if value is None:
+        del part[last]
     with pytest.raises(ConfigurationError, match=reason) as error:
-        read(write(tmp_path / "m.yaml", document))
+        read(write(tmp_path, document))
     assert "m.yaml" in str(error.value) or "csv" in str(error.value)
 
 
 @pytest.mark.parametrize(
     ("rows", "reason"),
     [
-        ("0,20\n300,21\n1300,22\n", "line 4, column time: a gap of 1000 s"),
-        ("0,20\n300,21\n200,22\n", "line 4, column time: time runs backwards"),
-        ("0,20\n300,\n1300,22\n", "line 3, column temperature: is empty; a number"),
+        ("0,20\n300,21\n1300,22\n", "line 4, column t: a gap of 1000 s"),
+        ("0,20\n300,21\n200,22\n", "line 4, column t: time runs backwards"),
+        ("0,20\n300,\n1300,22\n", "line 3, column air: is empty; a number"),
         ("0,20\n", "two rows"),
         ("0,20\n300,nan\n900,22\n", "finite"),
     ],
 )
 def test_faulty_logs(tmp_path, rows, reason):
-    (tmp_path / "log.csv").write_text("time,temperature\n" + rows)
-    document = {**PROGRAMME, "ambient": {"log": "log.csv", "largest_gap": 500.0}}
     with pytest.raises(ConfigurationError, match=reason):
-        read_programme(write(tmp_path / "p.yaml", document))
-
-
-def test_a_log_drives_a_boundary(tmp_path):
-    (tmp_path / "log.csv").write_text("t,air\n100,20\n600,30\n1100,25\n")
-    played = {"log": "log.csv", "time": "t", "value": "air"}
-    programme = read_programme(write(tmp_path / "p.yaml", {**PROGRAMME, "ambient": played}))
-    np.testing.assert_allclose(programme.boundaries["ambient"].at([0, 250, 1000]), [20, 25, 25])
+        read_programme(write(tmp_path, PROGRAMME, "t,air\n" + rows))

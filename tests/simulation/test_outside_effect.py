@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import ast
-import re
 import subprocess
 import sys
 from pathlib import Path
-
-import thermocald
-from thermocald.physics import catalogue
 
 OUTSIDE = '''
 """Saturation: a spring that gives less and less."""
 
 import numpy as np
 
-from thermocald.physics.effect import Effect, Steady
-from thermocald.physics.effect import Parameter, coefficient_units
+from thermocald.physics.effect import Effect, Parameter, coefficient_units
 
 
 class Saturation(Effect):
@@ -61,41 +55,32 @@ for name, true in (("T_s", 38.0), ("a_x0", 2e-3)):
     assert abs(said["value"] - true) < 4 * said["sd"], said
 print("discovered", found.effect)
 
-import sys
 from tests.commands import call
 print(call("simulate", "--list").stdout)
-sys.path.insert(0, "DOCS")
 import reference
 print(reference._effect_page())
 """
+ROOT = Path(__file__).parents[2]
 
 
-def outside(folder: Path) -> None:
-    """Write a small distribution: one module, one entry point."""
-    (folder / "saturation.py").write_text(OUTSIDE)
+def run_with(folder: Path, module: str, program: str) -> subprocess.CompletedProcess[str]:
+    """Run a program beside a small distribution: one module, one entry point."""
+    (folder / "saturation.py").write_text(module)
     info = folder / "saturation-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: saturation\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[thermocald.effects]\nsaturation = saturation:Saturation\n"
     )
-
-
-def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    root = Path(__file__).parents[2]
-    path = f"{folder}:{root}:{root / 'tests/photogrammetry'}"
+    path = f"{folder}:{ROOT}:{ROOT / 'tests/photogrammetry'}:{ROOT / 'docs/_site'}"
     return subprocess.run(
-        [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False,
+        [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, check=False,
         env={"PYTHONPATH": path, "PATH": "/usr/bin:/bin"},
     )  # fmt: skip
 
 
 def test_an_effect_from_outside(tmp_path):
-    outside(tmp_path)
-
-    site = Path(__file__).parents[2] / "docs/_site"
-    ran = python(tmp_path, "-c", PROGRAM.replace("DOCS", str(site)))
-
+    ran = run_with(tmp_path, OUTSIDE, PROGRAM)
     assert ran.returncode == 0, ran.stderr
     found, listed = ran.stdout.split("\n", 1)
     assert found.split() == ["discovered", "saturation"]
@@ -104,30 +89,7 @@ def test_an_effect_from_outside(tmp_path):
 
 
 def test_other_classes_than_effects_are_refused(tmp_path):
-    outside(tmp_path)
-    (tmp_path / "saturation.py").write_text("class Saturation:\n    pass\n")
-    ran = python(
-        tmp_path, "-c", "from thermocald.physics import catalogue; catalogue.get('saturation')"
-    )
+    program = "from thermocald.physics import catalogue; catalogue.get('saturation')"
+    ran = run_with(tmp_path, "class Saturation:\n    pass\n", program)
     assert "ConfigurationError" in ran.stderr
     assert "saturation:Saturation, which is not an Effect" in ran.stderr
-
-
-def test_no_module_outside_the_catalogue_names_an_effect():
-    """Neither as a string nor as a class; only modules without the catalogue may use words."""
-    root = Path(thermocald.__file__).parent
-    names = set(catalogue.names())
-    classes = {type(catalogue.get(name)).__name__ for name in names}
-    found = []
-    for path in sorted(root.rglob("*.py")):
-        source = path.read_text(encoding="utf-8")
-        if root / "physics" / "effects" in path.parents or not re.search(
-            r"thermocald\.(physics|thermal|discovery|analysis\.thermal)", source
-        ):
-            continue
-        for node in ast.walk(ast.parse(source)):
-            text = node.value if isinstance(node, ast.Constant) else getattr(node, "id", "")
-            if isinstance(text, str) and (text in names or text in classes):
-                found.append(f"{path.relative_to(root)}:{node.lineno} {text}")
-    assert found == []
-    assert len(names) >= 19

@@ -54,15 +54,15 @@ def test_centres_agree_with_the_projected_truth():
     iop, eop = model.interior.as_array(), model.exterior.as_array()
     image = Scene(SENSOR, field, CLEAN).render(iop, eop)
     error, areas, normals = [], [], surface_normals(field)
-    for row, (x, y) in enumerate(project(SENSOR, iop, eop, field.points)):
-        if not SENSOR.contains([x, y], 45):
+    grid = np.arange(-38, 39)
+    for row, place in enumerate(project(SENSOR, iop, eop, field.points)):
+        if not SENSOR.contains(place, 45):
             continue
-        i, j = round(float(x)), round(float(y))
+        i, j = np.rint(place).astype(int)
         ink = 200.0 - image[j - 38 : j + 39, i - 38 : i + 39].astype(float)
-        grid = np.arange(-38, 39)
-        measured = np.array([(ink.sum(0) * grid).sum(), (ink.sum(1) * grid).sum()]) / ink.sum()
+        measured = [i, j] + np.array([ink.sum(0) @ grid, ink.sum(1) @ grid]) / ink.sum()
         centroid, area = outline_centroid(field, normals, row, SENSOR, iop, eop)
-        error.append(measured + np.array([i, j]) - centroid)
+        error.append(measured - centroid)
         areas.append(ink.sum() / 170.0 / area - 1.0)
     assert len(error) >= 140
     assert np.sqrt(np.mean(np.square(error))) < 0.002
@@ -94,74 +94,59 @@ def test_blur_noise_vignetting():
     sensor = Sensor(641, 481, 0.005)
     iop = InteriorOrientation(c=8.0).as_array()
     eop = ExteriorOrientation(0, 0, 0, 120.0, 90.0, 1000.0).as_array()
-    look = Look(noise_dn=2.5, vignetting=0.3, blur_px=1.2)
-    image = Scene(sensor, field, look).render(iop, eop, seed=5).astype(float)
-    clean = Scene(sensor, field, Look(noise_dn=0, vignetting=0.3, blur_px=1.2)).render(iop, eop)
-    noise = (image - clean)[100:]
+
+    def rendered(noise, vignetting, **seed):
+        look = Look(noise_dn=noise, vignetting=vignetting, blur_px=1.2)
+        return Scene(sensor, field, look).render(iop, eop, **seed).astype(float)
+
+    clean, plain = rendered(0, 0.3), rendered(0, 0)
+    noise = (rendered(2.5, 0.3, seed=5) - clean)[100:]
     assert abs(noise.std() - np.hypot(2.5, 0.35)) < 0.1  # with two roundings
     assert abs(noise.mean()) < 0.04  # 1/64 DN keeps the clean frame off half-way values
-    r2 = ((np.arange(641) - 320.0) ** 2)[None] + ((np.arange(481) - 240.0) ** 2)[:, None]
+    x, y = np.arange(641), np.arange(481)
+    r2 = ((x - 320.0) ** 2)[None] + ((y - 240.0) ** 2)[:, None]
     expected = 200 * (1 - 0.3 * r2 / (320.0**2 + 240.0**2))
     assert np.abs(clean[:250] - expected[:250]).max() < 1.0
     # the edge of the disc is a normal distribution function
-    plain = Scene(sensor, field, Look(noise_dn=0, vignetting=0, blur_px=1.2)).render(iop, eop)
     cx, cy = project(sensor, iop, eop, field.points)[0]
-    row = plain[round(cy), :].astype(float)
-    x = np.arange(641)
-    radius = 30.0 * 8 / 1000 / 0.005
-    profile = ndtr((radius - np.abs(x - cx)) / np.hypot(1.2, 12**-0.5))
-    assert np.abs((200 - row) / 170 - profile).max() < 0.02
+    profile = ndtr((30.0 * 8 / 1000 / 0.005 - np.abs(x - cx)) / np.hypot(1.2, 12**-0.5))
+    assert np.abs((200 - plain[round(cy)]) / 170 - profile).max() < 0.02
 
 
 def test_out_of_sight():
     """Targets behind the camera, outside the image, or seen from the back are not drawn."""
-    field = corner_field("markers", 2, 200.0)
-    scene = Scene(SENSOR, field, CLEAN)
+    scene = Scene(SENSOR, corner_field("markers", 2, 200.0), CLEAN)
     iop = InteriorOrientation(c=3.04).as_array()
-    for eop in (
-        ExteriorOrientation(0, 0, 0, 5e4, 0, 1000),
-        ExteriorOrientation(np.pi, 0, 0, 100, 100, 1000),
-        ExteriorOrientation(0, np.pi, 0, -500, -500, -900),
-    ):
-        assert np.all(scene.render(iop, eop.as_array()) == 200)
-    inside = ExteriorOrientation(0, 0, 0, 100.0, 100.0, 30.0).as_array()
-    assert scene.render(iop, inside).shape == (2464, 3280)
+    for eop in ((0, 0, 0, 5e4, 0, 1000), (np.pi, 0, 0, 100, 100, 1000),
+                (0, np.pi, 0, -500, -500, -900)):  # fmt: skip
+        assert np.all(scene.render(iop, np.array(eop, float)) == 200)
+    inside = scene.render(iop, np.array([0, 0, 0, 100.0, 100.0, 30.0]))
+    assert inside.shape == (2464, 3280)
 
 
 def test_same_frame_from_the_same_seed():
     """The hash is from x86-64 (AVX2) and must be the same on any machine."""
     field = corner_field("circles", 4, 150.0)
     model = demonstration_model(field)
-    sensor = Sensor(820, 616, 0.00448)
-    scene = Scene(sensor, field)
-    frames = [
-        scene.render(model.interior.as_array(), model.exterior.as_array(), seed=s)
-        for s in (1, 1, 2)
-    ]
+    scene = Scene(Sensor(820, 616, 0.00448), field)
+    orientation = model.interior.as_array(), model.exterior.as_array()
+    frames = [scene.render(*orientation, seed=s) for s in (1, 1, 2)]
     assert np.array_equal(frames[0], frames[1])
     assert not np.array_equal(frames[0], frames[2])
-    digest = hashlib.sha256(frames[0].tobytes()).hexdigest()
-    assert digest[:16] == "5a054c4995a37c3f"
+    assert hashlib.sha256(frames[0].tobytes()).hexdigest()[:16] == "5a054c4995a37c3f"
 
 
 MockCamera = load_driver("camera", "mock")
 
 
-@pytest.fixture
-def camera():
-    device = MockCamera(clock=VirtualClock())
-    device.open()
-    yield device
-    device.close()
-
-
-def test_frame_shows_the_known_drift(camera):
-    first = camera.capture()
-    camera.clock.advance(650.0)
-    hot = camera.capture()
+def test_frames_of_the_mock_camera_show_the_known_drift():
+    with MockCamera(clock=VirtualClock()) as camera:
+        first = camera.capture()
+        camera.clock.advance(650.0)
+        hot = camera.capture()
+        a, b = (camera.truth(frame.monotonic) for frame in (first, hot))
     assert hot.image.shape == (2464, 3280)
     assert hot.utc - first.utc == pytest.approx(hot.monotonic - first.monotonic)
-    a, b = camera.truth(first.monotonic), camera.truth(hot.monotonic)
     moved = (b.iop[0] - a.iop[0]) / camera.model.sensor.pixel_pitch
     assert -12.0 < moved[1] < -9.0
     seen = measure_corners(hot.image, locate_markers(hot.image, camera.field, {}), {})
@@ -170,11 +155,12 @@ def test_frame_shows_the_known_drift(camera):
     assert np.sqrt(np.mean((seen.points - expected[seen.targets]) ** 2)) < 0.04
 
 
-def test_own_model_and_field(tmp_path, camera):
-    model = camera.model.with_effect(ModelEffect("slip", {"time": 100.0, "x0": 0.00112}))
+def test_the_mock_cameras_own_model_and_field(tmp_path):
+    slip = ModelEffect("slip", {"time": 100.0, "x0": 0.00112})
+    model = demonstration_model(demonstration_field("plain")).with_effect(slip)
     write_model(tmp_path / "m.yaml", model)
     clock = VirtualClock()
     with MockCamera(clock=clock, model=str(tmp_path / "m.yaml"),
                     programme=[[0, 25.0]], testfield="plain") as device:  # fmt: skip
-        before, after = device.truth(clock.monotonic() + 99), device.truth(clock.monotonic() + 101)
+        before, after = (device.truth(clock.monotonic() + s) for s in (99, 101))
     assert after.iop[0, 1] - before.iop[0, 1] == pytest.approx(0.00112)

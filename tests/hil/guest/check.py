@@ -231,7 +231,7 @@ def swapped(value):
 
 
 def i2c(bus):
-    """Read the kernel's lm75 over i2c-stub, and chips by their registers."""
+    """Read the kernel's lm75 over i2c-stub, and another one by its registers."""
     import smbus2
 
     bus = int(bus)
@@ -246,10 +246,6 @@ def i2c(bus):
             put(address, 3, 0x5000)
             put(address, 0, 0x1910)
             wire.write_byte_data(address, 1, 0)
-        put(0x18, 6, 0x0054)
-        put(0x18, 7, 0x0400)
-        put(0x18, 1, 0)
-        put(0x18, 5, 0xC191)
         if not os.path.exists(f"/sys/bus/i2c/devices/{bus}-0048"):
             write(f"/sys/bus/i2c/devices/i2c-{bus}/new_device", "tmp75 0x48")
         with thermometer("hwmon", chip="tmp75") as device:
@@ -260,14 +256,6 @@ def i2c(bus):
             put(0x48, 0, 0x1910)
         with thermometer("lm75", chip="tmp75", bus=bus, address=0x49) as device:
             result["registers"] = repeated(device)
-            put(0x49, 0, 0xFFFF)
-            result["0xffff"] = outcome(device.read)
-        with thermometer("mcp9808", bus=bus, address=0x18) as device:
-            result["mcp9808"] = repeated(device)
-            put(0x18, 5, 0x1FFF)
-            result["mcp9808 cold"] = outcome(lambda: dict(device.read().values))
-        put(0x18, 7, 0x0500)
-        result["another chip"] = outcome(thermometer("mcp9808", bus=bus, address=0x18).open)
         busy = thermometer("lm75", chip="tmp75", bus=bus, address=0x48)
         result["kernel has it"] = outcome(busy.open)
         result["nobody"] = outcome(thermometer("tmp117", bus=bus, address=0x4A).open)
@@ -307,16 +295,19 @@ def kernel(bus):
     return result
 
 
-def serial_line(port, count=20):
-    """Read the tty of a real USB serial adapter; the instrument is on the host."""
-    options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
-    with thermometer("serial", timeout_s=2.0, **options) as device:
-        return repeated(device, int(count))
+def serial_thermometer(port):
+    """Return the thermometer at a real USB serial adapter's tty; the instrument is on the host."""
+    pattern = r"T=(?P<temperature>[-+]?\d+\.\d+)"
+    return thermometer("serial", timeout_s=2.0, port=port, pattern=pattern, command="T?\r\n")
+
+
+def serial_line(port):
+    with serial_thermometer(port) as device:
+        return repeated(device)
 
 
 def serial_unplug(port):
-    options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
-    return unplug(thermometer("serial", timeout_s=2.0, **options))
+    return unplug(serial_thermometer(port))
 
 
 def ds18b20(*names, count="4"):

@@ -18,14 +18,22 @@ from thermocald.store.recording.reader import read_recording
 from thermocald.store.series import clock_corrections, series_times
 
 
-def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch):
+def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch, monkeypatch):
+    """With an epoch that a daemon stores in the meantime."""
     store, series = filled
+
+    def times_and_one_more(*given):
+        times = series_times(*given)
+        store.append(series, make_epoch(21))
+        return times
+
+    monkeypatch.setattr(archive, "series_times", times_and_one_more)
     archive_series(store, series, tmp_path / "M1")
     recording = read_recording(tmp_path / "M1")
     assert replace(recording.head, extra={}) == series.head
     assert recording.head.extra == {"start": "cold", "device": {"serial": "x1"}}
     assert recording.testfield.names == series.testfield.names
-    for epoch, made in zip(recording.epochs, map(make_epoch, range(1, 21)), strict=True):
+    for epoch, made in zip(recording.epochs, map(make_epoch, range(1, 22)), strict=True):
         assert (epoch.number, epoch.temperatures) == (made.number, made.temperatures)
         assert epoch.frame_time == pytest.approx(made.frame_time, abs=1e-6)
         assert np.array_equal(epoch.observations.points, made.observations.points)
@@ -36,32 +44,6 @@ def test_a_series_that_counts_from_0_is_whole(store, series, make_epoch, tmp_pat
         store.append(series, make_epoch(number))
     archive_series(store, series, tmp_path / "M1")
     assert read_recording(tmp_path / "M1").columns.numbers.tolist() == [0, 1, 2]
-
-
-def test_an_epoch_that_a_daemon_stores_in_the_meantime(filled, tmp_path, make_epoch, monkeypatch):
-    store, series = filled
-
-    def times_and_one_more(*given):
-        times = series_times(*given)
-        store.append(series, make_epoch(21))
-        return times
-
-    monkeypatch.setattr(archive, "series_times", times_and_one_more)
-    archive_series(store, series, tmp_path / "M1")
-    assert read_recording(tmp_path / "M1").columns.frame_time[-1] == make_epoch(21).frame_time
-
-
-def test_frames_that_are_left_are_taken_along(filled, tmp_path, make_epoch):
-    store, series = filled
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    (frames / "21.jpg").write_bytes(b"\xff\xd8 21")
-    for i in (21, 22):
-        store.append(series, replace(make_epoch(i), frame=type(frames)(f"{i}.jpg")))
-    archive_series(store, series, tmp_path / "M1", frames)
-    kept = {e.number: e.frame for e in read_recording(tmp_path / "M1").epochs if e.frame}
-    assert list(kept) == [21]
-    assert kept[21].read_bytes() == b"\xff\xd8 21"
 
 
 def test_a_clock_that_was_set_back_is_mended(filled, tmp_path, make_epoch):
@@ -94,11 +76,9 @@ def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):
         for camera, name in (("a-b", "c"), ("a", "b-c"), ("a", "b")):
             one = replace(head, series=name, camera=replace(head.camera, name=camera))
             store.append(store.create_series(one, field), make_epoch(1))
-    for _ in range(2):
-        found = archive_store(
-            tmp_path / "s.db", tmp_path / "out", None, None, False, True, lambda _: None
-        )
-    assert found["recordings"] == []  # all exist already
+    place = (tmp_path / "s.db", tmp_path / "out")
+    found = [archive_store(*place, None, None, False, True, lambda _: None) for _ in range(2)]
+    assert found[1]["recordings"] == []  # all exist already
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a--b-c", "a-b", "a-b--c"]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sqlite3
 from contextlib import closing
@@ -11,9 +10,8 @@ import pytest
 
 from tests.store.small import change
 from thermocald.errors import RecordingError, StoreError
-from thermocald.store.database.archive import archive_readings, archive_series
+from thermocald.store.database.archive import archive_store
 from thermocald.store.database.columns import KEPT, row_checksum
-from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.series import LoggedReading
 
@@ -39,63 +37,52 @@ def craft(path, statement: str, *values) -> None:
 
 
 @pytest.fixture
-def crafted(filled):
+def crafted(filled, tmp_path):
+    """A store beside a folder of frames and a secret."""
     store, _ = filled
     store.add_readings([LoggedReading("air", 1.6e9, {"temperature": 20.0})])
     store.close()
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "secret.jpg").write_bytes(b"secret")
     return store.path
 
 
-@pytest.mark.parametrize("column", ["camera", "name"])
-def test_a_name_that_leads_out_is_refused_when_it_is_read(crafted, column):
-    for name in ("../../x", "/etc/x", "..", ".hidden", "a/b", "a\x1b[2Jb", " "):
-        craft(crafted, f"UPDATE series SET {column} = ?", name)
-        with Store.open(crafted) as store, pytest.raises(StoreError, match="part of a file's name"):
-            store.all_series()
+def archive(path):
+    place = path.parent
+    return archive_store(path, place / "out", place / "frames", None, False, False, lambda _: None)
 
 
-def test_a_head_of_another_name_is_refused(crafted):
-    database = sqlite3.connect(crafted)
-    (head,) = database.execute("SELECT head FROM series").fetchone()
-    database.close()
-    document = json.loads(head)
-    document["camera"]["name"] = "../../x"
-    craft(crafted, "UPDATE series SET head = ?", json.dumps(document))
-    with Store.open(crafted) as store, pytest.raises(StoreError, match="its head names"):
-        store.all_series()
+OUTSIDE = [
+    *((f"series SET {column}", name, "part of a file's name") for column in ("camera", "name")
+      for name in ("../../x", "/etc/x", "..", ".hidden", "a/b", "a\x1b[2Jb", " ")),
+    ("series SET head = replace(head, '\"rpi\"', '\"../../x\"'), identity", "{}", "its head names"),
+    ("reading SET thermometer", "../../air", "thermometer"),
+    *(("epoch SET frame", frame, "leads out")
+      for frame in ("/etc/passwd", "../secret.jpg", "a/../../secret.jpg")),
+]  # fmt: skip
 
 
-def test_a_thermometers_name_that_leads_out_is_refused(crafted, tmp_path):
-    craft(crafted, "UPDATE reading SET thermometer = '../../air'")
-    (tmp_path / "out").mkdir()
-    with Store.open(crafted) as store, pytest.raises(StoreError, match="thermometer"):
-        archive_readings(store, tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_a_frame_that_leads_out_is_refused(crafted, tmp_path):
-    (tmp_path / "secret.jpg").write_bytes(b"secret")
-    (tmp_path / "frames").mkdir()
-    for frame in ("/etc/passwd", "../secret.jpg", "a/../../secret.jpg"):
-        craft(crafted, "UPDATE epoch SET frame = ? WHERE number = 3", frame)
-        with Store.open(crafted) as store, pytest.raises(StoreError, match="leads out"):
-            archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
-        assert not (tmp_path / "out").exists()
-        assert not list(tmp_path.glob(".*partial"))
+@pytest.mark.parametrize(("column", "name", "message"), OUTSIDE)
+def test_a_name_that_leads_out_is_refused(crafted, tmp_path, column, name, message):
+    craft(crafted, f"UPDATE {column} = ?", name)
+    with pytest.raises(StoreError, match=message):
+        archive(crafted)
+    written = [p.name for p in tmp_path.rglob("*.[jc]*") if p.parent.name != "rpi-M1"]
+    assert written == ["secret.jpg"]
+    assert not list(tmp_path.rglob("*partial*"))
 
 
 def test_a_link_among_the_frames_is_not_followed_out(crafted, tmp_path):
-    (tmp_path / "secret.jpg").write_bytes(b"secret")
-    (tmp_path / "frames").mkdir()
-    (tmp_path / "frames/link.jpg").symlink_to(tmp_path / "secret.jpg")
-    (tmp_path / "frames/away").symlink_to(tmp_path)
-    (tmp_path / "frames/kept.jpg").write_bytes(b"kept")
-    for number, frame in ((3, "link.jpg"), (4, "away/secret.jpg"), (5, "kept.jpg")):
+    frames = tmp_path / "frames"
+    (frames / "link.jpg").symlink_to(tmp_path / "secret.jpg")
+    (frames / "away").symlink_to(tmp_path)
+    (frames / "kept.jpg").write_bytes(b"kept")
+    for number, frame in enumerate(["link.jpg", "away/secret.jpg", "kept.jpg", "gone.jpg"], 3):
         craft(crafted, "UPDATE epoch SET frame = ? WHERE number = ?", frame, number)
-    with Store.open(crafted) as store:
-        archive_series(store, store.find_series(), tmp_path / "out", tmp_path / "frames")
-    kept = {p.name: p.read_bytes() for p in (tmp_path / "out/frames").iterdir()}
-    assert kept == {"000005.jpg": b"kept"}
+    archive(crafted)
+    kept = {e.number: e.frame for e in read_recording(tmp_path / "out/rpi-M1").epochs if e.frame}
+    assert list(kept) == [5]
+    assert [p.read_bytes() for p in (tmp_path / "out/rpi-M1/frames").iterdir()] == [b"kept"]
 
 
 @pytest.mark.parametrize(
@@ -120,8 +107,8 @@ def test_a_recording_names_frames_of_its_own_only(recording_path, tmp_path, fram
     elif leads:
         node.symlink_to(leads.format(outside=outside))
     table = recording_path / "epochs.csv"
-    lines = table.read_text().splitlines()
-    lines[1] = lines[1].rsplit(",", 1)[0] + f",{frame.format(outside=outside)}"
-    table.write_text("\n".join(lines) + "\n")
+    head, first, *rows = table.read_text().splitlines()
+    first = first.rsplit(",", 1)[0] + f",{frame.format(outside=outside)}"
+    table.write_text("\n".join([head, first, *rows, ""]))
     with pytest.raises(RecordingError, match="is missing or outside the recording"):
         read_recording(recording_path)

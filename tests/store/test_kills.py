@@ -11,20 +11,17 @@ import signal
 import subprocess
 import textwrap
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.daemon.conftest import make_recording
-from tests.daemon.forking import Forked, Forker
 from tests.store.small import write_recording
 from thermocald.errors import RecordingError, StoreError, StoreFullError
 from thermocald.store.database import file
 from thermocald.store.database.store import Store
 
-_TAKEOVER_S = 0.2  # for a second daemon after the first was killed, as it would write on for ever
 # As a daemon stores epochs: through its guard; prints after each what it reported as stored.
 DAEMON = textwrap.dedent(
     """
@@ -47,51 +44,44 @@ DAEMON = textwrap.dedent(
         number += 1
     """
 )
+_KILLS = 38
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    return make_recording(tmp_path_factory.mktemp("kills") / "small", 6)
+@pytest.fixture
+def beside(forker, store_path, tmp_path_factory):
+    """(kind, number) → processes beside a writer that try to write too, or read."""
+    recording = make_recording(tmp_path_factory.mktemp("kills") / "small", 6)
 
-
-def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> list[Forked]:
-    """Create the files beside the writer and start processes that try to write too."""
-
-    def writes(*arguments: object, script: str = "") -> Forked:
-        folder = store.parent / f"beside-{k}-{len(list(store.parent.glob(f'beside-{k}-*')))}"
+    def start(kind: str, k: int) -> list:
+        other = store_path.with_name(f"other-{k}.db")
+        if kind == "hard link":
+            os.link(store_path, other)
+        commands = {
+            "alone": [],
+            "hard link": [("replay", recording, "--store", other)],
+            "second daemon": [("daemon", store_path)],
+            "readers": [("check", store_path), ("backup", store_path, other)],
+        }[kind]
+        folder = store_path.parent / f"beside-{k}"
         folder.mkdir()
-        return forker.start(folder, *map(str, arguments), script=script)
+        script = DAEMON if kind == "second daemon" else ""
+        return [forker.start(folder, *map(str, words), script=script) for words in commands]
 
-    other = store.with_name(f"other-{k}.db")
-    if kind == "hard link":
-        os.link(store, other)
-        return [writes("replay", recording, "--store", other)]
-    if kind == "second daemon":
-        return [writes("daemon", store, script=DAEMON)]
-    if kind == "readers":
-        return [writes("check", store), writes("backup", store, other)]
-    return []
+    return start
 
 
-KINDS, _KILLS = ["alone", "hard link", "second daemon", "readers"], 38
-
-
-def kill_one(forker: Forker, store: Path, start, rng) -> int:
+def kill_one(forker, store, start, rng) -> int:
     """Start the writer, then `start`; kill it and return the last epoch that it reported."""
-    folder = store.parent / f"writer-{len(list(store.parent.glob('writer-*')))}"
-    folder.mkdir()
-    writer = forker.start(folder, "daemon", str(store), script=DAEMON)
+    (store.parent / "log.txt").unlink(missing_ok=True)
+    writer = forker.start(store.parent, "daemon", str(store), script=DAEMON)
 
-    def reported() -> list[str]:
-        # the last line may be cut off
-        return (folder / "log.txt").read_text().split("\n")[:-1]
-
-    def until(count: int) -> None:
+    def until(count: int) -> list[str]:
         deadline = time.monotonic() + 60.0
-        while len(reported()) < count:
-            assert writer.poll() is None, "the writer ended:\n" + (folder / "log.txt").read_text()
-            assert time.monotonic() < deadline, reported()
+        while len(lines := (store.parent / "log.txt").read_text().split("\n")[:-1]) < count:
+            assert writer.poll() is None, lines  # the last line may be cut off
+            assert time.monotonic() < deadline, lines
             time.sleep(0.001)
+        return lines
 
     until(1)
     others = start()
@@ -102,27 +92,24 @@ def kill_one(forker: Forker, store: Path, start, rng) -> int:
     for other in others:
         if rng.random() < 0.5:
             other.kill()
-        # a second daemon takes over after the first was killed, as intended
         try:
-            other.wait(_TAKEOVER_S)
-        except subprocess.TimeoutExpired:
+            other.wait(0.2)
+        except subprocess.TimeoutExpired:  # a second daemon took over, as intended
             other.kill()
             other.wait()
-    return int(reported()[-1])
+    return int(until(1)[-1])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind):
+@pytest.mark.parametrize("kind", ["alone", "hard link", "second daemon", "readers"])
+def test_what_was_reported_is_kept(forker, store_path, head, field, beside, kind):
     """A quick one of the whole daemon is in daemon/test_faults."""
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(len(kind))
     reported, before = 0, 0
     for k in range(_KILLS):
-        said = kill_one(
-            forker, store_path, lambda k=k: beside(forker, kind, store_path, recording, k), rng
-        )
+        said = kill_one(forker, store_path, lambda k=k: beside(kind, k), rng)
         for name in store_path.parent.glob("other-*.db"):
             name.unlink()  # a daemon writes on beside a hard link; nothing else would
         reported += said - before
@@ -156,16 +143,14 @@ def small_disk():
 
 
 def test_a_full_disk(store, series, make_epoch, make_result, small_disk):
-    def append(number):
-        store.append(series, make_epoch(number), make_result(number))
-
     with pytest.raises(StoreFullError, match="was not stored: the disk") as caught:
-        list(map(append, range(1, 10_000)))
+        for number in range(1, 10_000):
+            store.append(series, make_epoch(number), make_result(number))
     last = store.last_epoch(series)
     assert last > 10
     assert f"epoch {last + 1} " in str(caught.value)
     with pytest.raises(StoreError, match="disk"):
-        append(last + 1)
+        store.append(series, make_epoch(last + 1), make_result(last + 1))
     assert store.last_epoch(series) == last
 
 
@@ -174,13 +159,11 @@ def test_the_wal_file_takes_a_quarter_of_a_small_disk(
 ):
     """It filled a disk of 4 MB with 115 epochs, of which 800 find room."""
     monkeypatch.setattr(file.shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
-    wal, sizes = file.helper(store_path, "wal"), []
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
         for number in range(1, 50):
             store.append(series, make_epoch(number), make_result(number))
-            sizes.append(wal.stat().st_size)
-    assert max(sizes) < 350_000
+            assert file.helper(store_path, "wal").stat().st_size < 350_000
 
 
 def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):

@@ -9,117 +9,111 @@ from dataclasses import replace
 
 import pytest
 
+from tests.store.small import stored_numbers
 from thermocald.daemon.store_guard import Row, StoreGuard
 from thermocald.errors import StoreBusyError
-from thermocald.store.database.store import Store
 
 
 @pytest.fixture
-def guard(tmp_path, head, field):
+def guard(tmp_path, head, field, make_epoch, make_result):
+    """A guard of a store with one series, with a `keep` of its epochs."""
     guard = StoreGuard(tmp_path / "t.db", durable=False)
-    guard.store.create_series(head, field)
+    series = guard.store.create_series(head, field)
+    guard.keep = lambda n: guard.append(Row(series, make_epoch(n), make_result(n), {}, True))
     yield guard
     guard.close()
 
 
+def flushed(guard) -> list[int]:
+    """Return the numbers of the stored epochs when nothing waits."""
+    guard.flush()
+    assert (guard.away, guard.lost, guard.waiting) == ("", 0, 0)
+    return stored_numbers(guard.path)
+
+
 @pytest.fixture
-def keep(guard, make_epoch, make_result):
-    (series,) = guard.store.all_series()
-    return lambda n: guard.append(Row(series, make_epoch(n), make_result(n), {}, True))
+def busy(guard, monkeypatch):
+    """A store that refuses rows; with `busy(append)` it takes them."""
+    append = guard.store.append
+
+    def refuse(*_, **__):
+        raise StoreBusyError("locked")
+
+    monkeypatch.setattr(guard.store, "append", refuse)
+    return lambda new: monkeypatch.setattr(guard.store, "append", new(append))
 
 
-def numbers(guard):
-    (series,) = guard.store.all_series()
-    return [stored.epoch.number for stored in guard.store.epochs(series)]
-
-
-def test_a_row_that_found_no_room_waits(guard, keep):
+def test_a_row_that_found_no_room_waits(guard):
     """Regression: an event still fitted into its page, so the row was taken for a bad one."""
-    keep(1)
-    connection = guard.store._db
+    guard.keep(1)
+    connection, number = guard.store._db, 1
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     connection.execute(f"PRAGMA max_page_count = {pages}")
-    number = 1
     while not guard.waiting and number < 1000:  # until the last page is full
         number += 1
-        keep(number)
-    keep(number + 1)
+        guard.keep(number)
+    guard.keep(number + 1)
     assert "disk is full" in guard.away
     assert (guard.lost, guard.waiting) == (0, 2)
     connection.execute("PRAGMA max_page_count = 1000000")
-    guard.flush()
-    assert (guard.away, guard.lost, guard.waiting) == ("", 0, 0)
-    assert numbers(guard) == [*range(1, number + 2)]
+    assert flushed(guard) == [*range(1, number + 2)]
 
 
-def test_a_lock_of_another_program_is_waited_for_and_loses_nothing(guard, keep, monkeypatch):
-    """A row was lost if the lock ended at the wrong time, and the watchdog starved for a minute."""
-    other = sqlite3.connect(guard.path, isolation_level=None)
+@pytest.fixture
+def other(guard):
+    """Another program's connection that keeps the store locked."""
+    other = sqlite3.connect(guard.path, isolation_level=None, check_same_thread=False)
     other.execute("BEGIN IMMEDIATE")
+    yield other
+    other.close()
+
+
+def test_a_lock_of_another_program_is_waited_for_and_loses_nothing(guard, other, monkeypatch):
+    """A row was lost if the lock ended at the wrong time, and the watchdog starved for a minute."""
     write_event = guard.store.add_event
-
-    def end_lock(event):
-        other.close()
-        write_event(event)
-
-    monkeypatch.setattr(guard.store, "add_event", end_lock)
+    monkeypatch.setattr(guard.store, "add_event", lambda e: (other.close(), write_event(e)))
     begin = time.monotonic()
     for number in range(1, 11):  # epochs come faster than attempts may be made
-        keep(number)
+        guard.keep(number)
     assert time.monotonic() - begin < 5.0
     assert "another program keeps it locked" in guard.away
     assert (guard.waiting, guard.lost) == (10, 0)
     other.close()
-    guard.flush()
-    assert (guard.away, guard.lost, guard.waiting) == ("", 0, 0)
-    assert numbers(guard) == [*range(1, 11)]
+    assert flushed(guard) == [*range(1, 11)]
 
 
-def test_at_the_end_a_lock_is_waited_for(guard, keep):
-    other = sqlite3.connect(guard.path, isolation_level=None, check_same_thread=False)
-    other.execute("BEGIN IMMEDIATE")
-    keep(1)
+def test_at_the_end_a_lock_is_waited_for(guard, other):
+    guard.keep(1)
     threading.Timer(0.6, other.close).start()
     guard.close()
     assert guard.lost == 0
-    with Store.open(guard.path) as store:
-        assert store.last_epoch(store.find_series()) == 1
+    assert stored_numbers(guard.path) == [1]
 
 
-def test_numbers_go_on_after_the_rows_that_wait(guard, keep, monkeypatch, head, field):
+def test_numbers_go_on_after_the_rows_that_wait(guard, busy, make_epoch, head):
     """A reload or a session began anew at the last stored number, and lost all that followed."""
     (series,) = guard.store.all_series()
-    append = guard.store.append
-    keep(1)
-    monkeypatch.setattr(guard.store, "append", lambda *_, **__: refuse())
-    keep(2)
-    keep(3)
+    guard.keep(2)
+    guard.keep(3)
     other = replace(series, id=0, head=replace(head, series="new"))
-    guard.append(Row(other, guard._waiting[0].epoch, None, {}, True))
-    assert (guard.last_epoch(series), guard.last_epoch(series, waiting=False)) == (3, 1)
+    guard.append(Row(other, make_epoch(2), None, {}, True))
+    assert (guard.last_epoch(series), guard.last_epoch(series, waiting=False)) == (3, 0)
     assert guard.find(other.camera, "new") == other
     assert guard.find(other.camera, "none") is None
     assert guard.last_epoch(other) == 2
-    monkeypatch.setattr(guard.store, "append", append)
+    busy(lambda append: append)
     guard.flush()
     assert (guard.lost, guard.waiting) == (0, 0)
     assert [s.name for s in guard.store.all_series()] == [series.name, "new"]
 
 
-def test_a_long_backlog_is_written_in_parts_so_that_the_watchdog_is_fed(guard, keep, monkeypatch):
-    append = guard.store.append
-    monkeypatch.setattr(guard.store, "append", lambda *_, **__: refuse())
+def test_a_long_backlog_is_written_in_parts_so_that_the_watchdog_is_fed(guard, busy):
     for number in range(1, 11):
-        keep(number)
-    monkeypatch.setattr(guard.store, "append", lambda *a, **k: (time.sleep(0.05), append(*a, **k)))
+        guard.keep(number)
+    busy(lambda append: lambda *a, **k: (time.sleep(0.05), append(*a, **k)))
     guard.flush(0.12)
     assert 5 <= guard.waiting <= 9
-    guard.flush()
-    assert numbers(guard) == [*range(1, 11)]
-
-
-def refuse():
-    raise StoreBusyError("locked")
+    assert flushed(guard) == [*range(1, 11)]
 
 
 def test_losses_are_counted_each_and_reported_once_a_minute(guard, caplog):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import threading
@@ -26,71 +27,54 @@ from thermocald.numbers import typeset_powers, with_sd
 from thermocald.parallel import in_order
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write_text(text: str):
-        path = tmp_path / "file.yaml"
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write_text
+def read(folder, text: str, error=ConfigurationError):
+    """Read a text as a file of YAML."""
+    (folder / "file.yaml").write_text(text, encoding="utf-8")
+    return read_yaml(folder / "file.yaml", error)
 
 
-def test_a_mapping_is_read_in_its_order_also_with_anchors(write):
+def test_a_mapping_is_read_in_its_order_also_with_anchors(tmp_path):
     document = {"b": 1, "a": {"x": [1, 2.5, "ä"], "y": None}}
-    assert list(read_yaml(write(dump_yaml(document))).items()) == list(document.items())
-    assert read_yaml(write("a: &x {k: 1}\nb: {<<: *x, l: 2}\n"))["b"] == {"k": 1, "l": 2}
+    assert list(read(tmp_path, dump_yaml(document)).items()) == list(document.items())
+    assert read(tmp_path, "a: &x {k: 1}\nb: {<<: *x, l: 2}\n")["b"] == {"k": 1, "l": 2}
     # a file's name that is no text
-    named = os.fsdecode(b"M\xe9 \xff")
-    assert read_yaml(write(dump_yaml({"series": [named]}))) == {"series": ["M\\udce9 \\udcff"]}
+    named = dump_yaml({"series": [os.fsdecode(b"M\xe9 \xff")]})
+    assert read(tmp_path, named) == {"series": ["M\\udce9 \\udcff"]}
 
 
 BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
 
 BAD = [
-    ("", "is empty"),
-    ("# only a comment\n", "is empty"),
-    ("- 1\n", "must hold `key: value` lines"),
-    ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"),
-    ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
-    ("a: 010\n", "line 1, column 4: 010 is octal in YAML"),
-    ("a: [1\n", "line 2"),
-    ("1: x\n", "key 1 must be text"),
+    ("", "is empty"), ("# only a comment\n", "is empty"), ("1: x\n", "key 1 must be text"),
+    ("- 1\n", "must hold `key: value` lines"), ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
+    ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"), ("a: [1\n", "line 2"),
+    ("a: 010\n", "line 1, column 4: 010 is octal in YAML"), ("[" * 5000, "file.yaml"),
     ("a: !!python/object:os.system x\n", "line 1, column 4: holds a tag, `!…`"),
     ("a:\n\tb: 1\n", "line 2, column 1: a line or a value begins with a tab"),
     ("a: b: c\n", "line 1, column 5: `: ` must not stand here"),
-    ("a: !!bool x\n", "no YAML"),
-    ("a: 2020-99-99\n", "no YAML"),
-    ("[" * 5000, "file.yaml"),
+    ("a: !!bool x\n", "no YAML"), ("a: 2020-99-99\n", "no YAML"),
     ("a: " + "[" * 5000 + "]" * 5000, "nested deeper than 60"),
     ("\n".join(" " * i + "a:" for i in range(2000)), "nested deeper than 60"),
-    (BOMB, "aliases without end"),
-    ("a: &a [*a]\n", "aliases without end"),
+    (BOMB, "aliases without end"), ("a: &a [*a]\n", "aliases without end"),
     ('a: ["x\\0y"]\n', r"'x\\x00y' holds a NUL character"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)
-def test_one_clear_error_of_the_kind_that_the_caller_wants(write, text, message):
-    path = write(text)
+def test_one_clear_error_of_the_kind_that_the_caller_wants(tmp_path, text, message):
     for kind in (ConfigurationError, RecordingError):
         with pytest.raises(kind, match=message) as caught:
-            read_yaml(path, kind)
-        assert str(path) in str(caught.value)
+            read(tmp_path, text, kind)
+        assert str(tmp_path / "file.yaml") in str(caught.value)
 
 
 def test_a_path_with_nul_is_an_error_in_words():
+    assert not is_database(Path("x\0y"))
     for use in (
-        lambda path: is_database(path) or tc.open(path),
-        tc.open,
-        tc.load_camera,
-        tc.read_testfield,
-        lambda path: tc.calibrate([path], path),
-        read_yaml,
-        lambda path: write_text(path, ""),
-        lambda path: write_text(path / "file", ""),
+        tc.open, tc.load_camera, tc.read_testfield, lambda path: tc.calibrate([path], path),
+        read_yaml, lambda path: write_text(path, ""), lambda path: write_text(path / "file", ""),
         lambda path: check_output(path, "folder"),
-    ):
+    ):  # fmt: skip
         with pytest.raises(ThermocaldError, match=r"NUL|null byte"):
             use(Path("x\0y"))
 
@@ -103,19 +87,16 @@ def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
     path.write_bytes(texts[0].encode().ljust(131072))
 
     def write():
-        while not ended.is_set():
-            for text in texts:
-                assert overwrite_json(path, text.encode())
-                time.sleep(1e-3)
+        for text in itertools.takewhile(lambda _: not ended.is_set(), itertools.cycle(texts)):
+            assert overwrite_json(path, text.encode())
+            time.sleep(1e-3)
 
     writer = threading.Thread(target=write)
     writer.start()
-    try:
-        # on a busy machine a read may always meet the writer, which here writes far too often
-        seen = [document for _ in range(1000) if (document := read_json(path))]
-    finally:
-        ended.set()
-        writer.join()
+    # on a busy machine a read may always meet the writer, which here writes far too often
+    seen = [document for _ in range(1000) if (document := read_json(path))]
+    ended.set()
+    writer.join()
     assert all(document["a"] == document["z"] for document in seen)
     assert len(seen) > 900
 
@@ -161,17 +142,15 @@ def test_host_names_and_origins_are_ours_or_foreign():
             assert is_loopback(host) is expected, host
 
 
-@pytest.mark.parametrize(
-    ("text", "set_"),
-    [
-        ("a_B1 = (-7.69 ± 0.33)e-7 mm-1/K, 2.0e-06", "a_B1 = (−7.69 ± 0.33)·10⁻⁷ mm⁻¹/K, 2.0·10⁻⁶"),
-        ("A2 = (4.9 ± 0.3)e+12 mm-4", "A2 = (4.9 ± 0.3)·10¹² mm⁻⁴"),
-        ("above 40.2 ± 0.3 degC; --unit degC", "above 40.2 ± 0.3 °C; --unit degC"),
-        *((name, name) for name in ("mm-1-b of IMG_1e5.jpg", "(see M1)e-7, 0x1e5, 1e5b")),
-    ],
-)
-def test_powers_are_raised_and_names_are_left(text, set_):
-    assert typeset_powers(text) == set_
+def test_powers_are_raised_and_names_are_left():
+    for text, expected in {
+        "a_B1 = (-7.69 ± 0.33)e-7 mm-1/K, 2.0e-06": "a_B1 = (−7.69 ± 0.33)·10⁻⁷ mm⁻¹/K, 2.0·10⁻⁶",
+        "A2 = (4.9 ± 0.3)e+12 mm-4": "A2 = (4.9 ± 0.3)·10¹² mm⁻⁴",
+        "above 40.2 ± 0.3 degC; --unit degC": "above 40.2 ± 0.3 °C; --unit degC",
+        "series mm-1-b of IMG_1e5.jpg at 10 mm": "series mm-1-b of IMG_1e5.jpg at 10 mm",
+        "(see M1)e-7, 0x1e5, 1e5b": "(see M1)e-7, 0x1e5, 1e5b",
+    }.items():
+        assert typeset_powers(text) == expected
     assert with_sd(-1e-9, 1e-6) == "(0.0 ± 1.0)·10⁻⁶"  # no negative nothing
 
 

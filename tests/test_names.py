@@ -16,13 +16,12 @@ import thermocald as tc
 from tests.commands import call
 from tests.drivers.fakes.sysfs import Sysfs
 from tests.store.small import write_recording
-from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.thermometers import Thermometers
 from thermocald.config import parse_config
 from thermocald.daemon.series_run import result_row
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError, StoreError, UsageError, WrongDevice
-from thermocald.hal import Frame, Reading, VirtualClock, open_device
+from thermocald.hal import Reading, VirtualClock, open_device
 from thermocald.names import channel_fault, tell_apart
 from thermocald.output.dashboard.view import View
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, Sensor
@@ -84,17 +83,17 @@ def check(folder, document) -> str:
     return refused[0].stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "stanza"),
-    [
-        ("A1", {"driver": "ds18b20", "sensors": {"A1": "28-000000000001"}}),
-        ("frame", {"driver": "hwmon", "chip": "k10temp", "channels": {"frame": "temp1"}}),
-        ("sd_x0", {"driver": "mock", "channels": {"sd_x0": {}}}),
-        ("c", {"driver": "serial", "port": "/dev/null", "pattern": "(?P<c>[-+0-9.]+)"}),
-    ],
-)
-def test_a_configuration_with_a_column_of_ours_is_refused(tmp_path, name, stanza):
-    said = check(tmp_path, {"thermometers": [{"name": "board", **stanza}]})
+STANZAS = {
+    "A1": {"driver": "ds18b20", "sensors": {"A1": "28-000000000001"}},
+    "frame": {"driver": "hwmon", "chip": "k10temp", "channels": {"frame": "temp1"}},
+    "sd_x0": {"driver": "mock", "channels": {"sd_x0": {}}},
+    "c": {"driver": "serial", "port": "/dev/null", "pattern": "(?P<c>[-+0-9.]+)"},
+}
+
+
+@pytest.mark.parametrize("name", STANZAS)
+def test_a_configuration_with_a_column_of_ours_is_refused(tmp_path, name):
+    said = check(tmp_path, {"thermometers": [{"name": "board", **STANZAS[name]}]})
     assert f"cannot be called {name!r}" in said
 
 
@@ -118,14 +117,14 @@ def test_columns_of_several_thermometers_are_told_apart(tmp_path, thermometers):
     assert "thermometers" in check(tmp_path, {"cameras": [camera], "thermometers": mocks})
 
 
-@pytest.mark.parametrize("label", ["c", "Diode, left", "x\x07y"])
-def test_a_label_of_the_kernel_that_is_no_name_gives_way_to_the_input(tmp_path, label):
+def test_a_label_of_the_kernel_that_is_no_name_gives_way_to_the_input(tmp_path):
+    labels = {"temp1_label": "c", "temp2_label": "Tctl", "temp3_label": "Diode, left"}
+    inputs = {f"temp{i}_input": f"3{i}000" for i in (1, 2, 3)}
     sysfs = Sysfs(tmp_path)
-    labels = {"temp1_label": label, "temp2_label": "Tctl"}
-    sysfs.hwmon(0, "k10temp", temp1_input="28000", temp2_input="31000", **labels)
+    sysfs.hwmon(0, "k10temp", **labels, **inputs)
     options = {"chip": "k10temp", "sysfs": str(sysfs.root)}
     with open_device("thermometer", "hwmon", options, VirtualClock()) as device:
-        assert device.read().values == {"temp1": 28.0, "Tctl": 31.0}
+        assert device.read().values == {"temp1": 31.0, "Tctl": 32.0, "temp3": 33.0}
 
 
 def test_a_recording_with_a_column_of_ours_is_refused_when_it_is_opened(tmp_path):
@@ -138,22 +137,14 @@ def test_a_recording_with_a_column_of_ours_is_refused_when_it_is_opened(tmp_path
 
 
 def test_the_reference_keeps_its_place_when_it_is_not_read():
-    clock = VirtualClock()
     document = {"thermometers": [{"name": n, "driver": "mock"} for n in ("housing", "air")]}
-    thermometers = Thermometers(parse_config(document, Path("config.yaml")), clock)
-    thermometers.add("air", Reading({"temperature": 12.0}, 0.0, clock.utc()))
-    kept: list = []
-    keeper = SimpleNamespace(keep=kept.append, backlog=lambda below: None)
-    names = ["housing", "air"]
-    pipeline = Pipeline("cam", None, thermometers, names, keeper, clock, patience_s=0.0)
-    pipeline.start()
-    pipeline.submit(Frame(np.zeros((4, 4), np.uint8), 0.0, clock.utc()))
-    assert pipeline.finish(10.0)
-    (acquired,) = kept
-    assert list(acquired.epoch.temperatures) == names
-    np.testing.assert_array_equal([*acquired.epoch.temperatures.values()], [np.nan, 12.0])
-    row = result_row(SimpleNamespace(name="cam", series="M1"), acquired.epoch, None, {})
-    assert np.isnan(row["temperature"])
+    thermometers = Thermometers(parse_config(document, Path("config.yaml")), VirtualClock())
+    thermometers.add("air", Reading({"temperature": 12.0}, 0.0, 0.0))
+    _, temperatures, _ = thermometers.around(["housing", "air"], 0.0, patience_s=0.0)
+    assert list(temperatures) == ["housing", "air"]
+    epoch = Epoch(1, 0.0, 0.0, temperatures)
+    row = result_row(SimpleNamespace(name="cam", series="M1"), epoch, None, {})
+    np.testing.assert_array_equal([row["temperature"], temperatures["air"]], [np.nan, 12.0])
 
 
 @settings(max_examples=15, deadline=None)
@@ -169,9 +160,7 @@ def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
                 store.create_series(head_of(name), FIELD)
             assert "\n" not in str(told.value)
             return
-        series = store.create_series(head_of(name), FIELD)
-        store.append(series, epoch)
-        assert store.series_columns(series, [name])[name].tolist() == [20.5]
+        store.append(store.create_series(head_of(name), FIELD), epoch)
     header, row = csv.reader(io.StringIO("".join(View(folder / "t.db", folder).csv("cam", "M1"))))
     assert dict(zip(header, row, strict=True))[name] == "20.5"
     write_recording(folder / "M1", head_of(name), FIELD, [epoch])

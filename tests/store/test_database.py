@@ -20,6 +20,7 @@ from thermocald.store.database.epochs import (
     unpack_covariance,
     unpack_observations,
 )
+from thermocald.store.database.file import read_wal_tail
 from thermocald.store.database.store import Store
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event
@@ -167,7 +168,7 @@ def test_readers_see_committed_epochs_while_it_is_written(filled, store_path, ma
         assert not caplog.records  # an epoch that came while the others were read is not missing
 
 
-def test_threads_share_a_store(store, head, field, make_epoch, make_result):
+def test_threads_share_a_store(store, store_path, head, field, make_epoch, make_result):
     kinds = [store.create_series(replace(head, series=f"T{i}"), field) for i in range(4)]
 
     def work(series):
@@ -177,9 +178,11 @@ def test_threads_share_a_store(store, head, field, make_epoch, make_result):
     threads = [threading.Thread(target=work, args=(series,)) for series in kinds]
     for thread in threads:
         thread.start()
+    tails = [read_wal_tail(store_path.with_name(f"{store_path.name}-wal")) for _ in range(50)]
     for thread in threads:
         thread.join()
     assert [store.last_epoch(series) for series in kinds] == [24] * 4
+    assert not any(lost for lost, _ in tails)  # what is being written is not damaged
 
 
 def test_no_store(tmp_path):

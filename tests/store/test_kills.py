@@ -143,14 +143,16 @@ def small_disk():
 
 
 def test_a_full_disk(store, series, make_epoch, make_result, small_disk):
+    def append(number):
+        store.append(series, make_epoch(number), make_result(number))
+
     with pytest.raises(StoreFullError, match="was not stored: the disk") as caught:
-        for number in range(1, 10_000):
-            store.append(series, make_epoch(number), make_result(number))
+        list(map(append, range(1, 10_000)))
     last = store.last_epoch(series)
     assert last > 10
     assert f"epoch {last + 1} " in str(caught.value)
     with pytest.raises(StoreError, match="disk"):
-        store.append(series, make_epoch(last + 1), make_result(last + 1))
+        append(last + 1)
     assert store.last_epoch(series) == last
 
 

@@ -260,6 +260,8 @@ def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head,
          "line 2: the rows hold more fields than the head"),
         ("time,T °C\n2000-07-06 13:55,21\n2000-07-06 13:56,21\n2026-07-06 13:57,21\n", {},
          "line 4, column 'time': is 26 years after the row before"),
+        ("time,T\n" + "".join(f"2026-06-14 12:0{i},{21 if i < 4 else 69.8}\n" for i in range(8)), {},
+         "line 6, column 'T': the unit seems to change from °C to °F here.*--unit"),
         ("time,T °C\n13:55,21\n13:56,21\n", {},
          "as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"),
     ],
@@ -358,35 +360,6 @@ def test_what_is_doubtful_is_told(tmp_path, name):
         found = read(tmp_path, f"time,{head}", row, unit="degF")
         assert not [n for n in found.notes if "doubtful" in n]
         assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)
-
-
-WARM, ROOM, COLD = (np.linspace(*ends, 20) for ends in ((27, 35.9), (20.1, 22.3), (4.0, 6.2)))
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "hours", "change"),
-    [
-        (WARM, COLD, 14, None),  # 35.9 °F would be 2.2 °C
-        (ROOM, WARM + 21, 14, None),  # 22.3 °C would be 72 °F
-        (10 * COLD // 1, COLD, 14, "from tenths"),
-        (COLD + 21, COLD / 2, 14, None),  # 27.2 are no tenths
-        (1.8 * ROOM + 32, ROOM, 14, "from °F to °C"),
-        (ROOM, 1.8 * ROOM + 35, 14, "from °C to °F"),
-        (1.8 * COLD + 32, COLD[::-1], 0, "from °F to °C"),
-        (ROOM, ROOM + 273.15, 0, "from °C to K"),
-    ],
-)
-def test_a_night_changes_the_temperature_and_a_setting_the_unit(
-    tmp_path, first, second, hours, change
-):
-    times = TIMES[0] + np.arange(40) * 60.0 + np.repeat([0.0, 3600.0 * hours], 20)
-    rows = zip(times, [*first, *second], strict=True)
-    data = "time,T °C\n" + "".join(f"{time:.0f},{value:.1f}\n" for time, value in rows)
-    if change is None:
-        assert len(logged(tmp_path, data).times) == 40
-        return
-    with pytest.raises(DataError, match=f"line 22, .* the unit seems to change {change} here"):
-        logged(tmp_path, data)
 
 
 def test_no_two_days_of_a_real_log_have_two_units(shared, tmp_path):

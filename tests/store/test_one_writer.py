@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import shutil
 import socket
 import stat
 
@@ -117,14 +116,6 @@ def test_a_store_of_two_names_is_not_written_where_nobody_waits(daemon, path, tm
     # a daemon must not stop because of a user's backup: it reports it and goes on
     with contextlib.closing(StoreGuard(path)) as guard:
         assert "2 names" in guard.status()["notice"]
-
-
-def test_a_copy_is_a_store_of_its_own(daemon, path, tmp_path, recording):
-    daemon.store.checkpoint()
-    shutil.copyfile(path, tmp_path / "copy.db")
-    assert call("replay", recording, "--store", tmp_path / "copy.db").returncode == 0
-    with Store.open(tmp_path / "copy.db") as store:
-        assert len(store.all_series()) == 2
 
 
 @pytest.mark.parametrize("kind", ["null", "full", "pipe", "socket", "link to null"])

@@ -98,18 +98,11 @@ def test_text_that_cannot_be_read_is_not_converted(recording_path, monkeypatch):
     check(recording_path, convert(recording_path)[1])
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "words"),
-    [
-        ("x", float("inf"), "inf is not a finite number"),
-        ("sx", -1.0, "a standard deviation must be above 0"),
-        ("target", "nobody", "target 'nobody'"),
-        ("epoch", 77, "epoch 77"),
-        ("y", None, "is empty"),
-        ("epoch", 1.5, "'1.5' is not an integer"),
-        ("epoch", -1, "'-1' is not an integer"),
-    ],
-)
+@pytest.mark.parametrize(("column", "value", "words"), [
+    ("x", float("inf"), "inf is not a finite number"), ("y", None, "is empty"),
+    ("sx", -1.0, "a standard deviation must be above 0"), ("target", "nobody", "target 'nobody'"),
+    ("epoch", 77, "epoch 77"), ("epoch", 1.5, "'1.5' is not"), ("epoch", -1, "'-1' is not an int"),
+])  # fmt: skip
 def test_what_is_wrong_is_said_with_row_and_column(recording_path, column, value, words):
     path, _ = convert(recording_path)
     table = parquet.read_table(path).to_pydict()

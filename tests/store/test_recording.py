@@ -129,10 +129,18 @@ def test_frames_are_kept_and_found(tmp_path, field, head):
     assert recording.epochs[2].note == "neither frame nor observations"
 
 
-def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):
+def test_writing_and_streaming_do_not_grow_with_length(
+    tmp_path, field, head, make_epoch, monkeypatch
+):
+    monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+    monkeypatch.setattr(observation_file, "_parse_once", lambda table: table)
+    monkeypatch.setattr(table, "_ROWS", 100)
+
     def peak(epochs: int) -> int:
         tracemalloc.start()
         write_recording(tmp_path / f"r{epochs}", head, field, map(make_epoch, range(epochs)))
+        for epoch in open_recording(tmp_path / f"r{epochs}").iter_epochs():
+            assert len(epoch.observations) == len(field)
         size = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return size
@@ -211,23 +219,11 @@ def raise_full(_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "words"),
-    [("x", "12,5e", "not a number"), ("x", "", "is empty"), ("x", "nan", "finite"),
-     ("sx", "0", "above 0 px"), ("target", "nobody", "is not in testfield.csv"),
-     ("epoch", "99", "is not in epochs.csv"), ("epoch", "1.5", "not an integer")],
-)  # fmt: skip
-def test_a_copy_says_where_the_text_is_wrong(recording_path, cache, column, value, words):
-    """An error found in the binary copy names the line of the text."""
-    set_field(recording_path / "observations.csv", 40, column, value)
-    with pytest.raises(RecordingError, match=r"observations\.csv, line 40.*" + words):
-        streamed(recording_path)
-
-
 NONE = np.nan
 TENS = np.arange(0.0, 100.0, 10.0)
 # times of frames, times of readings, readings, temperatures at the frames
 INTERPOLATED = {
+    "no readings": ([0.0, 1.0], [], [], [NONE, NONE]),
     "a ramp is exact between readings, and just outside": (
         TENS, TENS + 3.0, 20.3 + 0.1 * TENS, 20 + 0.1 * TENS),
     "missing readings are passed over": (
@@ -236,7 +232,6 @@ INTERPOLATED = {
         [15.0, 500.0, 1000.0, 1015.0], [0.0, 10.0, 20.0, 1000.0, 1010.0, 1020.0],
         [0.0, 0.1, 0.2, 10.0, 10.1, 10.2], [0.15, NONE, 10.0, 10.15]),
     "no guess far outside": ([-50.0, 100.0], [0.0, 10.0, 20.0], [1.0, 2.0, 3.0], [NONE, NONE]),
-    "no readings": ([0.0, 1.0], [], [], [NONE, NONE]),
     "nothing but missing ones": ([0.0, 1.0], [0.0, 1.0], [NONE, NONE], [NONE, NONE]),
     "one reading holds for its instant": ([5.0, 6.0], [5.0], [21.0], [21.0, NONE]),
     "two readings at one instant are one": ([1.0], [0.0, 0.0, 2.0], [1.0, 1.0, 3.0], [2.0]),

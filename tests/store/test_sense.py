@@ -204,17 +204,13 @@ def test_what_a_thermometer_gives_unmeasured_is_found(value):
 
 
 MEASURED = [
-    wave(),
+    wave(), np.full(40, 85.0), np.full(9, np.nan), np.empty(0), np.r_[np.full(9, np.nan), wave(20)],
     np.r_[wave(30), wave(30) + 40.0],  # carried into the sun
     np.r_[np.full(20, 20.0), 20.0 + 65.0 * (1 - np.exp(-np.arange(60) / 3.0))],  # a kettle
     np.linspace(20.0, 120.0, 60),  # through 85 °C
-    np.full(40, 85.0),  # at 85 °C
     np.r_[np.full(20, 78.0), np.full(20, 85.0), np.full(20, 77.0)],  # a processor's limit
     np.r_[np.full(20, 6.0), np.full(30, 0.0)],  # melting snow
-    np.r_[np.full(9, np.nan), wave(20)],
-    np.full(9, np.nan),
-    np.empty(0),
-]
+]  # fmt: skip
 
 
 def test_what_was_measured_is_no_spike():
@@ -233,6 +229,25 @@ def test_a_camera_that_is_carried_changes_no_unit(rise):
     assert unit_change(np.r_[wave(30), wave(60)[30:] + rise - settling]) is None
 
 
+WARM, ROOM, COLD = (np.linspace(*ends, 20) for ends in ((27, 35.9), (20.1, 22.3), (4.0, 6.2)))
+# readings, others, hours between them, the change of their unit
+NIGHTS = [
+    (WARM, COLD, 14, None),  # 35.9 °F would be 2.2 °C
+    (ROOM, WARM + 21, 14, None),  # 22.3 °C would be 72 °F
+    (10 * COLD // 1, COLD.round(1), 14, "from tenths"),
+    (COLD + 21, COLD / 2, 14, None),  # 27.2 are no tenths
+    (1.8 * ROOM + 32, ROOM, 14, "from °F to °C"), (ROOM, 1.8 * ROOM + 35, 14, "from °C to °F"),
+    (1.8 * COLD + 32, COLD[::-1], 0, "from °F to °C"), (ROOM, ROOM + 273.15, 0, "from °C to K"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("first", "second", "hours", "unit"), NIGHTS)
+def test_a_night_changes_the_temperature_and_a_setting_the_unit(first, second, hours, unit):
+    times = np.arange(40) * 60.0 + np.repeat([0.0, 3600.0 * hours], 20)
+    found = find_unit_change(times, np.round([*first, *second], 1))
+    assert found == (None if unit is None else (20, unit))
+
+
 def test_a_spike_beside_a_change_of_the_unit_hides_neither():
     values = np.r_[wave(30), 1.8 * wave(60)[30:] + 32]
     values[[27, 33]] = 85.0, 185.0
@@ -240,10 +255,9 @@ def test_a_spike_beside_a_change_of_the_unit_hides_neither():
     assert find_spikes(values)[0][:2] == (27, 28)
 
 
-@pytest.mark.parametrize("rows", [[0], [0, 1, 2], [39]])
+@pytest.mark.parametrize(("value", "rows"), [("85", [0]), ("85", [0, 1, 2]), ("3.2e9", [39])])
 @pytest.mark.parametrize("column", ["frame_time", "temperature_time"])
-def test_a_clock_that_was_not_set_is_refused(recording, column, rows):
-    value = "85.0" if rows[0] == 0 else "3.2e9"
+def test_a_clock_that_was_not_set_is_refused(recording, column, value, rows):
     change("epochs.csv", **{column: put(value, *rows)})(recording)
     with pytest.raises(RecordingError, match=rf"column {column}: is 5\d years after the row"):
         read_recording(recording)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from tests.commands import finish
+from tests.commands import call, finish
 from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import read_recording
 from thermocald.store.series import Event
 from thermocald.store.sources import open_source
 
@@ -50,11 +51,14 @@ def read(path) -> dict[str, np.ndarray]:
     """Return times, and what depends on them, as every analysis reads them."""
     fitted = tc.open(path).observed()  # fit and discover
     studied = tc.open(path).measured(exterior="per_epoch")
+    assert call("archive", path, "--to", path.with_suffix("")).returncode == 0
+    archived = read_recording(path.with_suffix("") / "rpi-M1")
     rows = list(csv.DictReader(io.StringIO(finish("export", path, "--exterior", "stored").stdout)))
     with open_source(path) as store:
         epochs = [s.epoch.frame_time for s in store.epochs(store.find_series(), 10, 20)]
     return {
         "fit": fitted.frame_times, "readings": fitted.reading_times, "epochs": np.array(epochs),
+        "archive": archived.columns.frame_time, "archived": archived.columns.temperature_time,
         "study": studied.time_s, "start": np.array([studied.start_utc]),
         "thermometer": studied.thermometers[0].values,
         "export": np.array([float(row["frame_time"]) for row in rows]),

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import shutil
-import subprocess
 import tempfile
-import threading
 from contextlib import closing
 from pathlib import Path
 
@@ -15,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.commands import call
+from tests.daemon.conftest import tool
 from tests.store.small import stored_numbers
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError
@@ -98,25 +96,6 @@ def test_what_the_index_counts_was_committed(store, series, store_path, make_epo
     assert read_wal_tail(wal) == (0, True)
 
 
-@pytest.mark.slow
-def test_a_store_that_is_being_written_is_not_damaged(store, series, store_path, make_epoch):
-    enough = threading.Event()
-
-    def write():
-        for i in itertools.takewhile(lambda _: not enough.is_set(), itertools.count(1)):
-            store.append(series, make_epoch(i))
-
-    writer = threading.Thread(target=write)
-    writer.start()
-    try:
-        tails = [read_wal_tail(helper(store_path, "wal")) for _ in range(50)]
-    finally:
-        enough.set()
-        writer.join()
-    assert store.last_epoch(series) > 2
-    assert not any(lost for lost, _ in tails)
-
-
 def test_the_daemon_says_so_and_keeps_a_copy(crashed):
     data, _ = frames(helper(crashed, "wal"))
     data[len(data) // 2] ^= 16
@@ -141,14 +120,11 @@ def read_only(crashed):
         yield crashed
         folder.chmod(0o755)
         return
-    tool = shutil.which("mount")
-    command = [tool or "mount", "--bind", folder, folder]
-    done = tool and subprocess.run(command, capture_output=True, check=False)
-    if not done or done.returncode:
+    if tool("mount", "--bind", folder, folder).returncode:
         pytest.skip("root, whom modes do not stop, cannot mount here")
-    subprocess.run([tool, "-o", "remount,ro,bind", folder], check=True)
+    assert tool("mount", "-o", "remount,ro,bind", folder).returncode == 0
     yield crashed
-    subprocess.run(["umount", "-l", folder], check=False)
+    tool("umount", "-l", folder)
 
 
 def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_path):

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 
+import cv2
+import numpy as np
 import pytest
 
+from tests.cli.test_import import photograph
 from tests.recordings import read_rows, write_rows
-from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
+from thermocald.errors import ImageError, RecordingError, TestFieldError, ThermocaldError
+from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
+from thermocald.store.logger.photographs import find_copies, read_photograph
 from thermocald.store.recording import observation_file
 from thermocald.store.recording.reader import open_recording, read_recording
 from thermocald.store.recording.testfield_file import read_testfield
@@ -192,3 +199,65 @@ def test_a_field_in_metres_is_recognised_by_the_principal_distance(recording_pat
 def test_a_file_instead_of_a_folder(recording_path):
     with pytest.raises(RecordingError, match="is not a folder"):
         read_recording(recording_path / "epochs.csv")
+
+
+GARBAGE = [
+    "", "nan", "inf", "-1", "1e999", "0x10", "1_000", "t0", '"', "1", "2.5", "\x00", "²", "a,b\n", "\n",
+    "!!bool x", '!!int ""', "2020-99-99", "!!timestamp x", "*a", "&a [*a]", "{", "~", ": ", "x: {y: }",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "file", ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
+)
+def test_garbage_within_a_good_file_is_one_error_that_names_it(recording_path, file):
+    """The error of a damaged table may be in one that refers to it."""
+    rng = np.random.default_rng(len(file))
+    whole = (recording_path / file).read_bytes()
+    for put in [*(word.encode() for word in GARBAGE), *(rng.bytes(9) for _ in range(15))] * 2:
+        at, gone = int(rng.integers(len(whole))), int(rng.integers(40))
+        (recording_path / file).write_bytes(whole[:at] + put + whole[at + gone :])
+        message = file
+        try:
+            read_recording(recording_path)
+        except ThermocaldError as error:
+            message = str(error)
+        assert any(path.name in message for path in recording_path.iterdir())
+        assert "\n" not in message
+
+
+def test_an_image_too_large_is_refused_before_it_is_decoded(monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", None)
+    png = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
+    head = b"IHDR" + struct.pack(">II", 30000, 30000) + png[24:29]
+    with pytest.raises(ImageError, match="30000 × 30000 px"):
+        decode_grey(png[:12] + head + struct.pack(">I", zlib.crc32(head)) + png[33:])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".bmp", ".pgm"])
+def test_sizes_are_read_from_heads(suffix):
+    data = cv2.imencode(suffix, np.zeros((37, 53), np.uint8))[1].tobytes()
+    assert image_size(data) == (53, 37)
+    for cut in range(0, 40, 3):
+        image_size(data[:cut])  # damage is no error here
+
+
+def test_damaged_exif_is_no_warning(tmp_path):
+    """Warnings are errors here."""
+    photograph(tmp_path / "p.jpg", "2026:06:14 12:00:01", "250", "+02:00")
+    whole = (tmp_path / "p.jpg").read_bytes()
+    at, refused = whole.index(b"Exif"), 0
+    for cut in range(at + 10, at + 120, 5):
+        (tmp_path / "p.jpg").write_bytes(whole[:cut] + bytes(4) + whole[cut + 4 :])
+        try:
+            read_photograph(tmp_path / "p.jpg")
+        except ThermocaldError:
+            refused += 1
+    assert refused
+
+
+def test_a_file_that_cannot_be_read_hides_no_copy(tmp_path):
+    paths = [tmp_path / name for name in ("a.jpg", "gone.jpg", "c.jpg")]
+    for path in paths[::2]:
+        path.write_bytes(b"the same")
+    assert find_copies(paths) == {2: 0}

@@ -116,6 +116,3 @@ def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, steps):
         create_tables(place)
         with ServerStore(place) as store:
             assert store._query("SELECT count(*) FROM weather") == [(0,)]
-    steps()
-    with pytest.raises(StoreVersionError, match="update thermocald here"):
-        ServerStore(place)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import socket
 import stat
 
 import pytest
@@ -118,18 +117,15 @@ def test_a_store_of_two_names_is_not_written_where_nobody_waits(daemon, path, tm
         assert "2 names" in guard.status()["notice"]
 
 
-@pytest.mark.parametrize("kind", ["null", "full", "pipe", "socket", "link to null"])
+@pytest.mark.parametrize("kind", ["null", "pipe", "link to null"])
 def test_a_device_is_no_store_and_stays(tmp_path, recording, kind):
     """Regression: as root, the node of the null device was removed as an empty file."""
     place = node = tmp_path / "node"
     if kind == "pipe":
         os.mkfifo(node)
-    elif kind == "socket":
-        with contextlib.closing(socket.socket(socket.AF_UNIX)) as server:
-            server.bind(str(node))
     else:
         try:
-            os.mknod(node, 0o666 | stat.S_IFCHR, os.makedev(1, 7 if kind == "full" else 3))
+            os.mknod(node, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
         except PermissionError:
             pytest.skip("no device can be made here")
     if kind.startswith("link"):

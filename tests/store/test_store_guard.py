@@ -1,17 +1,22 @@
-"""The guard of a store whose disk has space for an event but not for a row."""
+"""Full disks and locks of other programs lose nothing that was stored, and rows wait for them."""
 
 from __future__ import annotations
 
+import resource
+import signal
 import sqlite3
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
-from tests.store.small import stored_numbers
+from tests.store.small import stored_numbers, write_recording
 from thermocald.daemon.store_guard import Row, StoreGuard
-from thermocald.errors import StoreBusyError
+from thermocald.errors import RecordingError, StoreBusyError, StoreError, StoreFullError
+from thermocald.store.database import file
+from thermocald.store.database.store import Store
 
 
 @pytest.fixture
@@ -122,3 +127,46 @@ def test_losses_are_counted_each_and_reported_once_a_minute(guard, caplog):
     assert guard.lost == 200
     assert caplog.text.count("lost: epoch") == 1
     assert len([e for e in guard.store.events() if e.kind == "epoch_lost"]) <= 1
+
+
+@pytest.fixture
+def small_disk():
+    """Limit files to 400 kB, which acts on one process like a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_full_disk(store, series, make_epoch, make_result, small_disk):
+    def append(number):
+        store.append(series, make_epoch(number), make_result(number))
+
+    with pytest.raises(StoreFullError, match="was not stored: the disk") as caught:
+        list(map(append, range(1, 10_000)))
+    last = store.last_epoch(series)
+    assert last > 10
+    assert f"epoch {last + 1} " in str(caught.value)
+    with pytest.raises(StoreError, match="disk"):
+        append(last + 1)
+    assert store.last_epoch(series) == last
+
+
+def test_the_wal_file_takes_a_quarter_of_a_small_disk(
+    store_path, head, field, make_epoch, make_result, monkeypatch
+):
+    """It filled a disk of 4 MB with 115 epochs, of which 800 find room."""
+    monkeypatch.setattr(file.shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    with Store.open(store_path, "append", durable=False) as store:
+        series = store.create_series(head, field)
+        for number in range(1, 50):
+            store.append(series, make_epoch(number), make_result(number))
+            assert file.helper(store_path, "wal").stat().st_size < 350_000
+
+
+def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):
+    with pytest.raises(RecordingError, match="cannot be written"):
+        write_recording(tmp_path / "r", head, field, map(make_epoch, range(10_000)))
+    assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Archiving: a stored series becomes a recording with the same content, and names no other files."""
+"""A stored series becomes a recording with the same content; neither names files elsewhere."""
 
 from __future__ import annotations
 

@@ -202,8 +202,8 @@ def test_a_file_instead_of_a_folder(recording_path):
 
 
 GARBAGE = [
-    "", "nan", "inf", "-1", "1e999", "0x10", "1_000", "t0", '"', "1", "2.5", "\x00", "²", "a,b\n", "\n",
-    "!!bool x", '!!int ""', "2020-99-99", "!!timestamp x", "*a", "&a [*a]", "{", "~", ": ", "x: {y: }",
+    "", "nan", "inf", "-1", "1e999", "0x10", "1_000", "t0", '"', "1", "2.5", "\x00", "²", "a,b\n",
+    "!!bool x", '!!int ""', "2020-99-99", "!!timestamp x", "*a", "&a [*a]", "{", "~", ": ", "\n",
 ]  # fmt: skip
 
 

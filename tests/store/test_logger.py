@@ -66,10 +66,6 @@ LOGS = {
     "HOBO": (HOBO, "{i},{b:%m/%d/%y %I:%M:%S %p},{t:.2f}"),
     "HOBOconnect, in Eastern standard time": (
         "#,Date-Time (EST),Temperature (°F)", "{i},{e:%m/%d/%Y %H:%M:%S},{f:.2f}"),
-    "Onset, twelve hours": (
-        "#,Date-Time (UTC),Ch: 1 - Temperature   (°C )", "{i},{m:%m/%d/%Y %I:%M:%S %p},{t:.2f}"),
-    "Ruuvi": ("Date,Temperature (°C),Humidity (%),RSSI (dBm)",
-              "{m:%Y-%m-%dT%H:%M:%S.000Z},{t:.2f},50.1,-60"),
     "Tinytag": ("Record,Date,Time,Temperature", "{i},{b:%d %b %Y},{b:%H:%M:%S},{t:.2f} °C"),
     # EL-USB: day first, the logger's data in the first row only, constant alarm levels
     "Lascar EasyLog": (
@@ -107,8 +103,6 @@ LOGS = {
         "{i},{b.year}年{b.month}月{b.day}日 {b:%H:%M:%S},{t:.2f},45"),
     "a remark between the rows": (
         "time,T °C", [*rows_of("{s},{t:.2f}")[:6], "# battery", *rows_of("{s},{t:.2f}")[6:]]),
-    "least, most and mean": (
-        "time,T max °C,T min °C,T avg °C", "{s},{f:.2f},{i},{t:.2f}"),
 }  # fmt: skip
 SAID = {
     "Testo": "3 rows without a time: left out (line 15: 'Minimum')",
@@ -237,13 +231,12 @@ def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head,
         ("Time (EST/EDT),T\n2026-06-14 12:00,20\n", {}, "EST/EDT.*Berlin: give --log-timezone"),
         ("time;T\n05/06/2026 10:00;21\n05/06/2026 10:01+01:00;21\n", {}, "--date-order dmy or"),
         ("time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
-        ("time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),
+        ("time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {},
+         "20 K is -253.*Another unit"),
         ("time,T (F)\n2026-06-14 12:00,20 C\n2026-06-14 12:01,20 C\n", {}, "at once.*--unit"),
         ("time,T\n2026-06-14 12:00,20.5\n2026-06-14 12:01,69F\n", {}, "only 1 of 2.*--unit"),
-        ("time,a,b\n2026-06-14 12:00,20,21\n2026-06-14 12:01,20,21\n", {}, "--temperature-column"),
         ("time,T\n2026-06-14 12:00,20\n2026-06-14 12:01,2_5.0\n", {"temperatures": ("T",)},
          "is not a number"),
-        ("time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
         ("a,b\n1,2\n3,4\n", {}, "no separator"),
         ("2026-06-14 4:50:00 PM 21.5\n2026-06-14 4:51:00 PM 21.5\n", {}, "no separator"),
         ("time,T\n" + 3 * "2026-06-14 12:00,20\n", {}, "has readings at 1 time; two"),
@@ -253,7 +246,6 @@ def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head,
         (b"\x7fELF\0\0\0\0", {}, "is not text"),
         ("time,temp\n46187.5,20\n46187.54,20\n", {}, "line 2.* spreadsheet's date"),
         ("Zeit;T\n46187.5,20\n46188.5,20\n", {}, "show 45992.5 as a date with a time"),
-        ("time,T °C\n2026-06-14 12:00,20\n", {"temperatures": ("Temp",)}, "no column 'Temp'"),
         ("time,T °C\n2026-06-14 12:00,20\n", {"encoding": "utf-16"},
          "--encoding utf-16: .* cannot be read so: .*BOM"),
         (f"time,T\n{'x' * 200_000}\n", {"separator": ","}, "line 2: is not readable: field larger"),
@@ -278,7 +270,7 @@ UNITS = {
         "(F)", "T °F", "degF", "TempF", "[F]", "tempf", "temp_f", "Temperature, F", "Temp. (F)",
         "deg. F", "Degrees F", "T ℉", "TºF", "Fahrenheit", "housing_f", "T_degF", "T1 F°",
         "Temp (Fahr.)", "Temp Farenheit", "degrees-f", "T (F, mean)", "温度(华氏)"),
-    "degC": ("Celsius(°C)", "Temperatur[°C]", "TempC", "温度(℃)", "T_degC"),
+    "degC": ("Celsius(°C)", "Temperature   (°C )", "Temperatur[°C]", "TempC", "温度(℃)", "T_degC"),
     "K": ("T [K]", "kelvin", "degK", "(K)", "housing_k"),
     None: ("temperature", "Tempfühler", "Temp Fan", "offset", "state", "temperature_factory",
            "board_temperature", "Probe F"),
@@ -448,41 +440,32 @@ NOON_IN_BERLIN = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("2026:06:14 12:00:01", datetime(2026, 6, 14, 12, 0, 1)),
-        ("06.14.26 12:00:03,5", datetime(2026, 6, 14, 12, 0, 3, 500000)),
-        ("20260614_120001", datetime(2026, 6, 14, 12, 0, 1)),
-        ("6/14/2026 12:02 AM", datetime(2026, 6, 14, 0, 2)),
-        ("6/14/2026 12:02 p. m.", datetime(2026, 6, 14, 12, 2)),
-        ("2026-06-30 24:00", datetime(2026, 7, 1)),
-        ("Sun Jun 14 12:00:00 2026", datetime(2026, 6, 14, 12)),
-        *((text, datetime(2026, 6, 14, 10, tzinfo=UTC)) for text in NOON_IN_BERLIN),
-    ],
-)
-def test_moments(text, expected):
-    found = parse_moment(text, "mdy")
-    assert found == expected
-    assert (found.utcoffset() is None) == (expected.utcoffset() is None)
+LOCAL = {
+    "2026:06:14 12:00:01": "2026-06-14T12:00:01", "20260614_120001": "2026-06-14T12:00:01",
+    "06.14.26 12:00:03,5": "2026-06-14T12:00:03.500000", "2026-06-30 24:00": "2026-07-01T00:00:00",
+    "6/14/2026 12:02 AM": "2026-06-14T00:02:00", "6/14/2026 12:02 p. m.": "2026-06-14T12:02:00",
+    "Sun Jun 14 12:00:00 2026": "2026-06-14T12:00:00",
+}  # fmt: skip
 
 
-NONE = [
-    *((clock_error, text, UsageError, r"HH:MM:SS")
-      for text in ("three", "1:2:3:4", "+", "00:03:12 ahead")),
-    *((time_zone, text, UsageError, "time zone")
-      for text in ("Europe/Nowhere", "CEST!", "+99:00", "../../etc/passwd", "")),
-    *((parse_moment, text, ValueError, r".")
-      for text in ("2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12",
-                   "2026-06-14 24:00:01", "9999-12-31 24:00")),
-    (find_photographs, [], DataError, "no photographs are given"),
-]  # fmt: skip
+def test_moments():
+    assert {text: parse_moment(text, "mdy").isoformat() for text in LOCAL} == LOCAL
+    for text in NOON_IN_BERLIN:
+        moment = parse_moment(text, "mdy")
+        assert (moment.tzinfo is None, moment) == (False, datetime(2026, 6, 14, 10, tzinfo=UTC))
 
 
-@pytest.mark.parametrize(("parse", "text", "error", "words"), NONE)
-def test_what_is_none_is_refused(parse, text, error, words):
-    with pytest.raises(error, match=words):
-        parse(text)
+@pytest.mark.parametrize(("parse", "texts", "error", "words"), [
+    (clock_error, ("three", "1:2:3:4", "+", "00:03:12 ahead"), UsageError, "HH:MM:SS"),
+    (time_zone, ("Europe/Nowhere", "CEST!", "+99:00", "../../etc/passwd", ""), UsageError, "zone"),
+    (parse_moment, ("2026-13-01 12:00", "25:00:00", "tomorrow", "", "2026-06-14 12",
+                    "2026-06-14 24:00:01", "9999-12-31 24:00"), ValueError, "."),
+    (find_photographs, [[]], DataError, "no photographs are given"),
+])  # fmt: skip
+def test_what_is_none_is_refused(parse, texts, error, words):
+    for text in texts:
+        with pytest.raises(error, match=words):
+            parse(text)
 
 
 @pytest.mark.parametrize(("head", "offset_h", "zone"), [

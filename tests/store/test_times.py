@@ -73,15 +73,6 @@ def test_every_analysis_reads_the_right_times(stamp, clock):
         times = store.series_columns(store.find_series(), ["frame_time"])["frame_time"]
     assert np.abs(np.diff(times)).max() > 3000
     expected = read(right)
-    assert len(expected["export"]) == EPOCHS
+    assert expected["export"].tolist() == [1.6e9 + 10.0 * i for i in range(1, EPOCHS + 1)]
     for name, values in read(stamped).items():
         assert values == pytest.approx(expected[name], abs=1e-5), name
-
-
-def test_times_that_need_no_correction_are_as_they_were_stamped(filled, store_path):
-    store, series = filled
-    names = ["frame_time", "temperature_time", "c"]
-    with open_source(store_path) as source:
-        found = source.series_columns(source.all_series()[0], names)
-    stamped = store.series_columns(series, names)
-    assert {n: v.tolist() for n, v in found.items()} == {n: v.tolist() for n, v in stamped.items()}

@@ -47,25 +47,19 @@ def test_an_epoch_comes_back_as_it_was(filled, make_epoch, make_result):
 
 
 def test_columns_have_names_and_nan_where_nothing_is(filled, make_result):
+    """More of columns is in the histories below."""
     store, series = filled
     covariance = make_result(1).covariance.copy()
     covariance[8, :] = covariance[:, 8] = 0.0  # C1 is held fixed
     store.append(series, Epoch(30, 1.6e9, 1.6e9), EpochResult("ok", "", np.ones(16), covariance))
     store.append(series, Epoch(31, 1.6e9 + 300, np.nan), EpochResult("too_few_targets", "only 2"))
-    names = ["epoch", "c", "sd_Z0", "X0", "x0", "temperature", "blur", "n_rejected", "status"]
-    columns = store.series_columns(series, [*names, "C1", "sd_C1", "sd_C2"])
-    assert list(columns) == [*names, "C1", "sd_C1", "sd_C2"]
-    assert columns["epoch"].tolist() == [*range(1, 21), 30, 31]
-    for i in (0, 12):
-        result = make_result(i + 1)
-        assert [columns[n][i] for n in ("c", "X0", "x0")] == result.values[[0, 13, 1]].tolist()
-        assert columns["sd_Z0"][i] == result.sd[15]
-    assert columns["temperature"][3] == 20.25
-    assert columns["n_rejected"].tolist() == [2] * 20 + [0, 0]
-    assert columns["status"].tolist() == ["ok"] * 21 + ["too_few_targets"]
+    names = ["X0", "x0", "sd_Z0", "n_rejected", "temperature", "C1", "sd_C1", "sd_C2"]
+    columns = store.series_columns(series, names)
+    assert list(columns) == names
+    made = make_result(13)
+    assert [columns[n][12] for n in names[:5]] == [*made.values[[13, 1]], made.sd[15], 2, 20.8125]
     assert (columns["C1"][-2], columns["sd_C2"][-2] > 0) == (1.0, True)
-    nothing = [columns[n][-1] for n in ("c", "sd_Z0", "temperature", "blur")]
-    assert np.isnan([*nothing, columns["sd_C1"][-2]]).all()
+    assert np.isnan([columns["sd_C1"][-2], columns["sd_Z0"][-1], columns["temperature"][-1]]).all()
 
 
 def test_what_cannot_be_stored_is_refused_and_leaves_nothing(filled, make_epoch, make_result):
@@ -95,12 +89,9 @@ def test_a_later_calibration_replaces_what_is_read_but_not_what_is_kept(filled, 
     for number, made in ((21, 21), (4, 400), (4, 401)):
         store.amend(series, number, make_result(made))
     assert store.examine().epochs == store.last_epoch(series)  # a later calibration is no epoch
-    columns = store.series_columns(series, ["c", "status", "temperature", "blur"])
-    assert columns["c"][[3, 20]].tolist() == [make_result(i).values[0] for i in (401, 21)]
-    assert (columns["status"][-1], columns["temperature"][-1]) == ("ok", 30.0)
-    assert columns["blur"][3] == 2.0
     (stored,) = store.epochs(series, 4, 4)
-    assert (stored.revision, len(stored.epoch.observations)) == (2, 12)
+    assert stored.result.values.tolist() == make_result(401).values.tolist()
+    assert (stored.revision, stored.extra, len(stored.epoch.observations)) == (2, {"blur": 2.0}, 12)
     assert [s.epoch.number for s in store.epochs(series)] == list(range(1, 22))
     with pytest.raises(StoreError, match="has no epoch 99"):
         store.amend(series, 99, make_result(1))
@@ -154,6 +145,7 @@ def test_rows_that_a_trigger_swallows_are_not_kept_and_said(filled, store_path, 
     store, series = filled
     with pytest.raises(StoreError, match=f"keeps rows out of {table}"):
         store.append(series, make_epoch(21))
+    assert store.last_epoch(series) == 20
 
 
 def test_readers_see_committed_epochs_while_it_is_written(filled, store_path, make_epoch, caplog):

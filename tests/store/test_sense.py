@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from html import escape
 
@@ -78,7 +79,7 @@ def observed(kept):
 
 
 OTHER_IMAGES = {
-    "width and height exchanged": (size(2464, 3280), "width and height (or x and y)"),
+    "width and height exchanged": (size(2464, 3280), "width and height "),
     "a crop": (size(1920, 1080), "another camera"),
     "points from the centre": (
         change("observations.csv", x=scaled(1, -1639.5), y=scaled(1, -1231.5)),
@@ -90,15 +91,13 @@ OTHER_IMAGES = {
 
 
 @pytest.mark.parametrize("name", OTHER_IMAGES)
-def test_points_of_another_image_are_refused(recording, name):
+def test_points_of_another_image_are_refused_in_one_line(recording, name):
     damage, message = OTHER_IMAGES[name]
     damage(recording)
-    with pytest.raises(RecordingError, match=r"observations\.csv, line \d+, column x") as caught:
-        read_recording(recording)
-    assert message in str(caught.value)
-    for command in ("check", "replay", "export") if name == "a crop" else ():
+    for command in ("check", "replay", "export"):
         done = call(command, recording)
         assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+        assert re.search(r"observations\.csv, line \d+, column x.*" + message, done.stderr)
 
 
 def test_some_gross_errors_off_the_image_are_left_to_the_adjustment(recording):

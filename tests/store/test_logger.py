@@ -125,30 +125,23 @@ def test_a_log_is_read_without_a_question(tmp_path, name):
 
 def test_sensors_below_one_another_are_channels(tmp_path):
     """As Home Assistant writes them; a humidity is no channel, a word no reading."""
-    rows = [
-        ("sensor.box_temperature", "unavailable", "09:59:00"),
-        ("sensor.box_temperature", 21.5, "10:00:00"), ("sensor.box_humidity", 45.0, "10:00:10"),
-        ("sensor.air_temperature", 19.5, "10:00:20"), ("sensor.box_temperature", 21.75, "10:01:00"),
-        ("sensor.air_temperature", -196.6, "10:01:10"),
-    ]  # fmt: skip
+    sensors = {"box_temperature": 21.5, "humidity": 45.0, "air": 19.5, "cpu": 70.0}
+    rows = [(name, value + k / 10, k) for k in range(9) for name, value in sensors.items()]
+    rows += [("air", "unavailable", 9), ("box_temperature", -196.6, 9)]
     data = "entity_id,state,last_changed\n" + "".join(
-        f"{name},{value},2026-06-14T{time}.000Z\n" for name, value, time in rows
+        f"sensor.{name},{value},2026-06-14T10:0{k}:0{len(name) % 9}.000Z\n"
+        for name, value, k in rows
     )
     found = logged(tmp_path, data)
-    assert list(found.channels) == ["sensor.box_temperature", "sensor.air_temperature"]
-    box, air = found.channels.values()
-    assert box[np.isfinite(box)].tolist() == [21.5, 21.75]
-    assert air[np.isfinite(air)].tolist() == [19.5]
+    # a processor at 70 °C is no room in °F
+    assert list(found.channels) == ["sensor.box_temperature", "sensor.air", "sensor.cpu"]
+    for name, values in found.channels.items():
+        known = sensors[name.removeprefix("sensor.")] + np.arange(9) / 10
+        assert values[np.isfinite(values)] == pytest.approx(known)
     lacking = "2 values of 'state' without a reading ('unavailable', '-196.6'): left empty"
     assert any(lacking in note for note in found.notes)
-    with pytest.raises(DataError, match=r"no column 'sensor.air'.* are 'sensor.box_temperature'"):
-        logged(tmp_path, data, temperatures=("sensor.air",))
-    # a processor at 70 °C is no room in °F
-    data = data.partition("\n")[0] + "".join(
-        f"\nsensor.{name},{value + k / 10},2026-06-14T10:0{k}:00.000Z"
-        for name, value in (("air", 21.1), ("cpu", 70.0)) for k in range(9)
-    ) + "\n"  # fmt: skip
-    assert list(logged(tmp_path, data).channels) == ["sensor.air", "sensor.cpu"]
+    with pytest.raises(DataError, match=r"no column 'sensor.lens'.* are 'sensor.box_temperature'"):
+        logged(tmp_path, data, temperatures=("sensor.lens",))
     given = {"temperatures": ("sensor.cpu",), "names": {"sensor.cpu": "processor"}}
     assert list(logged(tmp_path, data, **given).channels) == ["processor"]
 

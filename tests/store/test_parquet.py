@@ -9,6 +9,7 @@ import pytest
 from tests.commands import call, succeed
 from tests.recordings import read_rows, write_rows
 from tests.store.small import assert_same_epochs
+from tests.store.test_bad_recordings import refused
 from thermocald.errors import RecordingError
 from thermocald.store.recording import observation_file
 from thermocald.store.recording.reader import open_recording, read_recording
@@ -107,16 +108,13 @@ def test_what_is_wrong_is_said_with_row_and_column(recording_path, column, value
     if isinstance(value, float):
         table[column] = list(map(float, table[column]))
     parquet.write_table(pyarrow.table(table), path)
-    with pytest.raises(RecordingError, match=f"row 3, column {column}: {words}"):
-        read_recording(recording_path)
+    refused(recording_path, f"row 3, column {column}: {words}")
 
 
 def test_damage_and_doubt_are_one_line(recording_path):
     path, _ = convert(recording_path)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(RecordingError, match="not readable as Parquet"):
-        read_recording(recording_path)
+    refused(recording_path, "not readable as Parquet")
     path.with_suffix(".csv").write_bytes(data)
-    with pytest.raises(RecordingError, match="keep one of them"):
-        open_recording(recording_path)
+    refused(recording_path, "keep one of them")

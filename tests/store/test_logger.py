@@ -39,7 +39,7 @@ def rows_of(row: str, celsius=CELSIUS) -> list[str]:
     ]  # fmt: skip
 
 
-def read(folder, head, row, *below, encoding="utf-8", **options):
+def read(folder, head, row, *below, encoding="utf-8-sig", **options):
     """Read a log of lines: its head, a row per moment, some below; of the photographs' time."""
     rows = row if isinstance(row, list) else rows_of(row)
     text = "\r\n".join([*head.split("\n"), *rows, *below, ""]).removeprefix("\r\n")

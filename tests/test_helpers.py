@@ -13,6 +13,7 @@ import pytest
 
 import thermocald as tc
 from thermocald.addresses import HostNames, is_loopback
+from thermocald.cli.common import printable
 from thermocald.errors import ConfigurationError, DataError, RecordingError, ThermocaldError
 from thermocald.files import (
     check_output,
@@ -152,6 +153,10 @@ def test_powers_are_raised_and_names_are_left():
     }.items():
         assert typeset_powers(text) == expected
     assert with_sd(-1e-9, 1e-6) == "(0.0 ± 1.0)·10⁻⁶"  # no negative nothing
+
+
+def test_what_a_terminal_would_obey_is_shown_as_codes():
+    assert printable("a\x1b[31mb\x9b°\nc") == "a\\x1b[31mb\\x9b°\nc"
 
 
 def scaled(factor, item):

@@ -12,7 +12,15 @@ import pytest
 
 from tests.cli.test_import import photograph
 from tests.recordings import read_rows, write_rows
-from thermocald.errors import ImageError, RecordingError, TestFieldError, ThermocaldError
+from thermocald.errors import (
+    ConfigurationError,
+    ImageError,
+    RecordingError,
+    TestFieldError,
+    ThermocaldError,
+)
+from thermocald.photogrammetry.camera_files import read_camera
+from thermocald.photogrammetry.camera_files.camera_record import number
 from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
 from thermocald.store.logger.photographs import find_copies, read_photograph
 from thermocald.store.recording import observation_file
@@ -181,6 +189,15 @@ def test_a_bad_head_is_named(recording_path, key, value, message):
     pattern = rf"\b{key}: [^,}}\n]*" + "(, )?" * (value is None)
     path.write_text(re.sub(pattern, lambda _: new, path.read_text(), count=1))
     assert "recording.yaml" in refused(recording_path, re.escape(message))
+
+
+def test_a_camera_of_ten_to_the_400_pixels_is_refused(tmp_path):
+    huge = "1" + "0" * 400
+    (tmp_path / "camera.yaml").write_text(f"width: {huge}\nheight: 480\npixel_pitch: 0.003\n")
+    with pytest.raises(ConfigurationError, match="key width"):
+        read_camera(tmp_path / "camera.yaml")
+    with pytest.raises(ConfigurationError, match="too large"):
+        number(int(huge), "fx")
 
 
 def test_a_field_in_metres_is_recognised_by_the_principal_distance(recording_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import threading
@@ -12,6 +13,7 @@ import pytest
 
 import thermocald as tc
 from thermocald.addresses import HostNames, is_loopback
+from thermocald.cli.common import printable
 from thermocald.errors import ConfigurationError, DataError, RecordingError, ThermocaldError
 from thermocald.files import (
     check_output,
@@ -26,82 +28,56 @@ from thermocald.numbers import typeset_powers, with_sd
 from thermocald.parallel import in_order
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write_text(text: str):
-        path = tmp_path / "file.yaml"
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write_text
+def read(folder, text: str, error=ConfigurationError):
+    """Read a text as a file of YAML."""
+    (folder / "file.yaml").write_text(text, encoding="utf-8")
+    return read_yaml(folder / "file.yaml", error)
 
 
-def test_a_mapping_is_read_in_its_order_also_with_anchors(write):
+def test_a_mapping_is_read_in_its_order_also_with_anchors(tmp_path):
     document = {"b": 1, "a": {"x": [1, 2.5, "ä"], "y": None}}
-    path = write(dump_yaml(document))
-    assert read_yaml(path) == document
-    assert list(read_yaml(path)) == ["b", "a"]
-    assert read_yaml(write("a: &x {k: 1}\nb: {<<: *x, l: 2}\n"))["b"] == {"k": 1, "l": 2}
-
-
-def test_a_file_s_name_that_is_no_text_is_written_so_that_it_can_be_read(write):
-    named = os.fsdecode(b"M\xe9 \xff")
-    assert read_yaml(write(dump_yaml({"series": [named]}))) == {"series": ["M\\udce9 \\udcff"]}
+    assert list(read(tmp_path, dump_yaml(document)).items()) == list(document.items())
+    assert read(tmp_path, "a: &x {k: 1}\nb: {<<: *x, l: 2}\n")["b"] == {"k": 1, "l": 2}
+    # a file's name that is no text
+    named = dump_yaml({"series": [os.fsdecode(b"M\xe9 \xff")]})
+    assert read(tmp_path, named) == {"series": ["M\\udce9 \\udcff"]}
 
 
 BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
 
 BAD = [
-    ("", "is empty"),
-    ("# only a comment\n", "is empty"),
-    ("- 1\n", "must hold `key: value` lines"),
-    ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"),
-    ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
-    ("a: 010\n", "line 1, column 4: 010 is octal in YAML"),
-    ("a: [1\n", "line 2"),
-    ("1: x\n", "key 1 must be text"),
+    ("", "is empty"), ("# only a comment\n", "is empty"), ("1: x\n", "key 1 must be text"),
+    ("- 1\n", "must hold `key: value` lines"), ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
+    ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"), ("a: [1\n", "line 2"),
+    ("a: 010\n", "line 1, column 4: 010 is octal in YAML"), ("[" * 5000, "file.yaml"),
     ("a: !!python/object:os.system x\n", "line 1, column 4: holds a tag, `!…`"),
     ("a:\n\tb: 1\n", "line 2, column 1: a line or a value begins with a tab"),
     ("a: b: c\n", "line 1, column 5: `: ` must not stand here"),
-    ("a: !!bool x\n", "no YAML"),
-    ("a: 2020-99-99\n", "no YAML"),
-    ("[" * 5000, "file.yaml"),
-    (BOMB, "aliases without end"),
-    ("a: &a [*a]\n", "aliases without end"),
+    ("a: !!bool x\n", "no YAML"), ("a: 2020-99-99\n", "no YAML"),
+    ("a: " + "[" * 5000 + "]" * 5000, "nested deeper than 60"),
+    ("\n".join(" " * i + "a:" for i in range(2000)), "nested deeper than 60"),
+    (BOMB, "aliases without end"), ("a: &a [*a]\n", "aliases without end"),
     ('a: ["x\\0y"]\n', r"'x\\x00y' holds a NUL character"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)
-def test_one_clear_error(write, text, message):
-    path = write(text)
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        read_yaml(path)
-    assert str(path) in str(caught.value)
+def test_one_clear_error_of_the_kind_that_the_caller_wants(tmp_path, text, message):
+    for kind in (ConfigurationError, RecordingError):
+        with pytest.raises(kind, match=message) as caught:
+            read(tmp_path, text, kind)
+        assert str(tmp_path / "file.yaml") in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda path: is_database(path) or tc.open(path),
-        tc.open,
-        tc.load_camera,
-        tc.read_testfield,
-        lambda path: tc.calibrate([path], path),
-        read_yaml,
-        lambda path: write_text(Path(path), ""),
-        lambda path: write_text(Path(path) / "file", ""),
-        lambda path: check_output(Path(path), "folder"),
-    ],
-)
-def test_a_path_with_nul_is_an_error_in_words(use):
-    with pytest.raises(ThermocaldError, match=r"NUL|null byte"):
-        use(Path("x\0y"))
-
-
-def test_the_caller_chooses_the_error(tmp_path):
-    with pytest.raises(RecordingError, match="No such file"):
-        read_yaml(tmp_path / "none.yaml", RecordingError)
+def test_a_path_with_nul_is_an_error_in_words():
+    assert not is_database(Path("x\0y"))
+    for use in (
+        tc.open, tc.load_camera, tc.read_testfield, lambda path: tc.calibrate([path], path),
+        read_yaml, lambda path: write_text(path, ""), lambda path: write_text(path / "file", ""),
+        lambda path: check_output(path, "folder"),
+    ):  # fmt: skip
+        with pytest.raises(ThermocaldError, match=r"NUL|null byte"):
+            use(Path("x\0y"))
 
 
 @pytest.mark.slow
@@ -112,88 +88,75 @@ def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
     path.write_bytes(texts[0].encode().ljust(131072))
 
     def write():
-        while not ended.is_set():
-            for text in texts:
-                assert overwrite_json(path, text.encode())
-                time.sleep(1e-3)
+        for text in itertools.takewhile(lambda _: not ended.is_set(), itertools.cycle(texts)):
+            assert overwrite_json(path, text.encode())
+            time.sleep(1e-3)
 
     writer = threading.Thread(target=write)
     writer.start()
-    try:
-        # on a busy machine a read may always meet the writer, which here writes far too often
-        seen = [document for _ in range(1000) if (document := read_json(path))]
-        assert all(document["a"] == document["z"] for document in seen)
-        assert len(seen) > 900
-    finally:
-        ended.set()
-        writer.join()
+    # on a busy machine a read may always meet the writer, which here writes far too often
+    seen = [document for _ in range(1000) if (document := read_json(path))]
+    ended.set()
+    writer.join()
+    assert all(document["a"] == document["z"] for document in seen)
+    assert len(seen) > 900
 
 
-@pytest.mark.parametrize("text", [None, "", "{", '{"a": 1', "[1]", "1", "\xff", '{"a": 1}{'])
-def test_a_file_that_is_no_mapping_is_none(tmp_path, text):
-    path = tmp_path / "x.json"
-    if text is not None:
-        path.write_text(text, encoding="latin-1")
-    assert read_json(path) == {}
+def test_a_file_that_is_no_mapping_is_none(tmp_path):
+    assert read_json(tmp_path / "x.json") == {}
+    for text in (b"", b"{", b'{"a": 1', b"[1]", b"1", b"\xff", b'{"a": 1}{'):
+        (tmp_path / "x.json").write_bytes(text)
+        assert read_json(tmp_path / "x.json") == {}
 
 
-OURS = [
+OURS = {
     "127.0.0.1", "127.0.0.1:8437", "127.1.2.3:80", "localhost", "LOCALHOST:8437", "localhost.",
     "localhost.:8437", "[::1]", "[::1]:8437", "[::ffff:127.0.0.1]:1", "127.0.0.1.", "127.0.0.1:",
     "192.168.1.5:8437", "Pi.Local:8437", "pi.local.", "[fe80::1]:80",
-]  # fmt: skip
-FOREIGN = [
+}  # fmt: skip
+FOREIGN = {
     "127.0.0.1.evil.com", "127.evil.com", "127.0.0.1.evil.com:8437", "localhost.evil.com", "",
     "evil.com", "evil.com:127", "127.0.0.1@evil.com", "[::1].evil.com", "[::1", "::1", ":8437",
     "[127.0.0.1]", "127.0.0.1:99999", "127.0.0.1:80:80", "127.0.0.1:8O", "2130706433", "127.1",
     "0x7f.0.0.1", "0.0.0.0", "192.168.1.50", "pi.local.evil.com", "127.0.0.1..",
     "localhost,evil.com", "127.0.0.1 evil.com", "127.0.0.1\t", "１２７.0.0.1", "[::ffff:8.8.8.8]",
     "[::1]8437",
-]  # fmt: skip
+}  # fmt: skip
+ORIGINS = {
+    True: ("http://127.0.0.1:8437", "https://localhost", "http://[::1]:1"),
+    False: ("null", "http://127.0.0.1.evil.com", "file://", "", "http://evil.com", "http://[",
+            "ftp://localhost"),
+}  # fmt: skip
+LOOPBACK = {
+    True: ("127.0.0.1", "127.9.9.9", "localhost", "::1"),
+    False: ("127.0.0.1.evil.com", "127.evil.com", "0.0.0.0", "::"),
+}
 
 
-@pytest.mark.parametrize("host", [*OURS, *FOREIGN])
-def test_a_host_name_is_ours_or_foreign(host):
+def test_host_names_and_origins_are_ours_or_foreign():
     known = HostNames("192.168.1.5", ["pi.local", "fe80::1"])
-    assert known.allow_host(host) is (host in OURS)
+    assert {host for host in OURS | FOREIGN if known.allow_host(host)} == OURS
+    for expected in (True, False):
+        for origin in ORIGINS[expected]:
+            assert HostNames("127.0.0.1").allow_origin(origin) is expected, origin
+        for host in LOOPBACK[expected]:
+            assert is_loopback(host) is expected, host
 
 
-@pytest.mark.parametrize(
-    ("origin", "allowed"),
-    [("http://127.0.0.1:8437", True), ("https://localhost", True), ("http://[::1]:1", True),
-     ("null", False), ("http://127.0.0.1.evil.com", False), ("file://", False), ("", False),
-     ("http://evil.com", False), ("http://[", False), ("ftp://localhost", False)],
-)  # fmt: skip
-def test_origins(origin, allowed):
-    assert HostNames("127.0.0.1").allow_origin(origin) is allowed
+def test_powers_are_raised_and_names_are_left():
+    for text, expected in {
+        "a_B1 = (-7.69 ± 0.33)e-7 mm-1/K, 2.0e-06": "a_B1 = (−7.69 ± 0.33)·10⁻⁷ mm⁻¹/K, 2.0·10⁻⁶",
+        "A2 = (4.9 ± 0.3)e+12 mm-4": "A2 = (4.9 ± 0.3)·10¹² mm⁻⁴",
+        "above 40.2 ± 0.3 degC; --unit degC": "above 40.2 ± 0.3 °C; --unit degC",
+        "series mm-1-b of IMG_1e5.jpg at 10 mm": "series mm-1-b of IMG_1e5.jpg at 10 mm",
+        "(see M1)e-7, 0x1e5, 1e5b": "(see M1)e-7, 0x1e5, 1e5b",
+    }.items():
+        assert typeset_powers(text) == expected
+    assert with_sd(-1e-9, 1e-6) == "(0.0 ± 1.0)·10⁻⁶"  # no negative nothing
 
 
-@pytest.mark.parametrize(
-    ("host", "loopback"),
-    [("127.0.0.1", True), ("127.9.9.9", True), ("localhost", True), ("::1", True),
-     ("127.0.0.1.evil.com", False), ("127.evil.com", False), ("0.0.0.0", False), ("::", False)],
-)  # fmt: skip
-def test_what_reaches_this_machine_alone(host, loopback):
-    assert is_loopback(host) is loopback
-
-
-@pytest.mark.parametrize(
-    ("text", "set_"),
-    [
-        ("a_B1 = (-7.69 ± 0.33)e-7 mm-1/K, 2.0e-06", "a_B1 = (−7.69 ± 0.33)·10⁻⁷ mm⁻¹/K, 2.0·10⁻⁶"),
-        ("A2 = (4.9 ± 0.3)e+12 mm-4", "A2 = (4.9 ± 0.3)·10¹² mm⁻⁴"),
-        ("above 40.2 ± 0.3 degC; --unit degC", "above 40.2 ± 0.3 °C; --unit degC"),
-        ("series mm-1-b of IMG_1e5.jpg at 10 mm", "series mm-1-b of IMG_1e5.jpg at 10 mm"),
-        ("(see M1)e-7, 0x1e5, 1e5b", "(see M1)e-7, 0x1e5, 1e5b"),
-    ],
-)  # fmt: skip
-def test_powers_are_raised_and_names_are_left(text, set_):
-    assert typeset_powers(text) == set_
-    assert with_sd(-7.49e-7, 0.47e-7, "mm-1/K") == "(−7.49 ± 0.47)·10⁻⁷ mm⁻¹/K"
-
-
-def test_nothing_is_no_negative_nothing():
-    assert with_sd(-1e-9, 1e-6) == "(0.0 ± 1.0)·10⁻⁶"
+def test_what_a_terminal_would_obey_is_shown_as_codes():
+    assert printable("a\x1b[31mb\x9b°\nc") == "a\\x1b[31mb\\x9b°\nc"
 
 
 def scaled(factor, item):

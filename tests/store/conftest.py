@@ -115,21 +115,3 @@ def filled(store_path: Path, small_store: Path):
     shutil.copy(small_store, store_path)
     with Store.open(store_path, "append", durable=False) as opened:
         yield opened, opened.find_series()
-
-
-@pytest.fixture
-def killed(store: Store, series: StoredSeries, make_epoch, make_result, tmp_path: Path):
-    """(n, last) → the files of a killed writer: n epochs in the store, the others in its -wal."""
-
-    def make(moved: int, last: int) -> Path:
-        folder = tmp_path / "killed"
-        folder.mkdir()
-        for i in range(1, last + 1):
-            if i == moved + 1:
-                store.checkpoint()
-            store.append(series, make_epoch(i), make_result(i))
-        for name in (store.path.name, f"{store.path.name}-wal"):
-            shutil.copy(store.path.with_name(name), folder / name)
-        return folder / store.path.name
-
-    return make

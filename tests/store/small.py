@@ -29,6 +29,21 @@ def write_recording(path, head, testfield, epochs) -> None:
             writer.append(epoch)
 
 
+def assert_same_epochs(some, others, rtol: float = 1e-5) -> None:
+    """Check epochs and their observations, whatever the order of targets; rtol: of sigmas."""
+    for a, b in zip(some, others, strict=True):
+        assert (a.number, a.temperatures.keys()) == (b.number, b.temperatures.keys())
+        times = [[e.frame_time, e.temperature_time, *e.temperatures.values()] for e in (a, b)]
+        np.testing.assert_allclose(*times, rtol=0, atol=1e-6)
+        x, y = (e.observations.select(np.argsort(e.observations.targets)) for e in (a, b))
+        np.testing.assert_array_equal(x.targets, y.targets)
+        np.testing.assert_array_equal(x.points, y.points)
+        np.testing.assert_allclose(x.sigmas, y.sigmas, rtol=rtol)
+        assert x.quality.keys() == y.quality.keys()
+        for name in x.quality:
+            np.testing.assert_array_equal(x.quality[name], y.quality[name])
+
+
 def small_epoch(number: int, begin_s: float = 1e9, interval_s: float = 1.0) -> Epoch:
     time_s = begin_s + interval_s * number
     return Epoch(number, time_s, time_s, {"t": 20.0})

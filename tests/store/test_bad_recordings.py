@@ -3,215 +3,270 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 
+import cv2
+import numpy as np
 import pytest
 
-from thermocald.errors import RecordingError, TestFieldError, ThermocaldError
-from thermocald.store.recording.reader import read_recording
+from tests.cli.test_import import photograph
+from tests.recordings import read_rows, write_rows
+from thermocald.errors import (
+    ConfigurationError,
+    ImageError,
+    RecordingError,
+    TestFieldError,
+    ThermocaldError,
+)
+from thermocald.photogrammetry.camera_files import read_camera
+from thermocald.photogrammetry.camera_files.camera_record import number
+from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
+from thermocald.store.logger.photographs import find_copies, read_photograph
+from thermocald.store.recording import observation_file
+from thermocald.store.recording.reader import open_recording, read_recording
 from thermocald.store.recording.testfield_file import read_testfield
 
 
-def edit(path, old: str, new: str) -> None:
-    text, replaced = re.subn(old, new, path.read_text(), count=1)
-    assert replaced
-    path.write_text(text)
-
-
 def set_field(path, line: int, column: str, value: str) -> None:
-    lines = path.read_text().split("\n")
-    names = lines[0].split(",")
-    fields = lines[line - 1].split(",")
-    fields[names.index(column)] = value
-    lines[line - 1] = ",".join(fields)
-    path.write_text("\n".join(lines))
+    rows = read_rows(path)
+    rows[line - 2][column] = value
+    write_rows(path, rows)
 
 
-# file, line, column, value, part of the message
-CELLS = [
-    ("observations.csv", 5, "x", "NaN", "not a finite number"),
-    ("observations.csv", 7, "x", "12,5", None),
-    ("observations.csv", 7, "x", "abc", "'abc' is not a number"),
-    ("observations.csv", 7, "x", "", "is empty"),
-    ("observations.csv", 9, "sx", "0", "above 0 px"),
-    ("observations.csv", 4, "target", "t999", "'t999' is not in testfield.csv"),
-    ("observations.csv", 3, "target", "t0", "'t0' is duplicated in epoch 1"),
-    ("observations.csv", 6, "epoch", "77", "epoch 77 is not in epochs.csv"),
-    ("observations.csv", 6, "epoch", "1.5", "not an integer"),
-    ("epochs.csv", 3, "frame_time", "1599999999.0", "runs backwards"),
-    ("epochs.csv", 3, "temperature_time", "1599999999.0", "runs backwards"),
-    ("epochs.csv", 4, "frame_time", "2020-09-13 12:26", "write seconds since 1970"),
-    ("epochs.csv", 4, "frame_time", '"1600000020,5"', "write decimals with a point"),
-    ("epochs.csv", 4, "temperature", "NaN", "leave the field empty"),
-    ("epochs.csv", 4, "temperature", "warm", "'warm' is not a number; leave the field empty"),
-    ("epochs.csv", 4, "temperature", "-300", "below absolute zero"),
-    ("epochs.csv", 4, "temperature", "1e300", "above 1000 °C"),
-    ("epochs.csv", 4, "temperature", "2_5.0", "'2_5.0' is not a number"),
-    ("epochs.csv", 4, "temperature", "٢٥", "'٢٥' is not a number"),
-    ("observations.csv", 7, "x", "1_2.5", "'1_2.5' is not a number"),
-    ("epochs.csv", 4, "temperature_time", "", "empty although temperature was read"),
-    ("epochs.csv", 3, "epoch", "1", "is duplicated or after a later one"),
-    ("epochs.csv", 3, "frame", "frames/gone.png", "is missing"),
-    ("testfield.csv", 3, "target", "t0", "'t0' is duplicated"),
-    ("testfield.csv", 3, "target", "", "every target needs a name"),
-    ("testfield.csv", 3, "sX", "-1", "must not be negative"),
-    ("testfield.csv", 4, "diameter", "0", "above 0 mm"),
-    # numbers that nothing measures
-    *(("observations.csv", 5, column, value, "px is on no image")
-      for column, value in (("x", "1e308"), ("y", "-1e308"), ("x", "1e7"))),
-    *(("observations.csv", 5, column, value, "px is impossible")
-      for column, value in (("sx", "1e-300"), ("sy", "1e300"), ("sx", "5e-324"), ("sy", "1e-9"))),
-    *(("testfield.csv", 13, column, value, "must be between 1e-09 and 10000 mm")
-      for column, value in (("sX", "1e-300"), ("sX", "2e7"), ("sZ", "5e-324"))),
-    *(("testfield.csv", 13, column, value, "must be within 1e+09 mm")
-      for column, value in (("X", "1e308"), ("diameter", "1e300"))),
-    *(("epochs.csv", 6, column, value, "Write seconds since 1970")
-      for column, value in (("frame_time", "1e300"), ("frame_time", "1e11"))),
-    ("epochs.csv", 6, "frame_time", "1.6e12", "are they ms?"),
-    ("epochs.csv", 6, "temperature_time", "1.6e15", "are they µs?"),
-    ("epochs.csv", 6, "frame_time", "1.6e18", "are they ns?"),
-]  # fmt: skip
+def refused(path, message: str) -> str:
+    """Check that a recording is refused in one line, which holds a pattern; return the line."""
+    with pytest.raises((RecordingError, TestFieldError), match=message) as caught:
+        list(open_recording(path).iter_epochs())
+    assert "\x1b" not in str(caught.value)
+    return str(caught.value)
 
 
-@pytest.mark.parametrize(("file", "line", "column", "value", "message"), CELLS)
-def test_a_bad_cell_is_named(recording_path, file, line, column, value, message):
-    set_field(recording_path / file, line, column, value)
-    with pytest.raises((RecordingError, TestFieldError)) as caught:
-        read_recording(recording_path)
-    text = str(caught.value)
-    assert f"{file}, line {line}" in text
-    if message is None:
-        assert "has 7 fields instead of 6" in text
-    else:
-        assert f"column {column}: " in text
-        assert message in text
-
-
-def in_metres(path) -> None:
-    header, *rows = path.read_text().splitlines()
-    cells = [row.split(",") for row in rows]
-    metres = [[name, *(n and str(float(n) / 1000) for n in rest)] for name, *rest in cells]
-    path.write_text("\n".join([header, *map(",".join, metres)]) + "\n")
-
-
-def in_every_row(column: str, value: str):
-    return lambda path: [set_field(path, line, column, value) for line in range(2, 7)]
-
-
-def without_its_end(path) -> None:
-    path.write_text(path.read_text().rpartition(",")[0])
-
-
-# a file, its damage, part of the message
-FILES = {
-    "kelvin": ("epochs.csv", in_every_row("temperature", "294.5"), r"kelvin: subtract 273\.15"),
-    "kelvin in every reading": (
-        "readings.csv", lambda path: path.write_text(
-            "time,temperature,board_temperature\n1600000000,20,294.5\n1600000001,20,294.6\n"),
-        r"line 2, column board_temperature: seems to be in kelvin"),
-    "one time": (
-        "epochs.csv", in_every_row("frame_time", "1600000000"), "all epochs have the same time"),
-    "semicolons": (
-        "epochs.csv", lambda path: path.write_text(path.read_text().replace(",", ";")),
-        "separate the columns with commas"),
-    "tabs": (
-        "testfield.csv", lambda path: path.write_text(path.read_text().replace(",", "\t")),
-        "separate the columns with commas"),
-    "UTF-16": (
-        "testfield.csv", lambda path: path.write_text(path.read_text(), "utf-16"),
-        "testfield.csv: is not text in UTF-8; save it as CSV in UTF-8"),
-    "another case": (
-        "testfield.csv", lambda path: edit(path, "X,Y,Z", "x,y,z"), "is 'x' meant"),
-    "a unit": ("observations.csv", lambda path: edit(path, ",x,", ",x [px],"), "Write x, without"),
-    "half a last line": (
-        "observations.csv", without_its_end,
-        "line 61: has 5 fields instead of 6; is the file cut"),
-    "metres": ("testfield.csv", in_metres, "metres times 1000"),
-    "nothing": ("observations.csv", lambda path: path.unlink(), "nothing to calibrate from"),
-    **{f"no {column}": (
-        file, lambda path, column=column: edit(path, column, f"other_{column}"),
-        rf"{file}, line 1: column {column} is missing")
-       for file, column in (("epochs.csv", "board_temperature"), ("epochs.csv", "frame_time"),
-                            ("observations.csv", "sx"), ("testfield.csv", "sZ"))},
-    **{f"no {file}": (file, lambda path: path.unlink(), file)
-       for file in ("recording.yaml", "epochs.csv", "testfield.csv")},
+# a column, its value in line 4, part of the message
+CELLS = {
+    "observations.csv": [
+        ("x", "NaN", "not a finite number"), ("x", "abc", "'abc' is not a number"),
+        ("x", "", "is empty"), ("x", "1_2.5", "'1_2.5' is not a number"),
+        ("x", "1e7", "px is on no image"), ("y", "-1e308", "px is on no image"),
+        ("sx", "0", "above 0 px"), ("sx", "5e-324", "impossible"), ("sy", "1e300", "impossible"),
+        ("target", "t999", "'t999' is not in testfield.csv"),
+        ("target", "t0", "'t0' is duplicated in epoch 1"),
+        ("epoch", "77", "epoch 77 is not in epochs.csv"), ("epoch", "1.5", "not an integer"),
+    ],
+    "epochs.csv": [
+        ("frame_time", "1599999999.0", "runs backwards"), ("epoch", "1", "is duplicated or after"),
+        ("temperature_time", "1599999999.0", "runs backwards"),
+        ("frame_time", "2020-09-13 12:26", "write seconds since 1970"),
+        ("frame_time", "1600000020,5", "write decimals with a point"),
+        ("frame_time", "1e300", "Write seconds since 1970"), ("frame_time", "1.6e12", "they ms?"),
+        ("temperature_time", "1.6e15", "they µs?"), ("frame_time", "1.6e18", "they ns?"),
+        ("temperature", "NaN", "leave the field empty"), ("temperature", "1e300", "above 1000 °C"),
+        ("temperature", "warm", "'warm' is not a number; leave the field empty"),
+        ("temperature", "٢٥", "'٢٥' is not a number"), ("temperature", "-300", "absolute zero"),
+        ("temperature_time", "", "empty although temperature was read"),
+        ("frame", "frames/gone.png", "is missing"),
+    ],
+    "testfield.csv": [
+        ("target", "t0", "'t0' is duplicated"), ("target", "", "every target needs a name"),
+        ("sX", "-1", "must not be negative"), ("diameter", "0", "above 0 mm"),
+        ("sX", "2e7", "must be between 1e-09 and 10000"), ("sZ", "5e-324", "between 1e-09 and"),
+        ("X", "1e308", "must be within 1e+09 mm"), ("diameter", "1e300", "must be within 1e+09"),
+        ("target", "t1\x1b[2J", "printable"),
+    ],
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", FILES)
-def test_what_is_wrong_with_a_file_is_explained(recording_path, case):
-    file, damage, message = FILES[case]
-    damage(recording_path / file)
-    with pytest.raises((RecordingError, TestFieldError), match=message):
-        read_recording(recording_path)
+@pytest.mark.parametrize("long", [False, True])
+@pytest.mark.parametrize("file", CELLS)
+def test_a_bad_cell_is_named(recording_path, file, long, tmp_path, monkeypatch):
+    """Of a long text, an error found in its binary copy names the line of the text."""
+    if long:
+        monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    whole = (recording_path / file).read_text()
+    for column, value, message in CELLS[file]:
+        set_field(recording_path / file, 4, column, value)
+        where = f"{file}, line 4, column {column}: "
+        refused(recording_path, f"{where}.*{re.escape(message)}")
+        (recording_path / file).write_text(whole)
+
+
+def put(old: str, new: str):
+    """Return what replaces a pattern in a text."""
+    return lambda text: re.sub(old, new, text)
+
+
+def field(scale: float) -> str:
+    """Return a wall of 44 × 2 units of `scale` mm as a test field."""
+    rows = [f"t{i},{4 * scale * i},{scale * (i % 3)},1,,0,0,0\n" for i in range(12)]
+    return "target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(rows)
+
+
+KELVIN = "time,temperature,board_temperature\n1600000000,20,294.5\n1600000001,20,294.6\n"
+# the damage to a file's text, part of the message
+DAMAGES = {
+    "epochs.csv": [
+        (put(r"(?m)^(\d,[\d.]+,[\d.]+),[\d.]+", r"\1,294.5"), r"kelvin: subtract 273\.15"),
+        (put(r"(?m)^(\d),[\d.]+", r"\1,1600000000"), "all epochs have the same time"),
+        (put(",", ";"), "separate the columns with commas"),
+    ],
+    "testfield.csv": [
+        (put(",", "\t"), "separate the columns with commas"),
+        (lambda text: text.encode("utf-16"), "is not text in UTF-8; save it as CSV in UTF-8"),
+        (put("X,Y,Z", "x,y,z"), "is 'x' meant"),
+        (lambda _: field(0.001), "metres times 1000"),
+        (lambda _: "target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
+            f"{i},{i % 500},{i // 500},0,1,0.1,0.1,0.1\n" for i in range(20_000)),
+         "more than 4000 targets"),
+        # lines are counted past quoted line ends and blank lines
+        (put(r"t0(.*\n)(.*\n)t2,[-\d.]+", r'"first\ntarget"\1\n\2t2,nan'), "line 6, column X"),
+    ],
+    "observations.csv": [
+        (put(",x,", ",x [px],"), "Write x, without"), (put("t5", '"t5'), "line .*is not readable"),
+        (lambda text: text.rpartition(",")[0], "61: has 5 fields instead of 6; is the file cut"),
+        (put("(?m)^(1,t1,[^,]*),", r"\1,5,"), "line 3.*has 7 fields instead of 6"),
+        (lambda _: ",".join(map(str, range(20_000))) + "\n1\n", "20000 columns; at most 1000"),
+        (lambda _: "a" * 300_000 + "\n1\n", "longer than"),
+    ],
+    "readings.csv": [(lambda _: KELVIN, "line 2, column board_temperature: seems to be in kelvin")],
+}  # fmt: skip
+MISSING = {
+    "epochs.csv": ("board_temperature", "frame_time"), "observations.csv": ("sx",),
+    "testfield.csv": ("sZ",), "recording.yaml": (),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "message"),
+    [(file, *damage) for file, damages in DAMAGES.items() for damage in damages],
+)
+def test_what_is_wrong_with_a_file_is_explained(recording_path, file, damage, message):
+    path = recording_path / file
+    damaged = damage(path.read_text() if path.exists() else "")
+    path.write_bytes(damaged if isinstance(damaged, bytes) else damaged.encode())
+    refused(recording_path, message)
+
+
+@pytest.mark.parametrize("file", MISSING)
+def test_files_that_are_none(recording_path, file):
+    path = recording_path / file
+    for column in MISSING[file]:
+        whole = path.read_text()
+        path.write_text(whole.replace(column, f"other_{column}"))
+        refused(recording_path, rf"{file}, line 1: column {column} is missing")
+        path.write_text(whole)
+    for content in (b"", b"\x00" * 64, b"\xff\xfe\x00garbage", b'"never closed\n'):
+        path.write_bytes(content)
+        refused(recording_path, file)
+    path.unlink()
+    refused(recording_path, rf"{file}(: | is missing)|nothing to calibrate from")
+    path.symlink_to("/dev/zero")
+    refused(recording_path, r"is not a file|is missing")
+
+
+# a key of recording.yaml, its value (None: without the key), part of the message
+HEADS = [
+    ("format", "thermocald-recording/9", "format: is 'thermocald-recording/9'"),
+    ("format", None, "format: is missing"), ("interval", "-1", "it must be above 0"),
+    ("interval", "soon", "'soon' is not a finite number"),
+    ("interval", "1.0e-300", "interval: is 1e-300 s; it must be at least"),
+    ("interval", "1.0e+300", "interval: is 1e+300 s; it is at most"),
+    ("width", "0", "camera.width: is 0 px"), ("width", "12.5", "whole number"),
+    ("width", "1" + "0" * 400, "camera.width"), ("width", None, "camera.width: is missing"),
+    ("pixel_pitch", "1.12", "thousandths of a mm"), ("unit", "degF", "must be in degC"),
+    ("pixel_pitch", "1.0e-300", "key camera.pixel_pitch"), ("principal_distance", "-3", "above 0"),
+    ("principal_distance", "1.0e+300", "it is at most"),
+    ("resolution", "fine", "temperatures.temperature.resolution"),
+    ("resolution", "1.0e-300", "it must be at least"), ("name", "[small]", "name: must be text"),
+    ("name", r'"x\e[2J"', "printable"), ("name", "small\nname: other", "is duplicated"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("key", "value", "message"), HEADS)
+def test_a_bad_head_is_named(recording_path, key, value, message):
+    path = recording_path / "recording.yaml"
+    new = "" if value is None else f"{key}: {value}"
+    pattern = rf"\b{key}: [^,}}\n]*" + "(, )?" * (value is None)
+    path.write_text(re.sub(pattern, lambda _: new, path.read_text(), count=1))
+    assert "recording.yaml" in refused(recording_path, re.escape(message))
+
+
+def test_a_camera_of_ten_to_the_400_pixels_is_refused(tmp_path):
+    huge = "1" + "0" * 400
+    (tmp_path / "camera.yaml").write_text(f"width: {huge}\nheight: 480\npixel_pitch: 0.003\n")
+    with pytest.raises(ConfigurationError, match="key width"):
+        read_camera(tmp_path / "camera.yaml")
+    with pytest.raises(ConfigurationError, match="too large"):
+        number(int(huge), "fx")
+
+
+def test_a_field_in_metres_is_recognised_by_the_principal_distance(recording_path):
+    """A hall of 48 m in metres is 48 "mm": too near for a lens of 12 mm."""
+    (recording_path / "testfield.csv").write_text(field(1.0))
+    read_testfield(recording_path / "testfield.csv")
+    head = recording_path / "recording.yaml"
+    head.write_text(head.read_text().replace("distance: 3.04", "distance: 12.7"))
+    refused(recording_path, "metres times 1000")
+    refused(recording_path / "epochs.csv", "is not a folder")
+
+
+GARBAGE = [
+    "", "nan", "inf", "-1", "1e999", "0x10", "1_000", "t0", '"', "1", "2.5", "\x00", "²", "a,b\n",
+    "!!bool x", '!!int ""', "2020-99-99", "!!timestamp x", "*a", "&a [*a]", "{", "~", ": ", "\n",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "file", ["recording.yaml", "epochs.csv", "testfield.csv", "observations.csv"]
 )
-@pytest.mark.parametrize("content", [b"", b"\x00" * 64, b"\xff\xfe\x00garbage", b'"never closed\n'])
-def test_files_that_are_none(recording_path, file, content):
-    (recording_path / file).write_bytes(content)
-    with pytest.raises(ThermocaldError, match=file):
-        read_recording(recording_path)
+def test_garbage_within_a_good_file_is_one_error_that_names_it(recording_path, file):
+    """The error of a damaged table may be in one that refers to it."""
+    rng = np.random.default_rng(len(file))
+    whole = (recording_path / file).read_bytes()
+    for put in [*(word.encode() for word in GARBAGE), *(rng.bytes(9) for _ in range(15))] * 2:
+        at, gone = int(rng.integers(len(whole))), int(rng.integers(40))
+        (recording_path / file).write_bytes(whole[:at] + put + whole[at + gone :])
+        message = file
+        try:
+            read_recording(recording_path)
+        except ThermocaldError as error:
+            message = str(error)
+        assert any(path.name in message for path in recording_path.iterdir())
+        assert "\n" not in message
 
 
-def test_lines_are_counted_past_quoted_line_ends_and_blank_lines(recording_path):
-    path = recording_path / "testfield.csv"
-    header, *rows = path.read_text().splitlines()
-    rows[0] = '"first\ntarget"' + rows[0][rows[0].index(",") :]
-    rows[3] = rows[3].replace(rows[3].split(",")[1], "nan")
-    path.write_text("\n".join([header, rows[0], "", *rows[1:]]) + "\n")
-    with pytest.raises(TestFieldError, match="line 7, column X"):  # 1 + 2 + 1 + 3
-        read_testfield(path)
+def test_an_image_too_large_is_refused_before_it_is_decoded(monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", None)
+    png = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
+    head = b"IHDR" + struct.pack(">II", 30000, 30000) + png[24:29]
+    with pytest.raises(ImageError, match="30000 × 30000 px"):
+        decode_grey(png[:12] + head + struct.pack(">I", zlib.crc32(head)) + png[33:])
 
 
-HEADS = [
-    ("format: .*", "format: thermocald-recording/9", "format: is 'thermocald-recording/9'"),
-    ("format: .*", "other: 1", "format: is missing"),
-    ("interval: .*", "interval: soon", "'soon' is not a finite number"),
-    ("interval: .*", "interval: -1", "it must be above 0"),
-    ("width: 3280", "width: 0", "camera.width: is 0 px"),
-    ("width: 3280", "width: 12.5", "whole number"),
-    ("width: 3280, ", "", "camera.width: is missing"),
-    ("pixel_pitch: 0.00112", "pixel_pitch: 1.12", "thousandths of a mm"),
-    ("principal_distance: 3.04", "principal_distance: -3", "above 0"),
-    ("unit: degC", "unit: degF", "must be in degC"),
-    ("resolution: 0.0625", "resolution: fine", "temperatures.temperature.resolution"),
-    ("name: small", "name: [small]", "name: must be text"),
-    ("name: small", "name: small\nname: other", "is duplicated"),
-    ("name: small", "name: !!bool x", "no YAML"),
-    ("name: small", "name: [small", "recording.yaml, line"),
-    ("interval: 10.0", "interval: 1.0e-300", "interval: is 1e-300 s; it must be at least"),
-    ("interval: 10.0", "interval: 1.0e+300", "interval: is 1e+300 s; it is at most"),
-    ("pixel_pitch: 0.00112", "pixel_pitch: 1.0e-300", "key camera.pixel_pitch"),
-    ("principal_distance: 3.04", "principal_distance: 1.0e+300", "it is at most"),
-    ("principal_distance: 3.04", "principal_distance: 1.0e-300", "it must be at least"),
-    ("resolution: 0.0625", "resolution: 1.0e-300", "it must be at least"),
-]
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".bmp", ".pgm"])
+def test_sizes_are_read_from_heads(suffix):
+    data = cv2.imencode(suffix, np.zeros((37, 53), np.uint8))[1].tobytes()
+    assert image_size(data) == (53, 37)
+    for cut in range(0, 40, 3):
+        image_size(data[:cut])  # damage is no error here
 
 
-@pytest.mark.parametrize(("old", "new", "message"), HEADS)
-def test_a_bad_head_is_named(recording_path, old, new, message):
-    path = recording_path / "recording.yaml"
-    edit(path, old, new)
-    with pytest.raises(RecordingError, match=re.escape(message)) as caught:
-        read_recording(recording_path)
-    assert "recording.yaml" in str(caught.value)
+def test_damaged_exif_is_no_warning(tmp_path):
+    """Warnings are errors here."""
+    photograph(tmp_path / "p.jpg", "2026:06:14 12:00:01", "250", "+02:00")
+    whole = (tmp_path / "p.jpg").read_bytes()
+    at, refused = whole.index(b"Exif"), 0
+    for cut in range(at + 10, at + 120, 5):
+        (tmp_path / "p.jpg").write_bytes(whole[:cut] + bytes(4) + whole[cut + 4 :])
+        try:
+            read_photograph(tmp_path / "p.jpg")
+        except ThermocaldError:
+            refused += 1
+    assert refused
 
 
-def test_a_field_in_metres_is_recognised_by_the_principal_distance(recording_path):
-    """A hall of 48 m in metres is 48 "mm": too near for a lens of 12 mm."""
-    field = recording_path / "testfield.csv"
-    field.write_text(
-        "target,X,Y,Z,diameter,sX,sY,sZ\n"
-        + "".join(f"t{i},{4 * i},{i % 3},1,,0,0,0\n" for i in range(12))
-    )
-    read_testfield(field)
-    edit(recording_path / "recording.yaml", "distance: 3.04", "distance: 12.7")
-    with pytest.raises(TestFieldError, match="metres times 1000"):
-        read_recording(recording_path)
-
-
-def test_a_file_instead_of_a_folder(recording_path):
-    with pytest.raises(RecordingError, match="is not a folder"):
-        read_recording(recording_path / "epochs.csv")
+def test_a_file_that_cannot_be_read_hides_no_copy(tmp_path):
+    paths = [tmp_path / name for name in ("a.jpg", "gone.jpg", "c.jpg")]
+    for path in paths[::2]:
+        path.write_bytes(b"the same")
+    assert find_copies(paths) == {2: 0}

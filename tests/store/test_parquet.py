@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
 import pytest
 
 from tests.commands import call, succeed
+from tests.recordings import read_rows, write_rows
+from tests.store.small import assert_same_epochs
+from tests.store.test_bad_recordings import refused
 from thermocald.errors import RecordingError
 from thermocald.store.recording import observation_file
 from thermocald.store.recording.reader import open_recording, read_recording
@@ -17,39 +19,32 @@ pyarrow = pytest.importorskip("pyarrow", reason="pip install thermocald[parquet]
 parquet = pytest.importorskip("pyarrow.parquet")
 
 
-def convert(path, to):
+def convert(path, to="parquet"):
+    """Convert a recording; return the file and the epochs before."""
+    before = read_recording(path).epochs
     succeed("convert", path, "--to", to)
+    return path / f"observations.{to}", before
 
 
-def same(a, b):
-    for one, other in zip(a.epochs, b.epochs, strict=True):
-        x, y = one.observations, other.observations
-        assert np.array_equal(x.targets, y.targets)
-        assert np.array_equal(x.points, y.points)
-        assert np.array_equal(x.sigmas, y.sigmas)
-        assert set(x.quality) == set(y.quality)
-        for name in x.quality:
-            assert np.array_equal(x.quality[name], y.quality[name], equal_nan=True)
+def check(path, epochs) -> None:
+    assert_same_epochs(read_recording(path).epochs, epochs, rtol=0)
 
 
 def test_there_and_back_are_the_same_numbers(recording_path):
     """With more digits than ours, a column with gaps and one of text."""
     csv = recording_path / "observations.csv"
-    lines = csv.read_text().splitlines()
-    cells = lines[1].split(",")
-    cells[2] = "1234.567890123456"
-    lines[0] += ",blur,comment"
-    lines[1] = ",".join(cells)
-    rows = [f"{line},{'' if i % 2 else 0.1 + i},word {i}" for i, line in enumerate(lines[1:])]
-    csv.write_text("\n".join([lines[0], *rows]) + "\n")
-    before = read_recording(recording_path)
-    convert(recording_path, "parquet")
+    rows = read_rows(csv)
+    rows[0]["x"] = "1234.567890123456"
+    for i, row in enumerate(rows):
+        row |= {"blur": "" if i % 2 else f"{0.1 + i}", "comment": f"word {i}"}
+    write_rows(csv, rows)
+    _, before = convert(recording_path)
     assert not csv.exists()
-    same(before, read_recording(recording_path))
+    check(recording_path, before)
     streamed = list(open_recording(recording_path)._observation_file.stream(slice(0, 5)))
-    assert [len(s) for s in streamed] == [len(e.observations) for e in before.epochs]
+    assert [len(s) for s in streamed] == [len(e.observations) for e in before]
     convert(recording_path, "csv")
-    same(before, read_recording(recording_path))
+    check(recording_path, before)
     assert "word 3" in csv.read_text()
 
 
@@ -57,8 +52,7 @@ def test_there_and_back_are_the_same_numbers(recording_path):
 def test_a_long_text_is_converted_in_less_time_than_our_parser_takes(recording_path):
     """Regression: each number and word was made an object, 3.5 times the time."""
     for to in ("parquet", "csv"):
-        convert(recording_path, to)  # with its imports
-    csv = recording_path / "observations.csv"
+        csv, _ = convert(recording_path, to)  # with its imports
     head, *rows = csv.read_text().splitlines()
     csv.write_text("\n".join([head, *rows * 10000]))
     begin = time.process_time()
@@ -66,83 +60,61 @@ def test_a_long_text_is_converted_in_less_time_than_our_parser_takes(recording_p
         for name in ("x", "y", "sx", "sy"):
             chunk.numbers(name)
     read = time.process_time()
-    convert(recording_path, "parquet")
+    succeed("convert", recording_path, "--to", "parquet")
     assert time.process_time() - read < 0.7 * (read - begin)  # 0.2 to 0.3; was 1.2
 
 
 @pytest.mark.parametrize("kind", ["uint8", "uint32", "int16"])
 def test_names_of_targets_may_be_categories(recording_path, kind):
     """Polars writes a dictionary with unsigned indices, pandas one with signed ones."""
-    before = read_recording(recording_path)
-    convert(recording_path, "parquet")
-    path = recording_path / "observations.parquet"
+    path, before = convert(recording_path)
     table = parquet.read_table(path)
     names = table["target"].combine_chunks().dictionary_encode()
     codes = pyarrow.DictionaryArray.from_arrays(names.indices.cast(kind), names.dictionary)
     place = table.schema.get_field_index("target")
     parquet.write_table(table.set_column(place, "target", codes), path)
-    same(before, read_recording(recording_path))
+    check(recording_path, before)
 
 
 def test_text_that_cannot_be_read_is_not_converted(recording_path, monkeypatch):
     csv = recording_path / "observations.csv"
-    head, first, *rest = csv.read_text().splitlines()
-    cells = first.split(",")
-    text = "\n".join([head, ",".join([*cells[:2], '"1,5"', *cells[3:]]), *rest])
-    csv.write_text(text)
-    done = call("convert", recording_path, "--to", "parquet")
-    assert "line 2, column x: '1,5' is not a number; write decimals with a point" in done.stderr
-    assert (done.returncode, csv.read_text()) == (1, text)
+    whole, rows = csv.read_text(), read_rows(csv)
+    write_rows(csv, [*rows[:-1], {**rows[-1], "x": "1,5"}])
+    said = f"line {len(rows) + 1}, column x: '1,5' is not a number; write decimals with a point"
+    for wrong, words in ((csv.read_text(), said), (whole[:22] + "\n", "holds no observations")):
+        csv.write_text(wrong)
+        done = call("convert", recording_path, "--to", "parquet")
+        assert (words in done.stderr, done.returncode, csv.read_text()) == (True, 1, wrong)
     # rows that are read again are not counted twice
+    write_rows(csv, [*rows[:-1], {**rows[-1], "x": "1,5"}])
     monkeypatch.setattr(observation_file, "_TEXT_BLOCK", 2000)
     steps: list[int] = []
-    wrong = ",".join([*cells[:2], '"1,5"', *cells[3:]])
-    csv.write_text("\n".join([head, first, *rest, wrong]))
-    with pytest.raises(RecordingError, match=f"line {len(rest) + 3}, column x"):
+    with pytest.raises(RecordingError, match=said.partition(":")[0]):
         observation_file.csv_to_parquet(csv, csv.with_suffix(".parquet"), steps.append)
-    assert len(steps) > 1
-    assert sum(steps) == 0
-    csv.write_text(f"{head}\n")
-    assert "holds no observations" in call("convert", recording_path, "--to", "parquet").stderr
-    csv.write_text("\n".join(["", head, first, *rest]))
-    before = read_recording(recording_path)
-    convert(recording_path, "parquet")
-    same(before, read_recording(recording_path))
+    assert (len(steps) > 1, sum(steps)) == (True, 0)
+    csv.write_text("\n" + whole)  # a blank line above
+    check(recording_path, convert(recording_path)[1])
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "words"),
-    [
-        ("x", float("inf"), "row 3, column x: inf is not a finite number"),
-        ("sx", -1.0, "row 3, column sx: a standard deviation must be above 0"),
-        ("target", "nobody", "row 3, column target: target 'nobody'"),
-        ("epoch", 77, "row 3, column epoch: epoch 77"),
-        ("y", None, "row 3, column y: is empty"),
-        ("epoch", 1.5, "row 3, column epoch: '1.5' is not an integer"),
-        ("epoch", -1, "row 3, column epoch: '-1' is not an integer"),
-    ],
-)
+@pytest.mark.parametrize(("column", "value", "words"), [
+    ("x", float("inf"), "inf is not a finite number"), ("y", None, "is empty"),
+    ("sx", -1.0, "a standard deviation must be above 0"), ("target", "nobody", "target 'nobody'"),
+    ("epoch", 77, "epoch 77"), ("epoch", 1.5, "'1.5' is not"), ("epoch", -1, "'-1' is not an int"),
+])  # fmt: skip
 def test_what_is_wrong_is_said_with_row_and_column(recording_path, column, value, words):
-    convert(recording_path, "parquet")
-    path = recording_path / "observations.parquet"
+    path, _ = convert(recording_path)
     table = parquet.read_table(path).to_pydict()
     table[column][2] = value
     if isinstance(value, float):
         table[column] = list(map(float, table[column]))
     parquet.write_table(pyarrow.table(table), path)
-    with pytest.raises(RecordingError, match=words):
-        read_recording(recording_path)
+    refused(recording_path, f"row 3, column {column}: {words}")
 
 
 def test_damage_and_doubt_are_one_line(recording_path):
-    csv = (recording_path / "observations.csv").read_bytes()
-    convert(recording_path, "parquet")
-    path = recording_path / "observations.parquet"
+    path, _ = convert(recording_path)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(RecordingError, match="not readable as Parquet"):
-        read_recording(recording_path)
-    path.write_bytes(data)
-    (recording_path / "observations.csv").write_bytes(csv)
-    with pytest.raises(RecordingError, match="keep one of them"):
-        open_recording(recording_path)
+    refused(recording_path, "not readable as Parquet")
+    path.with_suffix(".csv").write_bytes(data)
+    refused(recording_path, "keep one of them")

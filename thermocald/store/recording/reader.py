@@ -263,12 +263,13 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     )
     for name in ("frame_time", *timed):
         times = found[name]
+        fault = time_fault(times)
         behind = times - np.fmax.accumulate(np.concatenate([[-np.inf], times]))[:-1]
-        if (back := np.flatnonzero(behind < 0)).size:
-            row = int(back[0])
+        row = int(np.argmax(behind < 0))
+        if behind[row] < 0 and not (fault and fault[0] < row):
             earlier = times[row] - behind[row]
             table.fail(row, name, f"time runs backwards: {times[row]:.3f} s after {earlier:.3f} s")
-        if fault := time_fault(times):
+        if fault:
             table.fail(fault[0], name, fault[1])
     temperature_time = found.get("temperature_time", np.full(len(numbers), np.nan))
     for name in channels:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry import network_cases as cases
-from tests.photogrammetry.exact_rendering import look_at
+from tests.photogrammetry.exact_rendering import look_at, rms
 from tests.photogrammetry.fields import corner_field
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
@@ -46,7 +46,7 @@ def assert_true(result, truth, least_accuracy=1 / 20_000):
     errors, normalised = cases.normalised_errors(result.network, known)
     assert np.mean(np.abs(normalised) < 3.0) > 0.99
     assert np.abs(normalised).max() < 4.5
-    assert np.sqrt(np.mean(errors**2)) / result.network.extent < least_accuracy
+    assert rms(errors) / result.network.extent < least_accuracy
     assert result.network.relative_accuracy < least_accuracy
     return errors, normalised
 
@@ -83,10 +83,8 @@ def test_bent_sheet_with_its_nominal_field(sheet):
     assert 0.8 < result.network.sigma0 < 1.25
     assert result.field.names == truth.names
     assert result.field.codes == nominal.codes
-    assert np.allclose(
-        result.field.points[[result.field.index[n] for n in result.network.names]],
-        result.network.points,
-    )
+    rows = [result.field.index[name] for name in result.network.names]
+    assert np.allclose(result.field.points[rows], result.network.points)
 
 
 def test_bent_sheet_without_a_nominal_field(sheet):
@@ -117,14 +115,14 @@ def test_a_corner_with_four_targets_on_each_wall():
 
 def test_photographs_that_do_not_fit_together_are_refused(sheet):
     nominal, _, pictures, distance = sheet
-    turned = {"portrait.png": lambda: np.ascontiguousarray(pictures["photo1.png"]().T)}
-    with pytest.raises(ImageError, match=r"portrait\.png.*1232×1640"):
-        survey(pictures | turned, [distance], 0.00224, nominal=nominal)
+    portrait = {"portrait.png": lambda: np.ascontiguousarray(pictures["photo1.png"]().T)}
     black = {"night.png": lambda: np.zeros((1232, 1640), dtype=np.uint8)}
-    with pytest.raises(ImageError, match="no photograph shows a coded target"):
-        survey(black, [distance], 0.00224, nominal=nominal)
-    with pytest.raises(GeometryError, match="2 photographs"):
-        survey(dict([*pictures.items()][:2]), [distance], 0.00224, nominal=nominal)
     nowhere = Distance("R65", "P9999", 100.0, 0.1)
-    with pytest.raises(GeometryError, match="P9999"):
-        survey(pictures, [nowhere], 0.00224, nominal=nominal)
+    for given, scale, error, reason in (
+        (pictures | portrait, distance, ImageError, r"portrait\.png.*1232×1640"),
+        (black, distance, ImageError, "no photograph shows a coded target"),
+        (dict([*pictures.items()][:2]), distance, GeometryError, "2 photographs"),
+        (pictures, nowhere, GeometryError, "P9999"),
+    ):
+        with pytest.raises(error, match=reason):
+            survey(given, [scale], 0.00224, nominal=nominal)

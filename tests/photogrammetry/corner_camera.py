@@ -58,6 +58,19 @@ def observe(field: TestField, rng, interior=INTERIOR, exterior=EXTERIOR, sigma_p
     return Observations(seen, noisy, np.full((len(seen), 2), sigma_px))
 
 
+def observe_series(field: TestField, truth, rng, coordinate_error=0.0, hidden=0.0, noise=1.0):
+    """Draw the grid of a camera's true parameters (E, 16), before a field that errs by mm.
+
+    hidden: share of the targets; noise: of points (E, T, 2), times the usual.
+    """
+    true = field.points
+    if coordinate_error:
+        true = true + rng.normal(0, coordinate_error, true.shape)
+    points = project(SENSOR, truth[:, :10], truth[:, 10:], true)
+    points += rng.normal(0, SIGMA_PX, points.shape) * noise
+    return grid_of(points, rng.random(points.shape[:2]) >= hidden)
+
+
 def adjusted(field: TestField, observations: Observations, **settings):
     """Adjust one epoch, with the truth as initial values."""
     return adjust(SENSOR, field, observations, INTERIOR, EXTERIOR, AdjustmentSettings(**settings))

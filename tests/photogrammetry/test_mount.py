@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.exact_rendering import rms
-from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, PRINCIPAL_POINT, project
+from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, PRINCIPAL_POINT
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.mount import Movement
@@ -40,10 +40,9 @@ def simulate(
     truth[:, 10:13] += px * move * per_px[:3]
     truth[knocked:, 10] += 0.3 * per_px[0]
     truth[first : first + brief, 10] += touched * per_px[0]
-    points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], field.points)
     noise = 0.4 + grows * np.sin(np.pi * np.arange(epochs) / epochs) ** 2 if grows else 1.0
-    points += rng.normal(0, scene.SIGMA_PX, points.shape) * np.reshape(noise, (-1, 1, 1))
-    return scene.grid_of(points, rng.random(points.shape[:2]) >= 0.03), truth
+    noise = np.reshape(noise, (-1, 1, 1))
+    return scene.observe_series(field, truth, rng, hidden=0.03, noise=noise), truth
 
 
 def adjusted(

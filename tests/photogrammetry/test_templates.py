@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.exact_rendering import noisy, rms
-from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 
@@ -115,13 +114,3 @@ def test_hidden_points_are_left_out_and_in_the_dark_or_another_scene_there_are_n
     assert other.status.word == "too_few"
     assert len(night.observations) == len(other.observations) == 0
     assert len(made.measure(noisy(clear, rng)).observations) == 6
-
-
-def test_clicks_outside_the_reference_are_refused(tmp_path):
-    rng = np.random.default_rng(8)
-    centres, clicks = placed(rng)
-    path = tmp_path / "reference.png"
-    cv2.imwrite(str(path), noisy(scene(centres, STILL, 8), rng))
-    clicks.points[:4] += 5000
-    with pytest.raises(ConfigurationError, match="2 control points have x, y within"):
-        Templates.read(path, FIELD, clicks)

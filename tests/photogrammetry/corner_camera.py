@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from tests.photogrammetry.exact_rendering import look_at
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, project
+from thermocald.photogrammetry.camera.camera_model import (
+    PRINCIPAL,
+    InteriorOrientation,
+    Sensor,
+    project,
+)
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.adjustment import adjust_series
@@ -68,7 +73,8 @@ def observe_series(field: TestField, truth, rng, coordinate_error=0.0, hidden=0.
         true = true + rng.normal(0, coordinate_error, true.shape)
     points = project(SENSOR, truth[:, :10], truth[:, 10:], true)
     points += rng.normal(0, SIGMA_PX, points.shape) * noise
-    return grid_of(points, rng.random(points.shape[:2]) >= hidden)
+    seen = rng.random(points.shape[:2]) >= hidden if np.any(hidden) else points[..., 0] < np.inf
+    return grid_of(points, seen)
 
 
 def adjusted(field: TestField, observations: Observations, **settings):
@@ -81,3 +87,10 @@ def adjusted_series(field: TestField, observations, **settings):
     return adjust_series(
         SENSOR, field, observations, INTERIOR, EXTERIOR, SeriesSettings(**settings)
     )
+
+
+def ratios(result, truth, columns=PRINCIPAL):
+    """Return errors about their mean over their sds (n, k), of the epochs with a result."""
+    ok = np.array([word == "ok" for word in result.status])
+    error = (result.values - truth)[ok][:, columns]
+    return (error - error.mean(axis=0)) / result.sd[ok][:, columns]

@@ -1,19 +1,21 @@
-"""Common boards, drawn as by their programs: all corners found, measured and numbered."""
+"""Common boards and printed sheets: all targets found, measured and numbered."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.marks import mostly_slow
 from tests.photogrammetry import board_images as images
 from tests.photogrammetry import exact_rendering
-from tests.photogrammetry.fields import draw_marker
+from tests.photogrammetry.fields import PI_CAMERA, draw_marker
 from tests.photogrammetry.network_cases import looking_at
-from tests.photogrammetry.printed_sheets import photograph
+from tests.photogrammetry.printed_sheets import photograph, put_up
 from thermocald.errors import TestFieldError
+from thermocald.output.testfield.sheets import TRIM, Design, paper_size, print_testfield
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets import boards, markers
@@ -187,3 +189,36 @@ def test_ring_targets_are_numbered_as_in_other_programs(tmp_path):
     (tmp_path / "targets.txt").write_text("target 148, 0, 0, 0\n1,0,0,0\n2,0,1,0\n3,1,0,0\n")
     with pytest.raises(TestFieldError, match="147 codes"):
         read_rings(tmp_path / "targets.txt", 12, 10.0)
+
+
+PAGE = paper_size("A3", landscape=True)
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sheet")
+    printed = print_testfield(Design(PAGE, 12.0), folder)
+    return printed.field, put_up(folder / "testfield.pdf", PAGE, TRIM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "stand",
+    [
+        pytest.param((120.0, -150.0, 330.0), id="near and aslant"),
+        pytest.param((0.0, -300.0, 250.0), id="very oblique"),
+        pytest.param((0.0, 0.0, 380.0), id="straight"),
+        pytest.param((300.0, 0.0, 600.0), id="far"),
+    ],
+)
+def test_a_printed_sheet_is_found_at_seventeen_scales(sheet, stand):
+    field, sheets = sheet
+    station = stood(field, stand, 0.4)
+    seen = int(PI_CAMERA.sensor.contains(PI_CAMERA.project(station, field.points), 30.0).sum())
+    frame = photograph(sheets, PI_CAMERA, station, noise=2.0, blur=0.4, finer=2)
+    found = []
+    for scale in np.linspace(0.2, 1.0, 17):
+        small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        found.append(len(measure(small, field).observations))
+    assert min(found) >= 0.97 * seen, found
+    assert seen >= 50

@@ -8,6 +8,7 @@ import pytest
 
 from tests.blocks import InBlocks
 from tests.photogrammetry.exact_rendering import rms
+from thermocald.photogrammetry.camera.camera_model import PRINCIPAL_POINT
 from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.normals import spread_windows
 from thermocald.photogrammetry.series.result import SeriesSettings
@@ -71,8 +72,7 @@ def test_blocks_equal_the_adjustment_of_all_at_once(case):
     assert np.quantile(np.abs(parts.rows.sd[:, OWN] / whole.sd[:, OWN] - 1), 0.95) < 0.05
     np.testing.assert_allclose(parts.level_sd[OWN], whole.level_sd[OWN], rtol=0.05)
     assert parts.rows.n_rejected[200] == 1
-    error = (parts.rows.values - truth)[:, OWN]
-    ratio = rms((error - error.mean(axis=0)) / parts.rows.sd[:, OWN], axis=0)
+    ratio = rms(scene.ratios(parts.rows, truth, OWN), axis=0)
     # 480 epochs give a standard deviation to 3.2 %; the bound is four times that
     assert ratio.min() > 0.87
     assert ratio.max() < 1.13
@@ -101,6 +101,4 @@ def test_a_knock_between_the_sampled_epochs_is_the_mounts():
     grid = scene.observe_series(field, truth, rng)
     found = blocked((field, truth, grid), 400, "auto", together=300)
     assert "with jumps in a sample of the epochs" in found.sample.choice
-    error = (found.rows.values - truth)[:, 1:3]
-    ratio = (error - error.mean(axis=0)) / found.rows.sd[:, 1:3]
-    assert rms(ratio) < 1.3
+    assert rms(scene.ratios(found.rows, truth, PRINCIPAL_POINT)) < 1.3

@@ -131,10 +131,9 @@ def test_other_texts_than_codes_are_refused(code, reason):
 
 def test_a_duplicated_code_is_refused(tmp_path):
     """`testfield check` accepted it."""
-    points = np.random.default_rng(1).uniform(0, 100, (5, 3))
     codes = ["RING12:65", "", "RING12:65", "", ""]
     with pytest.raises(TestFieldError, match="is duplicated in the test field, at targets 'a' and"):
-        TestField.build(list("abcde"), points, 0.1, 10.0, "circle", codes)
+        TestField.build(list("abcde"), np.eye(5, 3), 0.1, 10.0, "circle", codes)
     path = tmp_path / "field.csv"
     rows = [f"{'abcde'[k]},{k},{k * k},0,9,1,1,1,{code}" for k, code in enumerate(codes)]
     path.write_text("\n".join(["target,X,Y,Z,diameter,sX,sY,sZ,code", *rows]))

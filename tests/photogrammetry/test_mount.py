@@ -56,9 +56,7 @@ def adjusted(
     for seed in seeds:
         grid, truth = simulate(np.random.default_rng(seed), field, epochs, **more)
         r = scene.adjusted_series(field, grid, exterior=exterior, free=free)
-        error = (r.values - truth)[r.ok, columns]
-        sd = np.sqrt(np.diagonal(r.covariance, axis1=1, axis2=2)[r.ok, columns])
-        z.append((error - error.mean(axis=0)) / sd)
+        z.append(scene.ratios(r, truth, columns))
         results.append(r)
     return results, np.concatenate(z)
 

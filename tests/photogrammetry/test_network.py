@@ -101,6 +101,9 @@ _FLAT = cases.bent_sheet(8, 6, sag=0.0)
 _BENT = cases.bent_sheet(8, 6)
 _ROUND = cases.convergent_stations(_BENT, 8)
 _SPOT = _BENT.mean(axis=0)
+_TURNING = [
+    cases.looking_at(np.add(_SPOT, (0, 0, 900)), np.add(_SPOT, (10 * i, 0, 0)), i) for i in range(6)
+]
 
 
 @pytest.mark.parametrize(
@@ -108,9 +111,7 @@ _SPOT = _BENT.mean(axis=0)
     [
         pytest.param(_FLAT, _parallel(_FLAT, (-180, 0, 180), (-130, 0, 130)), None,
                      "principal distance is uncertain", id="flat and parallel"),
-        pytest.param(_BENT, [cases.looking_at(_SPOT + [0, 0, 900], _SPOT + [10 * i, 0, 0], i)
-                             for i in range(6)],
-                     None, "rays meet at|oriented to each other", id="one place"),
+        pytest.param(_BENT, _TURNING, None, "rays meet at|oriented to each other", id="one place"),
         pytest.param(_BENT[:6], cases.convergent_stations(_BENT[:6]), None, "6 targets",
                      id="six targets"),
         pytest.param(_BENT, cases.convergent_stations(_BENT), [], "--scale", id="no scale"),

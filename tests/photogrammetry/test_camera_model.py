@@ -1,10 +1,8 @@
-"""The camera model: projection, rays, partials (CONVENTIONS §2).
-
-`tests/output/camera_files` compares it with OpenCV and six other programs.
-"""
+"""The camera model: projection, rays, partials, equality with OpenCV's (CONVENTIONS §2)."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -27,7 +25,7 @@ POINTS = np.random.default_rng(1).uniform(-300, 300, (60, 3)) * [1, 1, 0.5]
 
 
 def test_partials_equal_differences():
-    """They agree to 1e-7 of each column; this does not prove the model itself."""
+    """They agree to 1e-7 of each column; the model itself is compared with OpenCV's below."""
 
     def seen(values):
         return project(SENSOR, values[:10], values[10:16], POINTS + values[16:])
@@ -53,3 +51,15 @@ def test_a_ray_passes_through_its_point_if_there_is_one():
         rays(SENSOR, [3.04, 0, 0, -0.2, 0, 0, 0, 0, 0, 0], [[0.0, 0.0]])
     behind = project(SENSOR, IOP, np.zeros(6), [[0, 0, -1000.0], [0, 0, 1000.0]])
     assert np.isnan(behind).all(axis=1).tolist() == [False, True]
+
+
+def test_the_model_equals_opencvs():
+    """All terms but C1 and C2, converted with CONVENTIONS' table, agree to 1e-9 px."""
+    iop = np.append(IOP[:8], [0.0, 0.0])
+    c, x0, y0, A1, A2, A3, B1, B2 = iop[:8]
+    p, (u, v) = SENSOR.pixel_pitch, SENSOR.centre
+    K = np.array([[c / p, 0, u + x0 / p], [0, c / p, v - y0 / p], [0, 0, 1]])
+    distortion = np.array([A1 * c**2, A2 * c**4, -B2 * c, B1 * c, A3 * c**6])
+    R = np.diag([1.0, -1.0, -1.0]) @ rotation(EOP[:3]).T
+    expected, _ = cv2.projectPoints(POINTS, cv2.Rodrigues(R)[0], -R @ EOP[3:], K, distortion)
+    np.testing.assert_allclose(project(SENSOR, iop, EOP, POINTS), expected[:, 0], atol=1e-9)

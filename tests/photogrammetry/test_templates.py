@@ -50,18 +50,13 @@ STILL = np.array([[1.0, 0, 0], [0, 1, 0]])
 FIELD = TestField.build([f"g{i}" for i in range(6)], np.zeros((6, 3)), 1.0)
 
 
-def placed(rng: np.random.Generator):
-    """Return true centres, and clicks at whole pixels."""
+def prepared(seed: int, drawn: int | None = None, finer: int = 4):
+    """Return generator, true centres, clicks at whole pixels, and templates of a noisy scene."""
+    rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid([110, 320, 530], [120, 340]), axis=-1).reshape(-1, 2)
     centres = grid + rng.uniform(-20, 20, (6, 2))
-    clicks = np.round(centres + rng.normal(0, 0.5, (6, 2)))
-    return centres, Observations(np.arange(6), clicks, np.full((6, 2), CLICK))
-
-
-def prepared(seed: int, drawn: int | None = None, finer: int = 4):
-    """Return generator, centres, clicks, and the templates of a noisy scene."""
-    rng = np.random.default_rng(seed)
-    centres, clicks = placed(rng)
+    places = np.round(centres + rng.normal(0, 0.5, (6, 2)))
+    clicks = Observations(np.arange(6), places, np.full((6, 2), CLICK))
     still = scene(centres, STILL, seed if drawn is None else drawn, finer=finer)
     return rng, centres, clicks, Templates(noisy(still, rng), FIELD, clicks)
 

@@ -31,4 +31,4 @@ def chessboard_sheet(columns: int, rows: int, square: float) -> Sheet:
     """Draw a chessboard with columns × rows inner corners, its upper left square black."""
     y, x = np.mgrid[: rows + 1, : columns + 1]
     cells = (255 * ((x + y) % 2)).astype(np.uint8)
-    return _sheet(np.kron(cells, np.ones((100, 100), np.uint8)), 100 / square, 100)
+    return _sheet(np.kron(cells, np.ones((240, 240), np.uint8)), 240 / square, 100)

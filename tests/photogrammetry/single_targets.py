@@ -63,7 +63,6 @@ def single_targets(
     tilts=(0, 30, 45, 60),
     blur=0.8,
     seed=1,
-    light=(0.0, 0.0),
     bits=0,
     ink=INK,
 ) -> SingleTargets:
@@ -92,7 +91,7 @@ def single_targets(
         uv = PI_CAMERA.project(AT_ORIGIN, centre[None])[0]
         side = SIZE_WITH_RING if bits else SIZE
         x, y = np.rint(uv - side / 2).astype(int)
-        scene = Scene(paper=PAPER, ink=ink, light=light)
+        scene = Scene(paper=PAPER, ink=ink)
         if bits:
             code = ring_code.codes(bits)[7 * k]
             scene.ring(centre, normal, size, bits, code, turn=0.37 * k % 1)

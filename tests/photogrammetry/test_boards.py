@@ -11,6 +11,7 @@ import pytest
 from tests.marks import mostly_slow
 from tests.photogrammetry import board_images as images
 from tests.photogrammetry import exact_rendering
+from tests.photogrammetry.exact_rendering import rms
 from tests.photogrammetry.fields import PI_CAMERA, draw_marker
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph, put_up
@@ -29,15 +30,6 @@ def stood(field, stand, roll=0.3):
     """Return the orientation of a camera at `stand` from the middle of a field."""
     middle = field.points.mean(axis=0)
     return looking_at(middle + np.array(stand), middle, roll)
-
-
-def seen(sheet, field, stand, roll=0.3):
-    """Measure a photograph; return also errors (n, 2) px, and the number of visible corners."""
-    station = stood(field, stand, roll)
-    found = measure(photograph([sheet], CAMERA, station, finer=2), field)
-    truth = CAMERA.project(station, field.points)
-    visible = int(CAMERA.sensor.contains(truth, 6.0).sum())
-    return found, found.observations.points - truth[found.observations.targets], visible
 
 
 APRIL_TAG_0 = 0xD5D628584
@@ -70,7 +62,7 @@ def test_standard_deviations_of_an_aprilgrid_are_true_at_any_obliquity(stand):
         found = measure(frame, field).observations
         assert len(found) >= 60
         ratios.append((found.points - truth[found.targets]) / found.sigmas)
-    assert 0.9 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.1
+    assert 0.9 < rms(np.concatenate(ratios)) < 1.1
 
 
 def test_the_tags_of_an_aprilgrid_are_the_published_ones():
@@ -93,29 +85,19 @@ def test_corners_in_another_order_are_not_ok():
         assert ("turned by 180°" in status.reason) == (turn == 2)
 
 
-def test_all_corners_of_a_charuco_board():
-    """As OpenCV drew it before 4.6; a present one: `test_a_printed_board_is_found_…`."""
-    field = boards.charuco(9, 6, 30.0, 22.5, "DICT_4X4_50", legacy=True)
-    sheet = images.charuco_sheet(9, 6, 30.0, 22.5, "DICT_4X4_50", legacy=True)
-    found, errors, visible = seen(sheet, field, (150.0, -120.0, 380.0))
-    assert found.status.ok
-    assert len(found.observations) == visible == len(field)
-    chess = np.array([field.kinds[r] == "chess_corner" for r in found.observations.targets])
-    assert chess.sum() == 8 * 5
-    assert np.sqrt(np.mean(errors[chess] ** 2)) < 0.01
-    ratio = errors[chess] / found.observations.sigmas[chess]
-    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.4
-
-
 CHESSBOARD = boards.chessboard(9, 6, 25.0)
 
 
 @pytest.mark.parametrize("roll", mostly_slow([0.0, 1.5, 3.1, 4.5], 1.5))
 def test_a_chessboard_is_numbered_at_any_roll(roll):
+    """ChArUco boards of all kinds: `test_a_printed_board_is_found_where_its_csv_says`."""
+    station = stood(CHESSBOARD, (150.0, -120.0, 330.0), roll)
     sheet = images.chessboard_sheet(9, 6, 25.0)
-    found, errors, _ = seen(sheet, CHESSBOARD, (150.0, -120.0, 330.0), roll)
-    assert len(found.observations) == 54
-    assert np.sqrt(np.mean(errors**2)) < 0.02
+    found = measure(photograph([sheet], CAMERA, station, finer=2), CHESSBOARD).observations
+    errors = found.points - CAMERA.project(station, CHESSBOARD.points)[found.targets]
+    assert len(found) == 54
+    assert rms(errors) < 0.02
+    assert 0.7 < rms(errors / found.sigmas) < 1.4
 
 
 KALIBR = "{target_type: 'aprilgrid', tagCols: 6, tagRows: 6, tagSize: 0.04, tagSpacing: 0.3}"

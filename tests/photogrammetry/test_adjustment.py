@@ -13,8 +13,14 @@ import thermocald as tc
 from tests.photogrammetry.exact_rendering import rms
 from tests.recordings import read_rows, write_rows
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, partials, rays
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    partials,
+    rays,
+)
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, cold_start
+from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.orientation import approximate_orientation
 
 FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
@@ -94,6 +100,16 @@ def test_cold_starts_of_narrow_and_wide_lenses(view_deg):
     found, _, fits = approximate_orientation(scene.SENSOR, points, image)
     assert found.c == pytest.approx(c, rel=0.05)
     assert fits.all()
+
+
+def test_one_plane_seen_frontally_is_weak():
+    a, b = (g.ravel() for g in np.meshgrid(np.linspace(-300, 300, 9), np.linspace(-200, 200, 7)))
+    field = TestField.build([str(i) for i in range(len(a))], np.c_[a, b, 0 * a], 0.0)
+    exterior = ExteriorOrientation(0.02, 0.03, 0.0, 0.0, 0.0, 700.0)
+    obs = scene.observe(field, np.random.default_rng(9), exterior=exterior)
+    a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=3.04)
+    assert a.status == "weak_geometry"
+    assert "one plane seen at 2° from frontal" in a.reason
 
 
 def test_targets_in_one_corner_too_few_and_of_another_field_are_reported():

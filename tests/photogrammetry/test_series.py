@@ -86,6 +86,16 @@ def test_without_common_unknowns_the_series_equals_single_adjustments(hidden, co
         assert r.sigma0[e] == pytest.approx(one.sigma0, rel=1e-3)
 
 
+def test_epochs_without_a_result_have_a_reason():
+    field, _, observations = series(np.random.default_rng(37), epochs=12)
+    observations[3] = None
+    observations[5] = observations[5].select(np.arange(len(observations[5])) < 5)
+    r = scene.adjusted_series(field, observations)
+    assert (r.status[3], r.status[5], r.ok.sum()) == ("no_observations", "too_few_targets", 10)
+    assert all(r.reasons[e] for e in (3, 5))
+    assert np.isnan(r.values[3]).all()
+
+
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
 def test_sigma0_refers_to_the_stated_sigmas(exterior):
     """With twice the stated noise it is 2, and the standard deviations follow."""

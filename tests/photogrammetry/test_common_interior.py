@@ -60,9 +60,9 @@ def photographs(rng, sigma_mm: float, gross: float = 0.0, stations=STATIONS, foc
     return known, measured
 
 
-def around(rng, count: int):
-    """Draw stations about the middle of the corner's view."""
-    centres = np.array([900, 850, 800]) + rng.uniform(-250, 250, (count, 3))
+def around(rng, count: int, middle=(950, 900, 800)):
+    """Draw stations about a middle, mm."""
+    centres = np.array(middle) + rng.uniform(-250, 250, (count, 3))
     return [look_at(c.tolist(), [150, 180, 160], k * np.pi / 2) for k, c in enumerate(centres)]
 
 
@@ -75,7 +75,7 @@ def errors(draws: int, seed: int, **drawn):
     """Yield each draw's result, its stations, and error over sd of c, x0, y0, A1, A2, A3."""
     for k in range(draws):
         rng = np.random.default_rng([seed, k])
-        stations = around(rng, 8) if "focus" in drawn else STATIONS
+        stations = around(rng, 8, (850, 800, 800)) if "focus" in drawn else STATIONS
         known, measured = photographs(rng, 0.05, stations=stations, **drawn)
         r = adjust_common_interior(scene.SENSOR, known, measured, scene.INTERIOR, stations)
         sd = np.sqrt(np.diag(r.covariance))[:6]
@@ -189,17 +189,24 @@ def test_few_points_of_an_uncertain_field_are_not_rejected_by_turns(shared, tmp_
     assert any(text in r.reason for text in weak)
 
 
-def test_gross_errors_are_rejected_and_a_moved_target_is_left_out_of_all_photographs():
+def test_gross_errors_are_rejected():
+    known, measured = photographs(np.random.default_rng(8), 0.05, gross=0.03)
+    r = adjusted(known, measured)
+    expected = 0.03 * sum(len(o) for o in measured)
+    assert sum(int((~m).sum()) for m in r.used) == pytest.approx(expected, rel=0.6)
+    assert r.sigma0 == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_moved_target_is_left_out_of_all_photographs():
     """Rays are rejected one at a time; this target is 2 mm off in 20 photographs."""
     rng = np.random.default_rng(3)
     stations = around(rng, 20)
-    known, measured = photographs(rng, 0.02, 0.02, stations)
+    known, measured = photographs(rng, 0.02, stations=stations)
     moved = replace(known, points=known.points + 2.0 * (np.arange(len(known)) == 10)[:, None])
     r = adjusted(moved, measured, stations)
     rejected = np.concatenate([o.targets[~m] for o, m in zip(measured, r.used, strict=True)])
     assert np.count_nonzero(rejected == 10) == sum(10 in o.targets for o in measured) > 15
-    gross = 0.02 * sum(len(o) for o in measured)
-    assert np.count_nonzero(rejected != 10) == pytest.approx(gross, rel=0.5)
+    assert len(rejected) < 30
     assert r.sigma0 == pytest.approx(1.0, abs=0.05)
 
 

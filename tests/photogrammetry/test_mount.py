@@ -12,7 +12,7 @@ from tests.photogrammetry.exact_rendering import rms
 from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, PRINCIPAL_POINT
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.mount import Movement
+from thermocald.photogrammetry.series.mount import Movement, drift_period
 from thermocald.photogrammetry.series.normals import linearise
 from thermocald.photogrammetry.series.variance_components import components
 
@@ -174,6 +174,13 @@ def test_the_variance_of_a_line_through_a_swaying_mount_is_true():
     weights = np.linspace(-1, 1, n)
     movement = Movement(np.zeros((1, 1)), np.full((1, 1), about.var()), 12.0, np.eye(1))
     assert movement.tilt(weights)[0, 0] == pytest.approx((about @ weights).var(), rel=0.05)
+
+
+def test_a_camera_drifts_within_a_minute_only_if_it_warms_up():
+    minute, hour = np.arange(0, 60, 0.5), np.arange(0, 3600, 10.0)
+    assert drift_period(minute, np.full(len(minute), np.nan)) == 0.0
+    assert drift_period(minute, np.linspace(20, 23, len(minute))) > 0
+    assert drift_period(hour, np.full(len(hour), 20.0)) == 24.0
 
 
 def test_bends_of_a_long_series_are_sought_in_bounded_memory():

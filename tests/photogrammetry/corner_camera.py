@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from tests.photogrammetry.exact_rendering import look_at
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, project
+from thermocald.photogrammetry.camera.camera_model import (
+    PRINCIPAL,
+    InteriorOrientation,
+    Sensor,
+    project,
+)
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.adjustment import adjust_series
@@ -58,6 +63,20 @@ def observe(field: TestField, rng, interior=INTERIOR, exterior=EXTERIOR, sigma_p
     return Observations(seen, noisy, np.full((len(seen), 2), sigma_px))
 
 
+def observe_series(field: TestField, truth, rng, coordinate_error=0.0, hidden=0.0, noise=1.0):
+    """Draw the grid of a camera's true parameters (E, 16), before a field that errs by mm.
+
+    hidden: share of the targets; noise: of points (E, T, 2), times the usual.
+    """
+    true = field.points
+    if coordinate_error:
+        true = true + rng.normal(0, coordinate_error, true.shape)
+    points = project(SENSOR, truth[:, :10], truth[:, 10:], true)
+    points += rng.normal(0, SIGMA_PX, points.shape) * noise
+    seen = rng.random(points.shape[:2]) >= hidden if np.any(hidden) else points[..., 0] < np.inf
+    return grid_of(points, seen)
+
+
 def adjusted(field: TestField, observations: Observations, **settings):
     """Adjust one epoch, with the truth as initial values."""
     return adjust(SENSOR, field, observations, INTERIOR, EXTERIOR, AdjustmentSettings(**settings))
@@ -68,3 +87,10 @@ def adjusted_series(field: TestField, observations, **settings):
     return adjust_series(
         SENSOR, field, observations, INTERIOR, EXTERIOR, SeriesSettings(**settings)
     )
+
+
+def ratios(result, truth, columns=PRINCIPAL):
+    """Return errors about their mean over their sds (n, k), of the epochs with a result."""
+    ok = np.array([word == "ok" for word in result.status])
+    error = (result.values - truth)[ok][:, columns]
+    return (error - error.mean(axis=0)) / result.sd[ok][:, columns]

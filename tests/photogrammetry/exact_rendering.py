@@ -155,8 +155,8 @@ def noisy(image: np.ndarray, rng: np.random.Generator, sd: float = 2.0) -> np.nd
     return np.clip(np.rint(image + rng.normal(0, sd, image.shape)), 0, 255).astype(np.uint8)
 
 
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def rms(values, axis=None):
+    return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
 def look_at(

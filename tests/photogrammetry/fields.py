@@ -10,6 +10,7 @@ from tests.photogrammetry.exact_rendering import Scene, look_at
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.markers import marker_cells
 
 PI_SENSOR = Sensor(3280, 2464, 0.00112)
 PI_CAMERA = CameraModel(
@@ -85,16 +86,13 @@ def small_frame() -> np.ndarray:
 def draw_marker(
     scene: Scene, dictionary: str, number: int, corners: np.ndarray, border: int = 1
 ) -> None:
-    """Draw a marker with outer corners (4, 3) mm in OpenCV's order, and a border in cells."""
-    import cv2
-
-    d = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    cells = d.markerSize + 2 * border
-    image = cv2.aruco.generateImageMarker(d, number, cells, borderBits=border)
+    """Draw a marker with outer corners (4, 3) mm in the order of its codes, border in cells."""
+    black = marker_cells(dictionary, number, border)
+    cells = len(black)
     a, b, _, e = corners
     for row in range(cells):
         # Each black run is one piece, without seams between its cells
-        dark = np.flatnonzero(np.diff(np.r_[0, image[row] < 128, 0]))
+        dark = np.flatnonzero(np.diff(np.r_[0, black[row], 0]))
         for begin, end in zip(dark[::2], dark[1::2], strict=True):
             u = np.array([begin, end, end, begin])[:, None] / cells
             v = np.array([row, row, row + 1, row + 1])[:, None] / cells

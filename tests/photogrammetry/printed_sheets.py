@@ -18,7 +18,6 @@ import pytest
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation
 
 GRID_PX = 8
-ROWS = 16
 BEYOND = 120.0
 
 
@@ -65,15 +64,27 @@ def photograph(
     """
     w, h = camera.sensor.width, camera.sensor.height
     image = np.full((h * finer, w * finer), BEYOND, np.float32)
+    coarse, step = _coarse_rays(camera), GRID_PX * finer
     for sheet in sheets:
-        if (exterior.centre - sheet.origin) @ np.cross(*sheet.axes) > 0:
-            part, u, v = _places(sheet, camera, exterior, finer)
-            rows, columns = sheet.image.shape
+        if (exterior.centre - sheet.origin) @ np.cross(*sheet.axes) <= 0:
+            continue
+        page = _smoothed(sheet, camera, exterior, finer)
+        page = page * np.float32((paper - ink) / 255) + np.float32(ink)
+        rows, columns = sheet.image.shape
+        for k in range(len(coarse) - 2):  # bands, small enough for the processor's cache
+            band, cells = image[k * step : (k + 1) * step], coarse[k : k + 3]
+            u, v = _on_sheet(sheet, exterior, cells[..., 0], cells[..., 1])
+            if not (np.abs(u / columns - 0.5) + np.abs(v / rows - 0.5) < 1.2).any():
+                continue
+            x, y = (
+                cv2.resize(np.ascontiguousarray(cells[..., i]), None, fx=step, fy=step)
+                [step : step + len(band), step : step + w * finer]
+                for i in (0, 1)
+            )  # fmt: skip
+            u, v = _on_sheet(sheet, exterior, x, y)
             hit = (u >= -0.5) & (v >= -0.5) & (u <= columns - 0.5) & (v <= rows - 0.5)
-            fine = _smoothed(sheet, camera, exterior, finer)
-            page = cv2.remap(fine, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            page *= np.float32((paper - ink) / 255)
-            np.copyto(image[part], page + np.float32(ink), where=hit)
+            seen = cv2.remap(page, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            np.copyto(band, seen, where=hit)
     image = cv2.GaussianBlur(image, (0, 0), blur * finer)
     small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
     if noise:
@@ -97,48 +108,17 @@ def _smoothed(
     return cv2.GaussianBlur(sheet.image.astype(np.float32), (0, 0), max(0.35 * apart, 0.3))
 
 
-def _places(
-    sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation, finer: int
-) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
-    """Return the part of the fine image that shows the sheet, and its rays' places on it (px).
+def _coarse_rays(camera: CameraModel) -> np.ndarray:
+    """Return the rays (rows, columns, 2) of a grid of pixels, with a cell more on every side.
 
-    Rays are interpolated in a grid of pixels (distortion is smooth: to 3e-4 px). Places on the
-    sheet are not: they would be 0.01 px off in an oblique view.
+    Rays are interpolated in it (distortion is smooth: to 3e-4 px). Places on the sheet are not:
+    they would be 0.01 px off in an oblique view.
     """
-    w, h = camera.sensor.width, camera.sensor.height
-    at = [np.arange(-1, -(-n // GRID_PX) + 1) * GRID_PX + (GRID_PX - 1) / 2 for n in (w, h)]
+    sides = (camera.sensor.width, camera.sensor.height)
+    at = [np.arange(-1, -(-n // GRID_PX) + 1) * GRID_PX + (GRID_PX - 1) / 2 for n in sides]
     u, v = np.meshgrid(*at)
-    coarse = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
-    coarse = (coarse[:, :2] / coarse[:, 2:]).reshape(len(at[1]), len(at[0]), 2)
-    x, y = _on_sheet(sheet, exterior, coarse[..., 0], coarse[..., 1])
-    rows, columns = sheet.image.shape
-    hit = (x > -0.1 * columns) & (y > -0.1 * rows) & (x < 1.1 * columns) & (y < 1.1 * rows)
-    block, part = [], []
-    for axis, size in ((1, h), (0, w)):
-        seen = np.flatnonzero(hit.any(axis=axis))
-        low, high = (seen[0] - 2, seen[-1] + 3) if len(seen) else (0, 1)
-        block.append(slice(max(low, 0), high))
-        first = max((block[-1].start - 1) * GRID_PX * finer, 0)
-        part.append(slice(first, size * finer))
-    step = GRID_PX * finer
-    fine = []
-    for i in (0, 1):
-        small = np.ascontiguousarray(coarse[block[0], block[1], i])
-        whole = cv2.resize(small, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
-        cut = [max(step - block[k].start * step, 0) for k in (0, 1)]
-        fine.append(whole[cut[0] :, cut[1] :])
-    height, width = fine[0].shape
-    part = [
-        slice(p.start, min(p.start + n, p.stop)) for p, n in zip(part, (height, width), strict=True)
-    ]
-    size = [p.stop - p.start for p in part]
-    places = np.empty((2, *size), np.float32)
-    for first in range(0, size[0], ROWS):  # small enough for the processor's cache
-        rows = slice(first, min(first + ROWS, size[0]))
-        found = _on_sheet(sheet, exterior, *(f[rows, : size[1]] for f in fine))
-        for place, out in zip(found, places[:, rows], strict=True):
-            np.clip(place, -1e6, 1e6, out=out, casting="same_kind")
-    return (part[0], part[1]), places[0], places[1]
+    rays = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
+    return (rays[:, :2] / rays[:, 2:]).reshape(*u.shape, 2)
 
 
 def _on_sheet(
@@ -163,7 +143,7 @@ def _on_sheet(
         with np.errstate(divide="ignore", invalid="ignore"):
             place = (above[0] * x + above[1] * y + above[2]) / denominator
         away = ~(denominator * (from_origin @ normal) > 0) | ~np.isfinite(place)
-        found.append(np.where(away, -1e6, place))
+        found.append(np.where(away, -1e6, place).clip(-1e6, 1e6).astype(np.float32))
     return found
 
 

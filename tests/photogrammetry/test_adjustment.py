@@ -6,11 +6,11 @@ import shutil
 from dataclasses import replace
 
 import corner_camera as scene
-import cv2
 import numpy as np
 import pytest
 
 import thermocald as tc
+from tests.photogrammetry.exact_rendering import rms
 from tests.recordings import read_rows, write_rows
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -19,80 +19,38 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     rays,
 )
-from thermocald.photogrammetry.epoch.adjustment import (
-    AdjustmentSettings,
-    adjust,
-    cold_start,
-)
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, cold_start
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.orientation import approximate_orientation
 
 FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
 TRUTH = scene.TRUTH
-DRAWS = 5000
 
 
-@pytest.mark.slow
-def test_no_bias_and_the_scatter_is_the_stated_sd_and_the_cramer_rao_bound():
-    """5,000 draws of an epoch: the standard error of a mean is 0.014 sd, that of an sd 1 %.
-
-    The bound is computed here from the partials at the truth, not by the adjustment.
-    """
+@pytest.mark.parametrize(
+    ("sigma_mm", "draws"), [pytest.param(0.0, 5000, marks=pytest.mark.slow), (0.05, 400)]
+)
+def test_no_bias_and_the_scatter_is_the_stated_sd_and_the_cramer_rao_bound(sigma_mm, draws):
+    """The bound is computed here from the partials at the truth, not by the adjustment."""
     rng = np.random.default_rng(20)
-    field = scene.corner_field()
-    drawn = [
-        scene.adjusted(field, scene.observe(field, rng), snooping_alpha=0.0) for _ in range(DRAWS)
-    ]
+    exact, known, drawn = scene.corner_field(), scene.corner_field(sigma_mm), []
+    for _ in range(draws):
+        points = exact.points + rng.normal(0, sigma_mm, exact.points.shape)
+        seen = scene.observe(replace(exact, points=points), rng)
+        drawn.append(scene.adjusted(known, seen, snooping_alpha=0.0))
     assert all(a.ok for a in drawn)
     values, sds = (np.array([getattr(a, k) for a in drawn])[:, FREE] for k in ("values", "sd"))
-    assert np.abs((values.mean(axis=0) - TRUTH[FREE]) / sds.mean(axis=0)).max() < 0.05
-    seen = scene.observe(field, np.random.default_rng(0)).targets
-    _, A, _ = partials(scene.SENSOR, TRUTH[:10], TRUTH[10:], field.points[seen])
+    # the standard error of a mean of 5,000 is 0.014 sd, that of an sd 1 %
+    error = 1 / np.sqrt(draws)
+    assert np.abs((values.mean(axis=0) - TRUTH[FREE]) / sds.mean(axis=0)).max() < 3.5 * error
+    _, A, _ = partials(scene.SENSOR, TRUTH[:10], TRUTH[10:], exact.points[seen.targets])
     J = A.reshape(-1, 16)[:, FREE] / scene.SIGMA_PX
     scale = np.linalg.norm(J, axis=0)
     bound = np.sqrt(np.diag(np.linalg.inv((J / scale).T @ (J / scale)))) / scale
-    for stated in (np.sqrt((sds**2).mean(axis=0)), bound):
+    for stated in (rms(sds, axis=0), *([] if sigma_mm else [bound])):
         ratio = values.std(axis=0, ddof=1) / stated
-        assert ratio.min() > 0.97
-        assert ratio.max() < 1.03
-    assert np.mean([a.sigma0 for a in drawn]) == pytest.approx(1.0, abs=0.005)
-
-
-def test_same_interior_as_opencv():
-    """With the same observations and parameters, c and x0, y0 agree to 1e-3 px."""
-    field = scene.corner_field()
-    obs = scene.observe(field, np.random.default_rng(3))
-    a = scene.adjusted(field, obs, snooping_alpha=0.0)
-    f, (cx, cy) = scene.INTERIOR.c / scene.SENSOR.pixel_pitch, scene.SENSOR.centre
-    K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-14)
-    _, K, d, *_ = cv2.calibrateCameraExtended(
-        field.points[obs.targets].astype(np.float32)[None], obs.points.astype(np.float32)[None],
-        (scene.SENSOR.width, scene.SENSOR.height), K, np.zeros(5), flags=flags, criteria=criteria,
-    )  # fmt: skip
-    i, p = a.interior, scene.SENSOR.pixel_pitch
-    assert i.c / p == pytest.approx(K[0, 0], abs=1e-3)
-    assert cx + i.x0 / p == pytest.approx(K[0, 2], abs=1e-3)
-    assert cy - i.y0 / p == pytest.approx(K[1, 2], abs=1e-3)
-    # the difference of distortion, as the shift of a corner of the image
-    ours = np.array([i.A1 * i.c**2, i.A2 * i.c**4, -i.B2 * i.c, i.B1 * i.c, i.A3 * i.c**6])
-    corner = np.array([[[10.0, 10.0]]])
-    moved = cv2.undistortPoints(corner, K, ours, P=K) - cv2.undistortPoints(corner, K, d, P=K)
-    assert np.abs(moved).max() < 5e-3
-
-
-def test_the_result_is_that_of_full_convergence():
-    """c, x0, y0 agree to 1e-4 px, though the last step uses the partials of the previous one."""
-    rng, field = np.random.default_rng(23), scene.corner_field()
-    settings = AdjustmentSettings(snooping_alpha=0.0)
-    for _ in range(60):
-        observations = scene.observe(field, rng)
-        first = last = scene.adjusted(field, observations, snooping_alpha=0.0)
-        for _ in range(3):
-            last = adjust(scene.SENSOR, field, observations, last.interior, last.exterior, settings)
-        change = np.abs(first.values - last.values)[:3] / scene.SENSOR.pixel_pitch
-        assert change.max() < 1e-4
+        assert ratio == pytest.approx(np.ones(len(FREE)), abs=3 / np.sqrt(2 * draws))
+    assert np.mean([a.sigma0 for a in drawn]) == pytest.approx(1.0, abs=0.35 * error)
 
 
 def test_priors_and_held_parameters():
@@ -109,22 +67,6 @@ def test_priors_and_held_parameters():
     assert sure.sd[0] / sure.sigma0 == pytest.approx(1e-7, rel=0.01)
     assert held.redundancy == plain.redundancy == free.redundancy - 1
     assert held.sigma0 == plain.sigma0
-
-
-def test_sigmas_of_the_coordinates_count():
-    """Sds stay true if the coordinates are noisy as the field's sigmas state."""
-    rng = np.random.default_rng(5)
-    exact, known = scene.corner_field(), scene.corner_field(0.05)
-    values, sds = [], []
-    for _ in range(400):
-        points = exact.points + rng.normal(0, 0.05, exact.points.shape)
-        obs = scene.observe(TestField.build(exact.names, points), rng)
-        a = scene.adjusted(known, obs, snooping_alpha=0.0)
-        values.append(a.values)
-        sds.append(a.sd)
-    ratio = np.std(values, axis=0)[FREE] / np.mean(sds, axis=0)[FREE]
-    assert ratio.min() > 0.87  # 400 draws: a standard error of 3.5 %
-    assert ratio.max() < 1.13
 
 
 @pytest.mark.parametrize("nominal", [None, 3.04])
@@ -167,7 +109,7 @@ def test_one_plane_seen_frontally_is_weak():
     obs = scene.observe(field, np.random.default_rng(9), exterior=exterior)
     a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=3.04)
     assert a.status == "weak_geometry"
-    assert "plane" in a.reason or "separate" in a.reason or "known to" in a.reason
+    assert "one plane seen at 2° from frontal" in a.reason
 
 
 def test_targets_in_one_corner_too_few_and_of_another_field_are_reported():
@@ -212,7 +154,7 @@ def test_one_gross_error_among_twelve_targets_is_found_or_the_epoch_has_no_resul
         else:
             assert r.reason
     assert ok > 130
-    assert np.sqrt(np.mean(np.square(z), axis=0)) == pytest.approx(np.ones(3), abs=0.2)
+    assert rms(z, axis=0) == pytest.approx(np.ones(3), abs=0.2)
 
 
 @pytest.mark.parametrize(("factor", "least", "most"), [(1, 0.96, 1), (2, 0, 0.45), (3, 0, 0.1)])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.blocks import InBlocks
-from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.photogrammetry.field.testfield import TestField
+from tests.photogrammetry.exact_rendering import rms
+from thermocald.photogrammetry.camera.camera_model import PRINCIPAL_POINT
 from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.normals import spread_windows
 from thermocald.photogrammetry.series.result import SeriesSettings
@@ -20,17 +20,14 @@ EPOCHS = 480
 @pytest.fixture(scope="module")
 def case():
     """Return a drifting camera's field, truth and grid; a board is hidden at times."""
-    rng = np.random.default_rng(40)
-    whole = scene.corner_field(0.02)
+    rng, whole = np.random.default_rng(40), scene.corner_field(0.02)
     known = whole.subset(np.arange(0, len(whole), 3))
-    true = TestField.build(known.names, known.points + rng.normal(0, 0.02, known.points.shape))
     truth = scene.warming_up(20 * np.sin(np.arange(EPOCHS) / EPOCHS * 9.0))
-    points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], true.points)
-    points += rng.normal(0, scene.SIGMA_PX, points.shape)
-    see = np.ones(points.shape[:2], dtype=bool)
-    see[EPOCHS // 3 : EPOCHS // 2, : len(known) // 5] = False
-    points[200, 20] += 40.0  # a gross error outside the sample
-    return known, truth, scene.grid_of(points, see)
+    grid = scene.observe_series(known, truth, rng, 0.02)
+    hidden = np.zeros(grid.observed.shape, dtype=bool)
+    hidden[EPOCHS // 3 : EPOCHS // 2, : len(known) // 5] = True
+    grid.points[200, 20] += 40.0  # a gross error outside the sample
+    return known, truth, grid.reject(hidden)
 
 
 def blocked(case, size, exterior="series", jobs=1, together=120, **other):
@@ -75,8 +72,7 @@ def test_blocks_equal_the_adjustment_of_all_at_once(case):
     assert np.quantile(np.abs(parts.rows.sd[:, OWN] / whole.sd[:, OWN] - 1), 0.95) < 0.05
     np.testing.assert_allclose(parts.level_sd[OWN], whole.level_sd[OWN], rtol=0.05)
     assert parts.rows.n_rejected[200] == 1
-    error = (parts.rows.values - truth)[:, OWN]
-    ratio = np.sqrt(np.mean(((error - error.mean(axis=0)) / parts.rows.sd[:, OWN]) ** 2, axis=0))
+    ratio = rms(scene.ratios(parts.rows, truth, OWN), axis=0)
     # 480 epochs give a standard deviation to 3.2 %; the bound is four times that
     assert ratio.min() > 0.87
     assert ratio.max() < 1.13
@@ -93,7 +89,7 @@ def test_targets_outside_the_sample_are_adjusted(case):
     seen = np.flatnonzero(~hidden[:, 0] & np.isfinite(r.rows.values[:, 0]))
     z = (r.rows.values - truth)[:, OWN]
     z = (z - z.mean(axis=0)) / r.rows.sd[:, OWN]
-    assert np.sqrt(np.mean(z[seen] ** 2)) < 1.15
+    assert rms(z[seen]) < 1.15
 
 
 def test_a_knock_between_the_sampled_epochs_is_the_mounts():
@@ -102,11 +98,7 @@ def test_a_knock_between_the_sampled_epochs_is_the_mounts():
     truth = np.tile(scene.TRUTH, (epochs, 1))
     truth[:, :3] += np.sin(np.arange(epochs) / 120)[:, None] * np.array([1e-4, 1e-3, -8e-4])
     truth[530:, 10:13] += np.array([2e-4, -1e-4, 1e-4])
-    points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], field.points)
-    points += rng.normal(0, scene.SIGMA_PX, points.shape)
-    grid = scene.grid_of(points, np.ones(points.shape[:2], dtype=bool))
+    grid = scene.observe_series(field, truth, rng)
     found = blocked((field, truth, grid), 400, "auto", together=300)
     assert "with jumps in a sample of the epochs" in found.sample.choice
-    error = (found.rows.values - truth)[:, 1:3]
-    ratio = (error - error.mean(axis=0)) / found.rows.sd[:, 1:3]
-    assert np.sqrt(np.mean(ratio**2)) < 1.3
+    assert rms(scene.ratios(found.rows, truth, PRINCIPAL_POINT)) < 1.3

@@ -15,12 +15,13 @@ from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.corner import measure_corners
-from thermocald.photogrammetry.targets.markers import locate_markers, parse_marker
+from thermocald.photogrammetry.targets.markers import locate_markers
 
 
-def measure_markers(image, field, missed=None):
-    missed = {} if missed is None else missed
-    return measure_corners(image, locate_markers(image, field, missed), missed)
+def measure_markers(image, field):
+    """Measure without the rest of a frame's measurement; return also the reasons of the missed."""
+    missed: dict[int, str] = {}
+    return measure_corners(image, locate_markers(image, field, missed), missed), missed
 
 
 APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
@@ -48,13 +49,13 @@ VIEWS = {
 }
 
 
-def _truth(exterior) -> np.ndarray:
-    return SMALL_CAMERA.project(exterior, FIELD.points)
+def _truth(view: str, camera=SMALL_CAMERA) -> np.ndarray:
+    return camera.project(VIEWS[view], FIELD.points)
 
 
 @cache
-def _rendered(view: str) -> np.ndarray:
-    return SCENE.render(SMALL_CAMERA, VIEWS[view])
+def _rendered(view: str, camera=SMALL_CAMERA) -> np.ndarray:
+    return SCENE.render(camera, VIEWS[view])
 
 
 def _frontal(seed: int) -> np.ndarray:
@@ -62,19 +63,21 @@ def _frontal(seed: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("view", VIEWS)
-def test_corners_scatter_as_stated(view):
-    exterior = VIEWS[view]
-    image = _rendered(view)
+@pytest.mark.parametrize(
+    ("view", "camera"),
+    [
+        *((view, SMALL_CAMERA) for view in VIEWS),
+        pytest.param("frontal", PI_CAMERA, id="found at half size, measured at full size"),
+    ],
+)
+def test_corners_scatter_as_stated(view, camera):
+    image, truth = _rendered(view, camera), _truth(view, camera)
     rng = np.random.default_rng(1)
-    found = locate_markers(noisy(image, rng), FIELD, {})
-    assert len(found) == 48
-    truth = _truth(exterior)
     error, z = [], []
     for _ in range(12):
-        missed: dict[int, str] = {}
-        observed = measure_corners(noisy(image, rng), found, missed)
+        observed, missed = measure_markers(noisy(image, rng), FIELD)
         assert missed == {}
+        assert len(observed) == 48
         e = observed.points - truth[observed.targets]
         error.append(e)
         z.append(e / observed.sigmas)
@@ -84,63 +87,53 @@ def test_corners_scatter_as_stated(view):
 
 
 def test_markers_of_two_dictionaries_are_in_the_fields_order():
-    observed = measure_markers(_frontal(2), FIELD)
+    observed, _ = measure_markers(_frontal(2), FIELD)
     assert list(observed.targets) == list(range(48))
     assert set(observed.quality) == {"blur", "contrast", "grey", "noise", "saturation"}
     assert np.median(observed.quality["blur"]) == pytest.approx(0.8, abs=0.05)
     # markers outside the field are ignored
     part = FIELD.subset(np.arange(8))
-    assert list(measure_markers(_frontal(3), part).targets) == list(range(8))
+    assert list(measure_markers(_frontal(3), part)[0].targets) == list(range(8))
 
 
-def test_a_marker_seen_twice_is_dropped():
-    image = _frontal(4)
-    u, v = np.rint(_truth(VIEWS["frontal"])[:4].mean(axis=0)).astype(int)
-    patch = image[v - 70 : v + 70, u - 70 : u + 70].copy()
-    image[20:160, 1480:1620] = patch
-    missed: dict[int, str] = {}
-    observed = measure_markers(image, FIELD, missed)
+def test_a_marker_seen_twice_and_corners_at_the_edge_are_missed_with_a_reason():
+    image, corners = _frontal(4), _truth("frontal")
+    u, v = np.rint(corners[:4].mean(axis=0)).astype(int)
+    image[20:160, 1480:1620] = image[v - 70 : v + 70, u - 70 : u + 70].copy()
+    observed, missed = measure_markers(image, FIELD)
     assert not set(observed.targets) & {0, 1, 2, 3}
     assert missed[0]
-
-
-@pytest.mark.slow
-def test_markers_are_found_at_half_size_and_measured_at_full_size():
-    image = noisy(SCENE.render(PI_CAMERA, VIEWS["frontal"]), np.random.default_rng(5))
-    observed = measure_markers(image, FIELD)
-    truth = PI_CAMERA.project(VIEWS["frontal"], FIELD.points)
-    assert len(observed) == 48
-    assert np.abs((observed.points - truth[observed.targets]) / observed.sigmas).max() < 5
-
-
-def test_a_corner_at_the_edge_is_missed_with_a_reason():
-    image = _frontal(6)
+    missed.clear()
+    x = int(np.floor(corners[5, 0])) + 1
     found = locate_markers(image, FIELD, {})
-    x = int(np.floor(_truth(VIEWS["frontal"])[1, 0])) + 1
-    missed: dict[int, str] = {}
     measure_corners(np.ascontiguousarray(image[:, :x]), found, missed)
-    assert "edge" in missed[1]
+    assert "edge" in missed[5]
+
+
+RINGS = ("RING12:1", "RING13:65", "RING12:", "RING12:x", "RING14:65.0", "RING12:" + 5000 * "1")
+MARKERS = (
+    "DICT_NONE:1:0", "DICT_4X4_50:50:0", "DICT_4X4_50:1:4", "DICT_4X4_50", "DICT_4X4_50:a:0",
+    "DICT_4X4_50:1:0:0", "DICT_4X4_50:-1:0", "DICT_4X4_50:1:" + 5000 * "1",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "code",
-    [
-        "DICT_NONE:1:0", "DICT_4X4_50:50:0", "DICT_4X4_50:1:4", "DICT_4X4_50", "DICT_4X4_50:a:0",
-        "DICT_4X4_50:1:0:0", "DICT_4X4_50:-1:0",
-        pytest.param("DICT_4X4_50:1:" + 5000 * "1", id="5000 digits"),
-    ],
-)  # fmt: skip
-def test_other_texts_than_marker_codes_are_refused(code):
-    with pytest.raises(TestFieldError, match="DICT_"):
-        parse_marker(code)
+    ("code", "reason"),
+    [*((c, "ring code") for c in RINGS), *((c, "DICT_") for c in MARKERS)],
+    ids=lambda text: text[:20],
+)
+def test_other_texts_than_codes_are_refused(code, reason):
+    kind = "circle" if "ring" in reason else "marker_corner"
+    field = TestField.build(list("abcd"), np.eye(4, 3), 0.1, 10.0, kind, [code, "", "", ""])
+    with pytest.raises(TestFieldError, match=reason):
+        measure(_frontal(7), field)
 
 
 def test_a_duplicated_code_is_refused(tmp_path):
     """`testfield check` accepted it."""
-    points = np.random.default_rng(1).uniform(0, 100, (5, 3))
     codes = ["RING12:65", "", "RING12:65", "", ""]
     with pytest.raises(TestFieldError, match="is duplicated in the test field, at targets 'a' and"):
-        TestField.build(list("abcde"), points, 0.1, 10.0, "circle", codes)
+        TestField.build(list("abcde"), np.eye(5, 3), 0.1, 10.0, "circle", codes)
     path = tmp_path / "field.csv"
     rows = [f"{'abcde'[k]},{k},{k * k},0,9,1,1,1,{code}" for k, code in enumerate(codes)]
     path.write_text("\n".join(["target,X,Y,Z,diameter,sX,sY,sZ,code", *rows]))
@@ -165,7 +158,7 @@ def test_photographs_of_apriltags(shared):
         expected["GeneralField3"] = {7}  # OpenCV 4 does not find the small number 8
     for name, numbers in expected.items():
         path = shared / "data" / "frc" / f"{name}.jpg"
-        observed = measure_markers(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), field)
+        observed, _ = measure_markers(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), field)
         assert {int(field.names[t].split(".")[0]) for t in observed.targets} == numbers
         assert len(observed) == 4 * len(numbers)
         assert observed.sigmas.max() < 0.2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry import network_cases as cases
-from tests.photogrammetry.exact_rendering import look_at
+from tests.photogrammetry.exact_rendering import look_at, rms
 from tests.photogrammetry.fields import corner_field
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
@@ -46,9 +46,8 @@ def assert_true(result, truth, least_accuracy=1 / 20_000):
     errors, normalised = cases.normalised_errors(result.network, known)
     assert np.mean(np.abs(normalised) < 3.0) > 0.99
     assert np.abs(normalised).max() < 4.5
-    assert np.sqrt(np.mean(errors**2)) / result.network.extent < least_accuracy
+    assert rms(errors) / result.network.extent < least_accuracy
     assert result.network.relative_accuracy < least_accuracy
-    return errors, normalised
 
 
 @pytest.fixture(scope="module")
@@ -63,42 +62,31 @@ def sheet():
     return nominal, truth, photograph(truth, stations), distance
 
 
-@pytest.mark.slow
-def test_bent_sheet_with_its_nominal_field(sheet):
-    """A black and a foreign photograph are named and do no harm."""
+@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_bent_sheet_with_and_without_its_nominal_field(sheet, given):
+    """Without it, codes give the names, photographs the diameters. A black and a foreign photograph
+    are named and do no harm."""
     nominal, truth, pictures, distance = sheet
     shape = pictures["photo0.png"]().shape
     noise = np.random.default_rng(0).integers(60, 180, (77, 103), dtype=np.uint8)
     clutter = cv2.resize(noise, shape[::-1], interpolation=cv2.INTER_CUBIC)
     others = {"black.png": lambda: np.zeros(shape, dtype=np.uint8), "wall.png": lambda: clutter}
-    result = survey({**pictures, **others}, [distance], 0.00224, nominal=nominal)
+    result = survey(pictures | others, [distance], 0.00224, nominal=nominal if given else None)
     assert not {s.photo for s in result.network.stations} & set(others)
     assert result.measured["wall.png"] == "0 coded targets"
     assert "coded targets" not in result.measured["black.png"]
-    assert set(result.network.names) == set(truth.names)
+    codes = dict(zip(truth.names, truth.codes, strict=True))
+    expected = {name: code for name, code in codes.items() if code or given}
+    assert dict(zip(result.field.names, result.field.codes, strict=True)) == expected
+    assert set(result.network.names) == set(expected)
+    assert result.field.diameters == pytest.approx(np.full(len(expected), 16.0), rel=0.01)
+    rows = [result.field.index[name] for name in result.network.names]
+    assert np.allclose(result.field.points[rows], result.network.points)
     assert_true(result, truth)
     interior = result.network.camera.interior.as_array() - CAMERA.interior.as_array()
     sd = np.sqrt(np.diag(result.network.interior_covariance))
     assert np.abs(interior / sd).max() < 3.7
     assert 0.8 < result.network.sigma0 < 1.25
-    assert result.field.names == truth.names
-    assert result.field.codes == nominal.codes
-    assert np.allclose(
-        result.field.points[[result.field.index[n] for n in result.network.names]],
-        result.network.points,
-    )
-
-
-def test_bent_sheet_without_a_nominal_field(sheet):
-    """The codes give the names, the photographs the diameters."""
-    _, truth, pictures, distance = sheet
-    result = survey(pictures, [distance], CAMERA.sensor.pixel_pitch)
-    coded = {name for name, code in zip(truth.names, truth.codes, strict=True) if code}
-    assert set(result.network.names) == coded
-    assert_true(result, truth)
-    assert result.field.diameters == pytest.approx(np.full(len(coded), 16.0), rel=0.01)
-    for name, code in zip(result.field.names, result.field.codes, strict=True):
-        assert truth.codes[truth.index[name]] == code
 
 
 def test_a_corner_with_four_targets_on_each_wall():
@@ -117,14 +105,14 @@ def test_a_corner_with_four_targets_on_each_wall():
 
 def test_photographs_that_do_not_fit_together_are_refused(sheet):
     nominal, _, pictures, distance = sheet
-    turned = {"portrait.png": lambda: np.ascontiguousarray(pictures["photo1.png"]().T)}
-    with pytest.raises(ImageError, match=r"portrait\.png.*1232×1640"):
-        survey(pictures | turned, [distance], 0.00224, nominal=nominal)
+    portrait = {"portrait.png": lambda: np.ascontiguousarray(pictures["photo1.png"]().T)}
     black = {"night.png": lambda: np.zeros((1232, 1640), dtype=np.uint8)}
-    with pytest.raises(ImageError, match="no photograph shows a coded target"):
-        survey(black, [distance], 0.00224, nominal=nominal)
-    with pytest.raises(GeometryError, match="2 photographs"):
-        survey(dict([*pictures.items()][:2]), [distance], 0.00224, nominal=nominal)
     nowhere = Distance("R65", "P9999", 100.0, 0.1)
-    with pytest.raises(GeometryError, match="P9999"):
-        survey(pictures, [nowhere], 0.00224, nominal=nominal)
+    for given, scale, error, reason in (
+        (pictures | portrait, distance, ImageError, r"portrait\.png.*1232×1640"),
+        (black, distance, ImageError, "no photograph shows a coded target"),
+        (dict([*pictures.items()][:2]), distance, GeometryError, "2 photographs"),
+        (pictures, nowhere, GeometryError, "P9999"),
+    ):
+        with pytest.raises(error, match=reason):
+            survey(given, [scale], 0.00224, nominal=nominal)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import corner_camera as scene
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.reduce import reduce_together
 from thermocald.thermal.series import SeriesInput
 
@@ -44,17 +42,15 @@ def year(temperature, moved, seed, afternoons=(200,), noise_K=0.02, targets=24):
     drive = moved(at, T).mean(axis=1)
     for column, rate in RATES.items():
         values[:, column] += rate * (drive - 15.0)
-    sigma = scene.SIGMA_PX / np.sqrt(count)
-    points = project(scene.SENSOR, values[:, :10], values[:, 10:], field.points)
-    points += rng.normal(0, 1, points.shape) * sigma[:, None, None]
-    weights = np.zeros((*points.shape[:2], 3))
-    weights[..., :2] = 1.0 / sigma[:, None, None] ** 2
+    size = np.sqrt(count)[:, None, None]
+    grid = scene.observe_series(field, values, rng, noise=1 / size)
+    grid.weights[:] *= size**2
     noise = noise_K / np.sqrt(count)
     read = T.mean(axis=1) + rng.normal(0, 1, len(t)) * noise
     return reduce_together([
         SeriesInput(
             "year", "camera", scene.SENSOR, field, scene.INTERIOR.c, t, t, {"temperature": read},
-            {"temperature": None}, ObservationGrid(points, weights), start, series="year",
+            {"temperature": None}, grid, start, series="year",
             interior=scene.INTERIOR, counts=count, noises={"temperature": noise},
         )
     ])  # fmt: skip

@@ -14,6 +14,7 @@ import argparse
 import os
 import time
 from collections.abc import Iterable, Iterator
+from itertools import product
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -21,14 +22,7 @@ import numpy as np
 
 from tests.blind.generator import Series
 from tests.blind.outcome import Outcome, compare
-from tests.real_corners.generator import (
-    CAMERAS,
-    NINE,
-    OTHERS,
-    SHARED,
-    RealCase,
-    generate,
-)
+from tests.real_corners.generator import CAMERAS, NINE, OTHERS, SHARED, RealCase, generate
 from thermocald.discovery.result import Discovery, discover_series
 from thermocald.numbers import percent
 from thermocald.store.recording.reader import read_recording
@@ -78,24 +72,21 @@ def judge_discovery(case: RealCase, discovery: Discovery, truth: dict, seconds: 
 
 def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> Iterator[RealCase]:
     """Yield the cases of a part."""
-    for camera in cameras:
-        for seed in seeds:
-            if part == "none":
-                for k in range(NONE_PER_SEED):
-                    yield RealCase(camera, (), seed * NONE_PER_SEED + k)
-            else:
-                for effect in NINE if part == "nine" else OTHERS:
-                    yield RealCase(camera, (effect,), seed)
+    hidden = {"nine": NINE, "others": OTHERS}.get(part)
+    for camera, seed in product(cameras, seeds):
+        if hidden:
+            yield from (RealCase(camera, (effect,), seed) for effect in hidden)
+        else:
+            none = range(seed * NONE_PER_SEED, (seed + 1) * NONE_PER_SEED)
+            yield from (RealCase(camera, (), k) for k in none)
 
 
 def missed(part: str, done: list[Outcome]) -> list[str]:
     """Return a sentence for each missed goal of a part."""
     named = float(np.mean([o.right_or_listed for o in done]))
-    out = []
-    if named < GOALS[part]:
-        out.append(
-            f"{part}: {percent(named)} named exactly or listed; the goal is {percent(GOALS[part])}"
-        )
+    out, goal = [], GOALS[part]
+    if named < goal:
+        out.append(f"{part}: {percent(named)} named exactly or listed; the goal is {percent(goal)}")
     gaps = [o.gap_closed for o in done if o.right and o.case.effects and o.gap_closed is not None]
     open_ = sum(g < GAP_CLOSED for g in gaps)
     if open_ > 0.1 * len(gaps):
@@ -117,20 +108,10 @@ def main() -> None:
     for part in a.part or ("nine", "none"):
         done = []
         for case in cases(part, range(a.first, a.first + a.seeds), a.camera or CAMERAS):
-            o = judge(case)
-            done.append(o)
-            mark = "  " if o.right else "l " if o.right_or_listed else "X "
-            closed = "-" if o.gap_closed is None else f"{o.gap_closed:.2f}"
-            print(
-                f"{mark}{case.camera} {'+'.join(case.effects) or 'none'} seed {case.seed}: "
-                f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, gap {closed}, "
-                f"{o.seconds:.1f} s", flush=True,
-            )  # fmt: skip
-        print(
-            f"{part}: exact {sum(o.right for o in done)} of {len(done)}, exact or listed "
-            f"{sum(o.right_or_listed for o in done)}, median "
-            f"{np.median([o.seconds for o in done]):.1f} s"
-        )
+            done.append(judge(case))
+            print(done[-1], flush=True)
+        right, listed = (sum(getattr(o, k) for o in done) for k in ("right", "right_or_listed"))
+        print(f"{part}: exact {right} of {len(done)}, exact or listed {listed}")
         failed += missed(part, done)
     if a.check and failed:
         raise SystemExit("\n".join(failed))

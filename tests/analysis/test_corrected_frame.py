@@ -13,7 +13,6 @@ from PIL import Image
 
 from tests.analysis.test_gauge import START, thermal_camera
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.correction import FrameCorrector
 from thermocald.epoch import Epoch
 from thermocald.errors import ImageError
@@ -118,13 +117,3 @@ def test_other_images_are_refused(thermal):
     ):
         with pytest.raises(ImageError, match=words):
             corrected(thermal, encoded, done)
-
-
-def test_strips_give_the_whole_image(thermal):
-    """The size is no multiple of a strip or a node."""
-    here = thermal.for_images(1640, 1232)
-    image = np.random.default_rng(0).integers(0, 256, (515, 821), dtype=np.uint8)
-    sensor, hot = replace(here.model.sensor, width=821, height=515), here.at(HOT).values
-    maps = Maps(sensor, here.at(20.0).values, 20.0)
-    whole = cv2.remap(image, *maps.of(hot), cv2.INTER_CUBIC)
-    assert np.array_equal(maps.resample(image, hot), whole)

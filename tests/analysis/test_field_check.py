@@ -14,7 +14,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     DEFAULT_FREE,
     IOP_NAMES,
     CameraModel,
-    ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )

@@ -16,7 +16,6 @@ from thermocald.analysis.study.montecarlo import (
     shares_within,
     simulate_errors,
 )
-from thermocald.errors import GeometryError
 
 POINTS = image_grid(SENSOR)
 EXPECTED = on_plane(SENSOR, IOP, POINTS, 1e4)
@@ -33,29 +32,6 @@ def test_errors_equal_opencvs_and_with_an_affinity_those_of_the_camera_model():
     found = plane_errors(SENSOR, sets, POINTS, EXPECTED, 1e4)
     ours = [on_plane(SENSOR, one, POINTS, 1e4) - EXPECTED for one in sets]
     np.testing.assert_allclose(found.T, ours, atol=1e-5)
-
-
-def test_an_indefinite_matrix_of_medians_becomes_the_nearest_correlation_matrix():
-    matrix = np.eye(10)
-    matrix[0, 1] = matrix[1, 0] = matrix[1, 2] = matrix[2, 1] = 0.95
-    matrix[0, 2] = matrix[2, 0] = 0.2
-    assert np.linalg.eigvalsh(matrix).min() < 0
-    root = draw_root(np.ones(10), matrix)
-    repaired = root.T @ root
-    np.testing.assert_allclose(np.diag(repaired), 1)
-    assert np.abs(repaired - matrix).max() < 0.3
-
-
-def test_sets_that_fold_the_image_are_counted_and_left_out():
-    """An expected point without a ray is refused."""
-    wild, folded = SDS.copy(), IOP.copy()
-    wild[3], folded[3] = 0.06, -0.2
-    result = simulate_errors(SENSOR, IOP, wild, CORRELATION, StudySettings(sets=2000))
-    assert 0 < result.folded < 2000
-    assert result.counts.sum() == 9 * (2000 - result.folded)
-    assert np.isfinite(result.overall_mean)
-    with pytest.raises(GeometryError, match="no ray"):
-        simulate_errors(SENSOR, folded, SDS, CORRELATION, StudySettings(sets=100))
 
 
 @pytest.mark.parametrize("sets", [50_000, pytest.param(5_000_000, marks=pytest.mark.slow)])

@@ -12,9 +12,7 @@ from thermocald.analysis.statistics.dependence import (
     dependence,
     fit_straight_line,
     holm,
-    median_correlations,
     moving_f_test,
-    pearson_matrix,
     slope_noise,
     slope_p_value,
     unbroken_windows,
@@ -84,16 +82,6 @@ def test_one_bad_epoch_is_no_drift():
     assert min(found) > 0.05
 
 
-def test_rounded_values_are_no_drift():
-    """Most steps are 0 and the others jumps; 95 % once drifted at 1 %."""
-    rng = np.random.default_rng(17)
-    found = []
-    for _ in range(100):
-        y = 2.0 * np.round(noise(rng) / 2.0) + 1e-3 * noise(rng)
-        found.append(drift_test(y, ONES, REDUNDANCY).p_value <= 0.01)
-    assert np.mean(found) <= 0.05  # 99.9 % point of a share of 1 %
-
-
 def test_a_warm_up_with_a_gap_is_found():
     kept = np.delete(np.arange(N), slice(60, 100))
     y = 40 * WARM_UP[kept] + noise(np.random.default_rng(15))[kept]
@@ -126,15 +114,6 @@ def test_pearson_and_its_t_test():
 def test_holm():
     """The sorted p times 4, 3, 2, 1, each at least the one before."""
     assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-
-
-def test_the_correlation_matrix_equals_numpys_without_missing_epochs():
-    columns = np.random.default_rng(3).standard_normal((3, 50))
-    columns[2, 7] = np.nan
-    kept = np.delete(columns, 7, axis=1)
-    found = pearson_matrix(list(columns))
-    assert found[0, 1] == pytest.approx(np.corrcoef(columns[:2])[0, 1])
-    np.testing.assert_allclose(found[2], np.corrcoef(kept)[2], atol=1e-12)
 
 
 def test_slope_is_unbiased_and_its_sd_true():
@@ -231,17 +210,3 @@ def test_the_f_test_equals_scipys():
     # single missing epochs are not gaps
     time_s = np.delete(TIME_S, [20, 50, 51, 90])
     assert len(unbroken_windows(time_s, 31)) == len(time_s) - 30
-
-
-def test_median_over_both_series_and_noise_within_each():
-    """The step from one series to the other is not noise."""
-    rng = np.random.default_rng(1)
-    series = []
-    for level in (0.5, 0.7):
-        matrices = np.tile(np.eye(2), (4000, 1, 1))
-        matrices[:, 0, 1] = matrices[:, 1, 0] = level + 0.03 * noise(rng, n=4000)
-        series.append(matrices)
-    found = median_correlations(series)
-    assert found.median[0, 1] == pytest.approx(0.6, abs=0.02)
-    assert found.noise[0, 1] == pytest.approx(0.03, rel=0.05)
-    assert found.epochs == 8000

@@ -53,9 +53,10 @@ def test_covariance_against_draws():
     state, names = camera.at(43.0), camera.parameters
     draws = np.random.default_rng(5).standard_normal((400, len(names)))
     draws *= np.sqrt(np.diag(camera.covariance))
-    moved = [model.with_values({n: model.value(n) + change for n, change in zip(names, draw)})
-             for draw in draws]  # fmt: skip
-    values = [ThermalCamera(one).at(43.0).values for one in moved]
+    values = []
+    for draw in draws:
+        drawn = {n: model.value(n) + d for n, d in zip(names, draw.tolist(), strict=True)}
+        values.append(ThermalCamera(model.with_values(drawn)).at(43.0).values)
     scatter = np.std(values, axis=0, ddof=1)
     stated = np.sqrt(np.diag(state.covariance))
     free = stated > 0

@@ -20,20 +20,12 @@ from benchmarks.audit_thermal import (
     read_apart,
     seen,
     seen_by_opencv,
-    switched,
 )
-from tests.commands import answer as run
-from tests.marks import mostly_slow
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError
-from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
-from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.series.adjustment import adjust_series
-from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import choose_distortion
-from thermocald.thermal.noise import calibrate_thermometers
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import epochs_input
 
@@ -51,17 +43,6 @@ def simulated(seed, series="M1", epochs=120, listed=(LAG,), power=9.0):
     """Return a simulation with these effects; M1 is heated for a shorter time than others."""
     until = 500.0 if series == "M1" else 700.0
     return audit_thermal.simulated(seed, tuple(listed), epochs, power, until, series)
-
-
-def misread(seed, epochs, noise, field_mm):
-    """Return a simulation with this noise of its thermometers, and it seen with a wrong field."""
-    s = simulated(seed, epochs=epochs)
-    thermometers = {k: replace(t, noise=noise) for k, t in s.device.thermometers.items()}
-    s = replace(s, device=replace(s.device, thermometers=thermometers))
-    rng = np.random.default_rng(1000 + seed)
-    wrong = s.field.points + rng.normal(0, field_mm, s.field.points.shape)
-    stated = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field_mm))
-    return s, epochs_input(s.head, stated, list(s.epochs()), "M1")
 
 
 def for_fit(source):
@@ -172,45 +153,6 @@ def test_refusals():
         for_fit(epochs_input(steady.head, steady.field, few, "few"))
 
 
-def test_correct_points_command(tmp_path):
-    """M2's points, once corrected, are constant within the noise, and the bands are true."""
-    second = simulated(2, "M2", power=6.5)
-    for s in (simulated(1, "M1"), second):
-        s.write(tmp_path / s.programme.series)
-    truth = second.image_points(slice(None))
-    visible = second.model.sensor.contains(truth, 1.0).all(axis=0)
-    targets, rows = np.flatnonzero(visible)[::7], ["time,x,y,name"]
-    for e in range(0, 120, 5):
-        time = second.programme.begin + second.frame_times[e]
-        rows += [f"{time:.3f},{truth[e, t, 0]:.6f},{truth[e, t, 1]:.6f},{t}" for t in targets]
-    (tmp_path / "points.csv").write_text("\n".join(rows) + "\n")
-    for command in (
-        ("fit", tmp_path / "M1", "-o", tmp_path / "cam.yaml", "--effect", "thermal_lag"),
-        ("correct", tmp_path / "points.csv", "--model", tmp_path / "cam.yaml", "--log",
-         tmp_path / "M2" / "epochs.csv", "--temperature-column", "temperature", "--to", 31.0,
-         "--out", tmp_path / "out.csv"),
-    ):  # fmt: skip
-        result = run(*command)
-        assert result.exit_code == 0, result.exception
-    before, after = (
-        np.genfromtxt(tmp_path / name, delimiter=",", names=True)
-        for name in ("points.csv", "out.csv")
-    )
-    spread, left = (
-        np.mean([np.ptp(d["x"][before["name"] == t]) for t in targets]) for d in (before, after)
-    )
-    assert spread > 4.0
-    assert left < 0.1 * spread
-    # compared with the truth at 31 °C; the model's errors are common to all points, and a lag damps
-    # the thermometer's noise, so the stated error is an upper bound
-    model = second.model
-    steady = model.interior.as_array() + (31.0 - model.T0) * model.rate_vector
-    at31 = project(model.sensor, steady, second.exterior.as_array(), second.field.points)
-    level = after["x"] - at31[before["name"].astype(int), 0]
-    ratio = np.sqrt(np.mean(((level - level.mean()) / after["sd_x"]) ** 2))
-    assert 0.1 < ratio < 1.3
-
-
 @pytest.mark.parametrize(("depth", "doubtful"), [("corner", False), ("wall", True)])
 def test_rates_are_doubtful_with_a_field_that_hardly_shows_c(depth, doubtful):
     """With one wall they are off by 4 to 19 standard deviations, with a corner by 1.2."""
@@ -295,35 +237,6 @@ def test_an_unstated_affinity_is_reported_and_estimated(tmp_path):
 SEEDS = range(1, 5)
 
 
-def test_the_rates_of_an_opencv_camera_whose_f_changes():
-    """The distortion follows the angle; A and B are free in each epoch of a series adjustment."""
-    errors, apart = [], []
-    for seed in SEEDS:
-        s = simulated(seed, listed=())
-        source = seen_by_opencv(s)
-        f = fitted(source)
-        assert f.model.distortion == "angle"
-        assert f.model.evidence["fit"]["effect_missing"] is False
-        errors.append(rate_errors(f, s))
-        if seed > 2:
-            continue
-        rows = [np.flatnonzero(there) for there in source.grid.observed]
-        observed = [Observations(r, points[r], np.full((len(r), 2), 0.04))
-                    for r, points in zip(rows, source.grid.points, strict=True)]  # fmt: skip
-        found = adjust_series(
-            source.sensor, source.field, observed, s.model.interior,
-            ExteriorOrientation.from_array(s.truth.eop[0]), SeriesSettings(),
-        )  # fmt: skip
-        T = s.true_history.temperature()
-        for column, name in enumerate(("c", "x0", "y0")):
-            (rate, _), C = np.polyfit(T, found.values[:, column], 1, cov=True)
-            apart.append((rate - s.model.rates[name]) / np.sqrt(C[0, 0]))
-    assert np.abs(errors).max() < 3.0
-    assert np.abs(apart).max() < 3.0
-    # twelve numbers give a standard deviation to 20 %
-    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
-
-
 def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
     recognised = 0
     for seed in SEEDS:
@@ -353,19 +266,6 @@ def test_the_distortion_is_recognised_before_any_effect(effect):
         assert choose_distortion([for_fit(source)])[0] == "angle"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("interval", [10.0, 15.0])
-def test_the_noise_of_readings_between_the_frames(interval):
-    """Interpolated values have less noise than a reading, which is what is estimated."""
-    found = []
-    for seed in range(1, 7):
-        source = read_apart(simulated(seed, listed=()), 0.0, interval)
-        e = calibrate_thermometers([for_fit(source)])[0]
-        found.append(e.thermometers[e.history.reference].noise)
-    # eighty readings give it to 8 %, six series to 3.3 %; the lamp's kinks add 4 %
-    assert 0.90 < np.mean(found) / 0.05 < 1.14
-
-
 def test_a_wrong_clock():
     for seed in (1, 2):
         s = simulated(seed, listed=())
@@ -375,27 +275,13 @@ def test_a_wrong_clock():
         assert np.abs(rate_errors(f, s)).max() < 3.5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("interval", [10.0, 15.0, 30.0, 60.0])
-def test_a_wrong_clock_with_any_interval_of_readings(interval):
-    """The temperature bends between readings; a straight line would add a delay of h²/12τ."""
-    off = []
-    for seed, late in enumerate([*np.linspace(-90.0, 90.0, 12), 0.0, interval / 2], start=40):
-        f = fitted(read_apart(switched(seed), float(late), interval), DELAY)
-        assert ("read_seldom" in f.fitted) >= (interval == 60.0)
-        assert interval > 15.0 or "the temperature turns between" not in " ".join(f.lines())
-        off.append(pull(f, "time_offset.d", -late))
-    assert np.max(np.abs(off)) < 3.5
-    # the RMS of fourteen draws scatters by 0.2
-    assert np.sqrt(np.mean(np.square(off))) < 1.6
-
-
 def test_a_delay_by_a_thermometer_of_1_k():
     """Where frames are half-way between readings, its sd was a tenth of its error."""
     off = {}
     for seed in (9107, 9109):
         true = float(np.random.default_rng([seed, 4]).uniform(-25, 25))
-        f = fitted(read_with(simulated(seed, listed=[replace(DELAY, values={"d": true})]), 1.0), DELAY)
+        s = simulated(seed, listed=[replace(DELAY, values={"d": true})])
+        f = fitted(read_with(s, 1.0), DELAY)
         if "read_poorly" not in f.fitted:
             off[seed] = pull(f, "time_offset.d", true)
     assert 9107 not in off  # it is 15 standard deviations off

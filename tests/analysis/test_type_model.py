@@ -145,8 +145,10 @@ def at_three_temperatures(cycle, interval, epochs, seed=5):
 def at_rest_only(cycle, seed):
     """Reduce four frames at rest at each temperature; the thermometer is read in all epochs."""
     rows = {row + k for row in (26, 56, 116) for k in range(4)}
-    epochs = [e if i in rows else replace(e, observations=None)
-              for i, e in enumerate(at_three_temperatures(cycle, 50.0, 120, seed).epochs())]  # fmt: skip
+    chamber = at_three_temperatures(cycle, 50.0, 120, seed)
+    epochs = [
+        e if i in rows else replace(e, observations=None) for i, e in enumerate(chamber.epochs())
+    ]
     return for_fit(epochs_input(cycle.head, cycle.field, epochs, "M1"))
 
 

@@ -31,7 +31,7 @@ READING_SD = float(np.hypot(0.04, 0.0625 / np.sqrt(12.0)))
 
 
 @dataclass(frozen=True)
-class Tested:
+class PredictedCase:
     """A tested case: RMS on M2 over the true floor, and the share inside the stated 95 % bands."""
 
     effect: str
@@ -55,7 +55,7 @@ def effect_option(name: str, truth: dict) -> list[str]:
 
 def predict_case(
     name: str, seed: int, folder: Path, px: float = 0.3, discover: bool = False
-) -> Tested:
+) -> PredictedCase:
     """Fit M1 with the true effect (`discover`: with those that discovery finds), and test on M2."""
     series, truth = generate(Case((name,) if name != "none" else (), px, seed))
     for s in series:
@@ -74,10 +74,10 @@ def predict_case(
     second = reduce_series(source, strict=False)
     true = predicted_error(_with_true_noise(fitted, truth), second, READING_SD)
     rms_px = tested["rms_px"]
-    return Tested(name, seed, rms_px / true.floor_px, tested["coverage"], rms_px)
+    return PredictedCase(name, seed, rms_px / true.floor_px, tested["coverage"], rms_px)
 
 
-def pooled(cases: list[Tested]) -> tuple[float, float]:
+def pooled(cases: list[PredictedCase]) -> tuple[float, float]:
     """Return the RMS of the ratios, and the mean coverage."""
     ratios = np.array([c.ratio for c in cases])
     return float(np.sqrt(np.mean(ratios**2))), float(np.mean([c.coverage for c in cases]))

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.audit_thermal import rate_errors, seen
-from tests.analysis.test_thermal_model import for_fit, reduced, run, simulated
+from tests.analysis.test_thermal_model import for_fit, reduced, simulated
+from tests.commands import answer as run
 from tests.marks import mostly_slow
 from thermocald.analysis.thermal.certificate import model_lines
 from thermocald.analysis.thermal.prediction_test import predicted_error

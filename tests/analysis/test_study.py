@@ -145,8 +145,8 @@ def with_a_gap(series):
                      "No epoch has a covariance matrix", {"Monte-Carlo"}, id="no covariance"),
         pytest.param({}, lambda s: replace(s, correlations=np.tile(INDEFINITE, (150, 1, 1))),
                      "A3, C1, C2 were held fixed", set(), id="an indefinite matrix of medians"),
-        pytest.param({"sds": SDS + 0.02 * np.eye(10)[3]}, lambda s: s, r"\d of 2000 drawn interior orienta"
-                     "tions fold the image", set(), id="folded images"),
+        pytest.param({"sds": SDS + 0.02 * np.eye(10)[3]}, lambda s: s,
+                     r"\d of 2000 drawn interior orientations fold", set(), id="folded images"),
         pytest.param({}, lambda s: replace(s, values=s.values - 0.2 * np.eye(10)[3]),
                      "No Monte-Carlo: .*no ray", {"Monte-Carlo"}, id="a camera without rays"),
         pytest.param({"drift": {}}, lambda s: s, "mostly the noise of an epoch's calibration",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from thermocald.photogrammetry.epoch.measuring import Plane, place_on
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.store.recording.reader import read_recording
+from thermocald.store.series import EpochResult
 
 POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 NAMES = ("c", "x0", "y0")
@@ -195,6 +197,21 @@ def test_the_state_after_a_restart_has_true_sds():
         past = at.camera.covariance[0, 0] - thermal_camera().at(20.0).covariance[0, 0]
         ratio.append(error / np.sqrt(past))
     assert np.std(ratio) == pytest.approx(1.0, abs=0.2)
+
+
+def test_remembered_epochs_restore_the_state():
+    world, camera = World(3), thermal_camera(TAU)
+    epochs = [world.epoch(k, 20.0 + 0.06 * k) for k in range(1, 100)]
+    results, *_ = followed(GaugeCalibrator(camera, world.field), epochs)
+    second = GaugeCalibrator(camera, world.field)
+    second.remember(
+        SimpleNamespace(epoch=done.epoch, result=EpochResult.from_adjustment(done.adjustment))
+        for done in results[:-1]
+    )
+    again, last = second.calibrate(epochs[-1]).adjustment, results[-1].adjustment
+    assert again.status == "resected"
+    assert again.values == pytest.approx(last.values, rel=1e-9)
+    assert again.sd == pytest.approx(last.sd, rel=1e-9, nan_ok=True)
 
 
 def test_the_last_pose_is_kept_with_growing_covariance_while_points_are_hidden():

@@ -19,7 +19,6 @@ from benchmarks.audit_thermal import (
     rate_errors,
     read_apart,
     seen,
-    seen_by_opencv,
 )
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
@@ -262,8 +261,7 @@ def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
 ], ids=lambda e: e.name)  # fmt: skip
 def test_the_distortion_is_recognised_before_any_effect(effect):
     for seed in SEEDS[:3]:
-        source = seen_by_opencv(simulated(seed, listed=(effect,)))
-        assert choose_distortion([for_fit(source)])[0] == "angle"
+        assert choose_distortion([reduced(simulated(seed, listed=(effect,)))])[0] == "angle"
 
 
 def test_a_wrong_clock():

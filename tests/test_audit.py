@@ -54,9 +54,14 @@ def test_every_ratio_on_the_page_is_met():
                     assert 0.85 - 3 * sd <= ratio_ <= 1.1 + 3 * sd, (section, printed_by)
 
 
-@pytest.mark.parametrize(
-    "section", mostly_slow(["epoch", "significance", "online", "null"], "epoch")
-)
+WHOLE = (
+    "epoch", "series", "mount", "survey", "online", "significance", "null", "thermal",
+    "distortion", "thermometer", "outside",
+)  # fmt: skip
+"""Sections that take less than a minute."""
+
+
+@pytest.mark.parametrize("section", mostly_slow(WHOLE, "epoch"))
 def test_the_page_shows_what_the_audit_prints(section):
     """All 200 draws: the same seed gives the same ratios, and all are met."""
     rows = SECTIONS[section](200, np.random.default_rng(1))

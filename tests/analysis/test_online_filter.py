@@ -11,6 +11,7 @@ from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.analysis.online.observer import EquilibriumWatch, OnlineObserver, fit_approach
 from thermocald.epoch import Epoch
+from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.testfield import TestField
 
 RATES = np.array([2.0e-4, -4.5e-4, -3.0e-4])
@@ -111,6 +112,14 @@ def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
     assert take(change=2.0 * np.eye(16)[13]).change == "outlier"
     assert np.abs((found.values() - before)[:3]).max() < 1e-9
     assert take().change == ""
+
+
+def test_an_epoch_without_a_result_changes_nothing():
+    camera = Surveyed(0.0, 4)
+    observer = OnlineObserver(camera.sensor, camera.field, lambda *_: None)
+    epoch = Epoch(1, 0.0, 0.0, {"temperature": 25.0}, None, camera.epoch()[0])
+    assert observer.observe(CalibratedEpoch(epoch, failed("bad_frame", ""), {})) == {}
+    assert observer.filter.epochs == 0
 
 
 @pytest.mark.parametrize("missing", mostly_slow([0.0, 0.1], 0.1))

@@ -87,6 +87,10 @@ def test_a_store_without_any_result_is_refused(recording, tmp_path):
         store.append(stored, opened.epochs[0], EpochResult("weak_geometry", "one plane"))
     with pytest.raises(DataError, match=r"no epoch has a result \(1 × weak geometry\)"):
         tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
+    with Store.open(tmp_path / "empty.db", "append", durable=False):
+        pass
+    with pytest.raises(DataError, match="holds no series"):
+        tc.open_all(tmp_path / "empty.db")
 
 
 def test_a_warm_up_is_found_in_its_parameters_only(warm_up):

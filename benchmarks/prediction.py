@@ -16,7 +16,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from tests.analysis.blind_prediction import SINGLE, pooled, predict_case
+from tests.analysis.test_blind_prediction import SINGLE, pooled, predict_case
 
 
 def main() -> int:

@@ -21,8 +21,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
-from tests.analysis.river_scenes import KINDS, Outcome, play
 from tests.analysis.test_gauge import SD_RATE, START
+from tests.analysis.test_river import KINDS, Outcome, play
 from tests.analysis.test_scene import HOURS, LACKING, WARMTH, Bank, camera, drawn
 from thermocald.analysis.thermal.scene import SceneCourse, follow_scene
 from thermocald.store.logger.temperatures import TemperatureLog

@@ -22,7 +22,7 @@ LONGEST = (
     "discovery/test_movement", "discovery/test_years", "cli/test_discover",
     "daemon/test_page_attacks", "daemon/test_faults", "fleet/test_dask",
     "output/test_pages", "store/test_bounds", "photogrammetry/test_ring_code", "docs/test_site",
-    "daemon/test_chaos", "analysis/test_type_model", "analysis/test_type_fit",
+    "daemon/test_chaos", "analysis/test_type_model",
     "discovery/test_grammar", "analysis/test_river", "analysis/test_running_series",
     "photogrammetry/test_measurement", "analysis/test_scene",
     # of the quick one, by the processor time of each file
@@ -40,7 +40,7 @@ LONGEST = (
     "analysis/test_online_filter", "store/test_hostile_input", "output/test_series_export",
     "cli/test_real_data", "test_names", "daemon/test_store_file", "store/test_wal",
     "cli/test_outputs", "store/test_damage", "photogrammetry/test_markers", "fleet/test_trouble",
-    "daemon/test_gauge", "output/test_pyorc", "fleet/test_forward", "analysis/test_distortion",
+    "daemon/test_gauge", "output/test_pyorc", "fleet/test_forward",
     "store/test_times", "photogrammetry/test_image_file", "daemon/test_virtual_clock",
     "test_helpers", "photogrammetry/test_survey", "cli/test_measure",
     "photogrammetry/test_measuring",

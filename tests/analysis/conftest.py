@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -44,23 +44,14 @@ class WarmUp:
         correlation = np.eye(10)
         correlation[3, 4] = correlation[4, 3] = -0.9
         correlation[1, 6] = correlation[6, 1] = correlation[2, 7] = correlation[7, 2] = 0.6
-        columns = {
-            "label": label,
-            "name": name,
-            "camera": "nexus5",
-            "sensor": NEXUS,
-            "source": "formula",
-            "time_s": time_s,
-            "thermometers": (Thermometer("temperature", temperature, self.thermometer_sd),),
-            "values": values,
-            "sds": sds,
-            "sigma0": 1 + 0.04 * rng.standard_normal(n),
-            "redundancy": np.full(n, 284.0),
-            "correlations": np.tile(correlation, (n, 1, 1)),
-            "exterior": "series",
-            "without_result": {},
-        }
-        return MeasuredSeries(**{**columns, **changes})
+        made = MeasuredSeries(
+            label=label, name=name, camera="nexus5", sensor=NEXUS, source="formula", time_s=time_s,
+            thermometers=(Thermometer("temperature", temperature, self.thermometer_sd),),
+            values=values, sds=sds, sigma0=1 + 0.04 * rng.standard_normal(n),
+            redundancy=np.full(n, 284.0), correlations=np.tile(correlation, (n, 1, 1)),
+            exterior="series", without_result={},
+        )  # fmt: skip
+        return replace(made, **changes)
 
 
 @pytest.fixture

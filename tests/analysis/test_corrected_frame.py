@@ -13,7 +13,6 @@ from PIL import Image
 
 from tests.analysis.test_gauge import START, thermal_camera
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.correction import FrameCorrector
 from thermocald.epoch import Epoch
 from thermocald.errors import ImageError
@@ -106,31 +105,15 @@ def test_exif_colours_and_comment_of_the_camera_stay(thermal):
     assert abs(float(np.median(np.asarray(image)[..., 0])) - 90) < 3
 
 
-def test_sixteen_bits_become_a_jpeg(thermal):
-    hot = seen_at(thermal, HOT)
-    deep = corrected(thermal, png(hot.astype(np.uint16) << 8))
-    assert deep == corrected(thermal, png(hot))
-
-
-@pytest.mark.parametrize(
-    ("encoded", "words"),
-    [(png(np.zeros((60, 80), np.uint8)), "80×60 px, the model's camera 820×616"),
-     (b"\xff\xd8 no image", "the JPEG is cut off")],
-)  # fmt: skip
-def test_other_images_are_refused(thermal, encoded, words):
-    with pytest.raises(ImageError, match=words):
-        corrected(thermal, encoded)
+def test_other_images_are_refused(thermal):
+    """16 bits become a JPEG."""
+    deep, small = np.full((616, 820), 9 << 8, np.uint16), np.zeros((60, 80), np.uint8)
+    assert corrected(thermal, png(deep)) == corrected(thermal, png((deep >> 8).astype(np.uint8)))
     far = CalibratedEpoch(calibrated(thermal).epoch, failed("outside_range", "90 °C"), {})
-    with pytest.raises(ImageError, match="outside_range: 90 °C"):
-        corrected(thermal, encoded, far)
-
-
-def test_strips_give_the_whole_image(thermal):
-    """The size is no multiple of a strip or a node."""
-    here = thermal.for_images(1640, 1232)
-    hot = here.at(HOT).values
-    image = np.random.default_rng(0).integers(0, 256, (515, 821), dtype=np.uint8)
-    sensor = replace(here.model.sensor, width=821, height=515)
-    maps = Maps(sensor, here.at(20.0).values, 20.0)
-    whole = cv2.remap(image, *maps.of(hot), cv2.INTER_CUBIC)
-    assert np.array_equal(maps.resample(image, hot), whole)
+    for encoded, done, words in (
+        (png(small), None, "80×60 px, the model's camera 820×616"),
+        (b"\xff\xd8 no image", None, "the JPEG is cut off"),
+        (png(deep), far, "outside_range: 90 °C"),
+    ):
+        with pytest.raises(ImageError, match=words):
+            corrected(thermal, encoded, done)

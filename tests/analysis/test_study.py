@@ -1,4 +1,4 @@
-"""Studies of series and cameras: results, and notes where there is no result."""
+"""Studies of series and cameras: input, results, and notes where there is no result."""
 
 import re
 from dataclasses import replace
@@ -6,23 +6,91 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import thermocald as tc
 from tests.analysis.conftest import INTERIOR, NEXUS, SDS
 from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.study.measured import StudySettings, Thermometer
-from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
+from thermocald.analysis.study.montecarlo import trajectories
 from thermocald.analysis.study.study import (
     depth_of_field,
-    deviation,
     image_displacement,
     study,
     study_camera,
     study_series,
 )
+from thermocald.errors import DataError
 from thermocald.output.study.report import answer_sentences
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import open_recording
+from thermocald.store.series import EpochResult
 
 SETTINGS = StudySettings(sets=2000)
-CLUSTERS = (15.0, 50.0, 100.0)
+FREE = ("c", "x0", "y0", "A1", "A2", "B1", "B2")
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Write ten epochs of a warm phone, of which two have too few or no observations."""
+    tc.simulate("nexus5-warm", seed=1, epochs=10, out=tmp_path / "rec")
+    file = tmp_path / "rec" / "observations.csv"
+    lines = [line for line in file.read_text().splitlines() if not line.startswith("3,")]
+    few = [line for line in lines if line.startswith("7,")][3:]
+    file.write_text("\n".join([line for line in lines if line not in few]) + "\n")
+    return tmp_path / "rec"
+
+
+def test_epochs_without_a_result_are_counted(recording):
+    series = tc.open(recording).measured(free=FREE, exterior="series")
+    interval = tc.open(recording).head.interval
+    assert np.rint(series.time_s / interval).tolist() == [0, 1, 3, 4, 5, 7, 8, 9]
+    assert sum(series.without_result.values()) == 2
+    assert (series.free, series.exterior) == (FREE, "series")
+    # DESIGN idea 3: thousandths of a pixel with one exterior orientation
+    assert series.sds[0, 1] / series.sensor.pixel_pitch < 0.01
+    assert series.correlations.shape == (8, 10, 10)
+    assert [t.name for t in series.thermometers] == ["temperature", "board_temperature"]
+    assert 0.02 < series.thermometers[0].sd < 0.12
+    given = tc.open(recording).measured(thermometer_sd=0.25, free=FREE)
+    assert [t.sd for t in given.thermometers] == [0.25, 0.25]
+
+
+def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
+    opened = open_recording(recording)
+    covariance = np.diag(np.append(np.full(8, 1e-8), np.zeros(8)))
+    broken = covariance.copy()
+    broken[1, 1] = -1e-12
+    values = np.arange(16.0)
+    with Store.open(tmp_path / "s.db", "append", durable=False) as store:
+        stored = store.create_series(opened.head, opened.testfield, start="warm")
+        for epoch in opened.epochs:
+            result = EpochResult("ok", "", values + epoch.number, covariance, 1.0, 200, 100)
+            if epoch.number == 5:
+                result = replace(result, covariance=broken)
+            if epoch.number == 6:
+                result = EpochResult("too_few_targets", "3 targets")
+            store.append(stored, epoch, result)
+    series = tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
+    assert series.label == "nexus5-warm"
+    assert series.without_result == {"too few targets": 1, "no standard deviation": 1}
+    numbers = [1, 2, 3, 4, 7, 8, 9, 10]
+    np.testing.assert_array_equal(series.values, values[:10] + np.array(numbers)[:, None])
+    assert series.free == IOP_NAMES[:8]
+    assert len(series.correlations) == 8
+    assert series.redundancy.tolist() == [200] * 8
+
+
+def test_a_store_without_any_result_is_refused(recording, tmp_path):
+    opened = open_recording(recording)
+    with Store.open(tmp_path / "s.db", "append", durable=False) as store:
+        stored = store.create_series(opened.head, opened.testfield)
+        store.append(stored, opened.epochs[0], EpochResult("weak_geometry", "one plane"))
+    with pytest.raises(DataError, match=r"no epoch has a result \(1 × weak geometry\)"):
+        tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
+    with Store.open(tmp_path / "empty.db", "append", durable=False):
+        pass
+    with pytest.raises(DataError, match="holds no series"):
+        tc.open_all(tmp_path / "empty.db")
 
 
 def test_a_warm_up_is_found_in_its_parameters_only(warm_up):
@@ -45,73 +113,75 @@ def test_a_warm_up_is_found_in_its_parameters_only(warm_up):
         assert not {"A3", "C1", "C2"} & set(part)
 
 
-def test_a_series_that_holds_a_parameter_does_not_reduce_its_sd(warm_up):
-    one, other = warm_up()("M1"), warm_up()("M2")
-    k = IOP_NAMES.index("B1")
-    values, sds = other.values.copy(), other.sds.copy()
-    values[:, k], sds[:, k] = values[0, k], np.nan
-    held = replace(other, values=values, sds=sds)
-    both = study_camera("camera", [one, held], SETTINGS)
-    assert both.sds[k] == pytest.approx(np.std(one.values[:, k], ddof=1))
+INDEFINITE = np.eye(10)
+"""No correlation matrix: its smallest eigenvalue is negative."""
+INDEFINITE[0, 1] = INDEFINITE[1, 0] = INDEFINITE[1, 2] = INDEFINITE[2, 1] = 0.95
+INDEFINITE[0, 2] = INDEFINITE[2, 0] = 0.2
 
 
-def test_a_single_epoch_has_notes_and_no_results(warm_up):
-    series = warm_up(epochs=1)()
-    values = series.values.copy()
-    result = study([series], SETTINGS).cameras[0]
-    np.testing.assert_array_equal(series.values, values)
-    (one,) = result.series
-    assert "a single epoch: nothing can be said about change" in " ".join(one.notes)
-    assert "The F-test needs 31 consecutive epochs; the series has 1" in " ".join(one.notes)
-    assert one.deviations == one.significance == {}
-    assert result.montecarlo is None
-    assert "No Monte-Carlo" in " ".join(result.notes)
+def with_temperature(series, temperature):
+    """Return the series with other readings of its thermometer."""
+    return replace(series, thermometers=(Thermometer("temperature", temperature, 0.05),))
+
+
+def with_a_gap(series):
+    rows = np.r_[0:60, 100:150]
+    names = ("time_s", "values", "sds", "sigma0", "redundancy", "correlations")
+    kept = replace(series, **{name: getattr(series, name)[rows] for name in names})
+    return with_temperature(kept, series.thermometers[0].values[rows])
 
 
 @pytest.mark.parametrize(
-    ("temperature", "words"),
+    ("options", "change", "words", "lacks"),
     [
-        (np.full(150, 25.0), "stayed at 25.00 °C"),
-        (25 + 0.05 * np.random.default_rng(1).standard_normal(150), "which its noise of 0.050 K"),
-        (np.full(150, np.nan), "is known in 0 of 150 epochs"),
+        pytest.param({"epochs": 1}, lambda s: s, "a single epoch: nothing can be said about change"
+                     ".*The F-test needs 31 consecutive epochs; the series has 1",
+                     {"dependence", "drift", "Monte-Carlo"}, id="a single epoch"),
+        pytest.param({}, lambda s: with_temperature(s, np.full(150, 25.0)), "stayed at 25.00 °C",
+                     {"dependence"}, id="constant temperature"),
+        pytest.param({}, lambda s: with_temperature(s, 25 + 0.05 * np.sin(np.arange(150.0))),
+                     "which its noise of 0.050 K", {"dependence"}, id="only noise"),
+        pytest.param({}, lambda s: with_temperature(s, np.full(150, np.nan)),
+                     "is known in 0 of 150 epochs", {"dependence"}, id="never read"),
+        pytest.param({}, with_a_gap, "1 gap, the longest of 410 s at an interval of 10 s", set(),
+                     id="a gap"),
+        pytest.param({}, lambda s: replace(s, correlations=np.empty((0, 10, 10))),
+                     "No epoch has a covariance matrix", {"Monte-Carlo"}, id="no covariance"),
+        pytest.param({}, lambda s: replace(s, correlations=np.tile(INDEFINITE, (150, 1, 1))),
+                     "A3, C1, C2 were held fixed", set(), id="an indefinite matrix of medians"),
+        pytest.param({"sds": SDS + 0.02 * np.eye(10)[3]}, lambda s: s,
+                     r"\d of 2000 drawn interior orientations fold", set(), id="folded images"),
+        pytest.param({}, lambda s: replace(s, values=s.values - 0.2 * np.eye(10)[3]),
+                     "No Monte-Carlo: .*no ray", {"Monte-Carlo"}, id="a camera without rays"),
+        pytest.param({"drift": {}}, lambda s: s, "mostly the noise of an epoch's calibration",
+                     set(), id="nothing but noise"),
     ],
-    ids=["constant", "noise only", "never read"],
-)
-def test_a_temperature_without_information(warm_up, temperature, words):
-    series = warm_up()(thermometers=(Thermometer("temperature", temperature, 0.05),))
-    found = study_series(series, SETTINGS)
-    assert words in " ".join(found.notes)
-    assert not found.channels[0].dependences
-    column = found.columns.index("temperature")
-    if words.startswith(("stayed", "was")):
-        assert np.isnan(found.matrix[column]).all()
-
-
-def test_gaps_are_reported_and_not_tested_across(warm_up):
-    series, rows = warm_up()(), np.r_[0:60, 100:150]
-    names = ("time_s", "values", "sds", "sigma0", "redundancy", "correlations")
-    t = series.thermometers[0]
-    kept = {"thermometers": (replace(t, values=t.values[rows]),)}
-    kept |= {name: getattr(series, name)[rows] for name in names}
-    found = study_series(replace(series, **kept), SETTINGS)
-    assert "1 gap, the longest of 410 s at an interval of 10 s" in " ".join(found.notes)
-    assert found.significance["c"].tests == 30 + 20
+)  # fmt: skip
+def test_what_the_data_do_not_allow_is_said(warm_up, options, change, words, lacks):
+    camera = study([change(warm_up(**options)())], SETTINGS).cameras[0]
+    (one,) = camera.series
+    assert re.search(words, " ".join([*camera.notes, *one.notes]))
+    absent = {
+        "dependence": not one.channels[0].dependences, "drift": not one.significance,
+        "Monte-Carlo": camera.montecarlo is None,
+    }  # fmt: skip
+    assert {part for part, missing in absent.items() if missing} == lacks
+    if "gap" in words:
+        assert one.significance["c"].tests == 30 + 20
 
 
 def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
     series = warm_up()(without_result={"too few targets": 7})
-    values = series.thermometers[0].values.copy()
-    values[40:50] = np.nan
+    temperature = series.thermometers[0].values.copy()
+    temperature[40:50] = np.nan
     series.values[:, 3] = series.values[0, 3]
-    found = study_series(
-        replace(series, thermometers=(Thermometer("temperature", values, 0.05),)), SETTINGS
-    )
+    found = study_series(with_temperature(series, temperature), SETTINGS)
     assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
     text = " ".join(answer_sentences(study_camera("c", [found.series], SETTINGS)))
     assert "while temperature (known in 140 of 150 epochs) changed by" in text
     # a constant parameter has no dependence
     assert "A1" not in found.channels[0].dependences
-    assert found.deviations["A1"].change == 0
+    assert (found.deviations["A1"].change, found.significance["A1"].drift) == (0, None)
     assert found.channels[0].dependences["x0"].n == 140
     assert abs(found.channels[0].dependences["x0"].r) > 0.99
 
@@ -128,11 +198,19 @@ def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
     assert cold.correlations.epochs == 300
     assert cold.sds[1] == pytest.approx(0.0194 * 0.2527, rel=0.01)
     assert warm.montecarlo.overall_mean < 0.6 * cold.montecarlo.overall_mean
+    # one that holds a parameter does not reduce its sd
+    one, other = pair
+    k = IOP_NAMES.index("B1")
+    values, sds = other.values.copy(), other.sds.copy()
+    values[:, k], sds[:, k] = values[0, k], np.nan
+    both = study_camera("camera", [one, replace(other, values=values, sds=sds)], SETTINGS)
+    assert both.sds[k] == pytest.approx(np.std(one.values[:, k], ddof=1))
 
 
 def test_first_order_agrees_where_errors_are_small(warm_up):
     camera = study([warm_up()()], StudySettings(sets=50_000)).cameras[0]
     first, drawn = camera.montecarlo.first_order, camera.montecarlo
+    assert "mostly the noise" not in " ".join(camera.notes)
     np.testing.assert_allclose(first.mean, drawn.mean, rtol=0.02)
     np.testing.assert_allclose(first.fractions, drawn.fractions, atol=0.01)
     # maxima of 50,000 draws scatter by several per cent
@@ -146,7 +224,7 @@ def test_first_order_agrees_where_errors_are_small(warm_up):
 def test_a_shift_of_the_principal_point_moves_all_points_equally(warm_up):
     """A change of x0 alone moves every image point by D Δx0 / c, with little distortion."""
     series = warm_up(drift={"x0": 0.0194}, sds=np.full(10, 1e-12))()
-    first, mean, last = trajectories([series], 10_000.0, 3, CLUSTERS)
+    first, mean, last = trajectories([series], 10_000.0, 3, (15.0, 50.0, 100.0))
     away = np.abs(series.values[:, 1] - series.values[0, 1]) * 10_000.0 / series.values[0, 0]
     assert first.reference == "first"
     assert first.mean == pytest.approx(away.mean(), rel=0.03)
@@ -159,24 +237,12 @@ def test_a_shift_of_the_principal_point_moves_all_points_equally(warm_up):
     assert first.fractions[0] < last.fractions[0]
 
 
-def test_correlations_over_time_refer_to_each_series_mean(warm_up):
-    made = warm_up(drift={"x0": 0.02, "y0": -0.02})
-    r = correlations_over_time([made("M1"), made("M2")])
-    assert r[1, 2] == pytest.approx(-1.0, abs=1e-3)
-    assert np.isnan(r[IOP_NAMES.index("A3"), 1])  # held
-    # a difference of levels between two series is no correlation
-    still = warm_up(drift={})
-    one, other = still("M1"), still("M2")
-    other.values[:, 1:3] += 1.0
-    assert abs(correlations_over_time([one, other])[1, 2]) < 0.3
-
-
 def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
     """The text does not claim that nothing changed, though last equals first."""
     warm = warm_up()()
     up_and_down = np.concatenate([np.arange(75), np.arange(75)[::-1]])
-    thermometer = Thermometer("temperature", warm.thermometers[0].values[up_and_down], 0.05)
-    cycle = replace(warm, values=warm.values[up_and_down], thermometers=(thermometer,))
+    cycle = replace(warm, values=warm.values[up_and_down])
+    cycle = with_temperature(cycle, warm.thermometers[0].values[up_and_down])
     camera = study_camera("rpi", [cycle], StudySettings(sets=500))
     assert camera.series[0].deviations["c"].range > 0.006
     sentences = answer_sentences(camera)
@@ -200,74 +266,28 @@ def test_a_nearly_steady_camera_is_described_by_numbers_that_hold(warm_up):
     assert re.search(r"while temperature stayed within 0\.\d\d K\.", text)
 
 
-def test_last_minus_first_ignores_missing_epochs():
-    values = np.array([np.nan, 1.0, 5.0, 2.5, np.nan])
-    found = deviation(values, np.array([9.0, 0.3, 9.0, 0.4, 9.0]))
-    assert found is not None
-    assert (found.first, found.last, found.change) == (1.0, 2.5, 1.5)
-    assert found.sd_change == pytest.approx(0.5)
-    assert found.largest == 4.0
-    # a single value has no change
-    assert deviation(np.array([np.nan, 1.0]), np.ones(2)) is None
-
-
-def displacement(series, first, later):
-    """Return the displacement of the image grid between two interior orientations."""
-    return image_displacement(replace(series, values=np.array([first, later])), image_grid(NEXUS))
-
-
-def test_displacements_by_principal_point_and_principal_distance(warm_up):
-    first = np.array([3.97, 0.01, -0.02, 5e-3, -4e-4, 0, 1e-4, -1e-4, 0, 0])
-    later = first + np.array([0, 10.0, 5.0, *[0] * 7]) * 0.0014
-    moved, _ = displacement(warm_up()(), first, later)
-    np.testing.assert_allclose(moved, np.tile([10.0, -5.0], (9, 1)), atol=1e-6)
-    first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
-    moved, _ = displacement(warm_up()(), first, 1.002 * first)
-    np.testing.assert_allclose(moved, 0.002 * (image_grid(NEXUS) - NEXUS.centre), atol=1e-9)
-
-
 def test_the_covariance_of_displacements_is_their_scatter(warm_up):
-    series = warm_up(drift={}, epochs=2)()
-    _, covariance = image_displacement(series, image_grid(NEXUS))
-
-    rng = np.random.default_rng(9)
+    series, grid = warm_up(drift={}, epochs=2)(), image_grid(NEXUS)
+    _, covariance = image_displacement(series, grid)
     sds = np.nan_to_num(series.sds[0])
     of_epoch = series.correlations[0] * np.outer(sds, sds)
-    later = rng.multivariate_normal(INTERIOR, 2 * of_epoch, 2000)  # of two independent epochs
-    grid = image_grid(NEXUS)
+    # of two independent epochs
+    later = np.random.default_rng(9).multivariate_normal(INTERIOR, 2 * of_epoch, 2000)
     scene = directions(NEXUS, INTERIOR, grid)
     moved = project(NEXUS, later, np.zeros((len(later), 6)), scene) - grid
-
     found = np.einsum("nki,nkj->kij", moved, moved) / len(moved)
     # 2000 draws give a variance to 3 %
     scale = np.sqrt(np.einsum("kii->ki", covariance))
     assert np.all(np.abs(found - covariance) < 0.15 * scale[:, :, None] * scale[:, None, :])
 
 
-def test_without_covariances_there_is_a_note_instead_of_a_monte_carlo(warm_up):
-    series = warm_up()(correlations=np.empty((0, 10, 10)))
-    camera = study([series], StudySettings(sets=100)).cameras[0]
-    assert camera.montecarlo is camera.series[0].displacement_covariance is None
-    assert "No epoch has a covariance matrix" in " ".join(camera.notes)
-
-
-@pytest.mark.parametrize("drift", [{}, {"x0": 1e-3}])
-def test_errors_on_the_plane_that_are_the_epochs_noise_are_told(warm_up, drift):
-    notes = " ".join(study([warm_up(drift)()], SETTINGS).cameras[0].notes)
-    assert ("mostly the noise of an epoch's calibration" in notes) == (not drift)
-
-
-def blur(f, f_number, focus, distance):
-    """Return the diameter of the blur circle of a thin lens."""
-    image, other = (f * s / (s - f) for s in (focus, distance))
-    return f / f_number * abs(other - image) / other
-
-
 def test_limits_of_the_depth_of_field_have_the_permitted_blur():
-    near, far = depth_of_field(3.97, 1000.0, 2.4, 0.0029)
-    assert blur(3.97, 2.4, 1000.0, near) == pytest.approx(0.0029, rel=1e-9)
-    assert blur(3.97, 2.4, 1000.0, far) == pytest.approx(0.0029, rel=1e-9)
-    # beyond the hyperfocal distance
+    """Of a thin lens; there is no far one beyond the hyperfocal distance."""
+    f, f_number, focus, permitted = 3.97, 2.4, 1000.0, 0.0029
+    for limit in depth_of_field(f, focus, f_number, permitted):
+        image, other = (f * s / (s - f) for s in (focus, limit))
+        blur = f / f_number * abs(other - image) / other
+        assert blur == pytest.approx(permitted, rel=1e-9)
     assert np.isinf(depth_of_field(3.04, 3000.0, 2.0, 0.003)[1])
     with pytest.raises(ValueError, match="no depth of field"):
         depth_of_field(3.97, 3.0, 2.0, 0.003)  # a focus inside the lens

@@ -50,26 +50,13 @@ def test_covariance_against_draws():
     """400 models are drawn with the file's standard deviations."""
     model = thermal_model(*LISTED)
     camera = ThermalCamera(model)
-    rng = np.random.default_rng(5)
-    state = camera.at(43.0)
-    names, sds = camera.parameters, np.sqrt(np.diag(camera.covariance))
-    draws = rng.standard_normal((400, len(names))) * sds
+    state, names = camera.at(43.0), camera.parameters
+    draws = np.random.default_rng(5).standard_normal((400, len(names)))
+    draws *= np.sqrt(np.diag(camera.covariance))
     values = []
     for draw in draws:
-        change = dict(zip(names, draw, strict=True))
-        interior = replace(
-            model.interior,
-            **{n: getattr(model.interior, n) + change[f"interior.{n}"] for n in ("c", "x0", "y0")},
-        )
-        rates = {n: model.rates[n] + change[f"rates.{n}"] for n in ("c", "x0", "y0")}
-        listed = tuple(
-            replace(
-                e, values={k: v + change.get(f"{e.name}.{k}", 0.0) for k, v in e.values.items()}
-            )
-            for e in model.effects
-        )
-        moved = replace(model, interior=interior, rates=rates, effects=listed)
-        values.append(ThermalCamera(moved).at(43.0).values)
+        drawn = {n: model.value(n) + d for n, d in zip(names, draw.tolist(), strict=True)}
+        values.append(ThermalCamera(model.with_values(drawn)).at(43.0).values)
     scatter = np.std(values, axis=0, ddof=1)
     stated = np.sqrt(np.diag(state.covariance))
     free = stated > 0
@@ -78,31 +65,22 @@ def test_covariance_against_draws():
 
 
 def test_undistort_is_exact():
+    """A polynomial that folds outside the image circle has no fast inverse."""
     state = ThermalCamera(thermal_model(*LISTED)).at(33.0)
-    rng = np.random.default_rng(2)
-    points = rng.uniform([0, 0], [3279, 2463], (30_000, 2))
-    r = rays(state.sensor, state.values, points)
-    expected = r[:, :2] / -r[:, 2:]
-    found = ideal_points(state.sensor, state.values, points)
-    px = state.interior.c / state.sensor.pixel_pitch
-    assert np.abs(found - expected).max() * px < 1e-8
-    ideal = InteriorOrientation(state.interior.c)
-    back = state.as_seen_by(points, ideal)
+    points = np.random.default_rng(2).uniform([0, 0], [3279, 2463], (30_000, 2))
+    folding = Sensor(1000, 800, 0.004), InteriorOrientation(c=3.0, A1=-0.055).as_array()
+    for sensor, iop, seen in (
+        (state.sensor, state.values, points), (*folding, points[:300] * 0.1 + [350, 250])
+    ):  # fmt: skip
+        r = rays(sensor, iop, seen)
+        found = ideal_points(sensor, iop, seen)
+        np.testing.assert_allclose(found, r[:, :2] / -r[:, 2:], rtol=0, atol=1e-12)
+    back = state.as_seen_by(points, InteriorOrientation(state.interior.c))
     np.testing.assert_allclose(state.undistort(points), back, rtol=0, atol=1e-7)
 
 
-def test_a_folding_distortion_has_the_rays_of_the_camera_model():
-    """The polynomial folds outside the image circle, so there is no fast inverse."""
-    sensor = Sensor(1000, 800, 0.004)
-    iop = InteriorOrientation(c=3.0, A1=-0.055).as_array()
-    points = np.array([[500.0, 400.0], [600.0, 300.0], [200.0, 500.0]])
-    r = rays(sensor, iop, points)
-    np.testing.assert_allclose(
-        ideal_points(sensor, iop, points), r[:, :2] / -r[:, 2:], rtol=0, atol=1e-12
-    )
-
-
 def test_outside_the_validity_it_warns_or_refuses():
+    """Standard deviations there grow by the whole drift."""
     camera = ThermalCamera(thermal_model())
     inside = camera.at(50.0)
     with pytest.warns(ExtrapolationWarning, match=r"4\.0 K outside the 20 to 50 °C"):
@@ -119,7 +97,9 @@ def test_outside_the_validity_it_warns_or_refuses():
 
 
 def test_missing_readings_are_refused():
-    camera = ThermalCamera(thermal_model(*LISTED))
+    """Also those of a second thermometer, and no NumPy number is."""
+    heated = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5})
+    camera, two = (ThermalCamera(thermal_model(*effects)) for effects in (LISTED, [heated]))
     with pytest.raises(UsageError, match="temperature is NaN: give °C"):
         camera.at(float("nan"))
     for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
@@ -128,31 +108,20 @@ def test_missing_readings_are_refused():
     with pytest.raises(UsageError, match="no reading"):
         camera.live().update(0.0, {})
     assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
-
-
-def test_second_thermometer_must_be_given():
-    listed = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5})
-    camera = ThermalCamera(thermal_model(listed))
     with pytest.raises(DataError, match="'board': give its temperature"):
-        camera.at(30.0)
-    a, b = camera.at(30.0, channels={"board": 45.0}), camera.at(30.0, channels={"board": 25.0})
-    assert a.interior.c - b.interior.c == pytest.approx(20 * 1e-5)
-
-
-def test_thermometer_noise_is_propagated():
-    camera = ThermalCamera(replace(thermal_model(), sds={}))
-    assert camera.at(30.0, temperature_sd=0.5).sd["x0"] == pytest.approx(0.5 * 4.5e-4)
+        two.at(30.0)
+    a, b = (two.at(30.0, channels={"board": T}).interior.c for T in (45.0, 25.0))
+    assert a - b == pytest.approx(20 * 1e-5)
 
 
 def test_the_object_error_equals_differences():
-    state = ThermalCamera(thermal_model()).at(30.0)
-    sd = 1e-3
-    only_x0 = replace(state, covariance=np.diag([0, sd**2, 0, 0, 0, 0, 0, 0, 0, 0]))
-    moved = replace(state, values=state.values + np.array([0, sd, 0, 0, 0, 0, 0, 0, 0, 0]))
+    state, change = ThermalCamera(thermal_model()).at(30.0), 1e-3 * np.eye(10)[1]
+    only_x0 = replace(state, covariance=np.outer(change, change))
+    moved = replace(state, values=state.values + change)
     found, expected = only_x0.object_error(10_000.0), moved.object_distance(state, 10_000.0)
     # distortion matters in the image's corners, not in the middle
     np.testing.assert_allclose(found, expected, rtol=0.05)
-    assert found[4] == pytest.approx(sd / state.interior.c * 10_000.0, rel=1e-3)
+    assert found[4] == pytest.approx(1e-3 / state.interior.c * 10_000.0, rel=1e-3)
 
 
 def test_warm_up_time_of_an_exponential():

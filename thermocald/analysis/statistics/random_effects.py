@@ -18,12 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError
-
 if TYPE_CHECKING:
     from thermocald.arrays import Array
 
-_FEWEST = 2
 _FEWEST_FOR_CORRELATIONS = 4
 _STEP = 0.05
 _NODES = 49  # of the mixture over Σ
@@ -130,13 +127,8 @@ class Population:
 
 
 def population(values: Array, covariances: Array) -> Population:
-    """Estimate the type of M specimens from their values (M, k) and covariances (M, k, k).
-
-    Raises DataError for fewer than two specimens.
-    """
+    """Estimate the type of M > 1 specimens from their values (M, k) and covariances (M, k, k)."""
     count, size = values.shape
-    if count < _FEWEST:
-        raise DataError(f"a type needs at least {_FEWEST} specimens, there are {count}")
     noise = np.einsum("ikk->ik", covariances)
     variance = np.array([_paule_mandel(values[:, j], noise[:, j]) for j in range(size)])
     weight = 1.0 / np.maximum(variance + noise, 1e-300)

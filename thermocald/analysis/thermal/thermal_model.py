@@ -104,8 +104,6 @@ def fit_thermal_model(
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:
     """Raise DataError for series that one model cannot be fitted to."""
-    if not series:
-        raise DataError("there is no series to fit a model to")
     first = series[0].source
     for reduced in series:
         s = reduced.source

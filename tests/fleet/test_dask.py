@@ -60,13 +60,18 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
 
 def test_every_series_is_analysed_as_it_is_here(archive, tmp_path, dask):
     """Monte-Carlo too: its random numbers do not depend on the engine."""
-    command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--do", "study",
-               "--sets", "500", "--out"]  # fmt: skip
-    for options in (["local"], ["cluster", "--engine", dask.address]):
-        subprocess.run(
-            [*command, tmp_path / options[0], *options[1:]], check=True, capture_output=True,
-            timeout=300,
-        )  # fmt: skip
+
+    def reprocess(out, *engine):
+        command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--do", "study",
+                   "--sets", "500", "--out", tmp_path / out, *engine]  # fmt: skip
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+        return done.returncode, done.stderr
+
+    assert reprocess("local")[0] == reprocess("cluster", "--engine", dask.address)[0] == 0
     here = files(tmp_path / "local", "*.json")
     assert {str(name) for name in here} == {"rpi-v2.1-M1.json", "rpi-v2.1-M2.json"}
     assert files(tmp_path / "cluster", "*.json") == here
+    status, said = reprocess("none", "--engine", "tcp://127.0.0.1:9")
+    assert status == 1
+    assert "the scheduler cannot be reached" in said
+    assert "Traceback" not in said

@@ -11,17 +11,16 @@ import pytest
 
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
+from psycopg.rows import dict_row
 
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import succeed
-from thermocald.store.server.connection import ServerAddress, grant
+from tests.fleet.conftest import address, execute
+from thermocald.store.server.connection import grant
 from thermocald.store.server.reader import ServerWriter
 
 # the values with which Grafana's PostgreSQL source replaces its macros and variables
-MACROS = {
-    "$__unixEpochFrom()": "{first}", "$__unixEpochTo()": "{last}", "$__interval_ms": "60000",
-    "${station:sqlstring}": "'bank','hill'",
-}  # fmt: skip
+MACROS = {"$__interval_ms": "60000", "${station:sqlstring}": "'bank','hill'"}
 
 
 @pytest.fixture(scope="module")
@@ -50,38 +49,35 @@ def test_it_is_what_grafana_imports(dashboard):
 
 
 def test_every_query_runs_and_finds_something(server, dashboard):
+    """As a role that may only read."""
     now = time.time()
     camera = GeneratedCamera("bank", epochs=200, end=now - 1000)
     with psycopg.connect(server.address(name="thermocald")) as connection:
         for station in ("bank", "hill"):
             add_camera(connection, replace(camera, station=station))
-        connection.execute(
-            "INSERT INTO event VALUES ('bank', 1, %s, 'knock', 'x', NULL, 1, '{}')", (now - 1100,)
-        )
-        connection.execute("CREATE ROLE grafana LOGIN PASSWORD 'g'")
-    address = ServerAddress.parse(server.address(name="thermocald"))
-    grant(address, "grafana", writes=False)
-    with ServerWriter(address, "bank", STORE) as writer:
+    knock = "INSERT INTO event VALUES ('bank', 1, %s, 'knock', 'x', NULL, 1, '{}')"
+    execute(server, knock, now - 1100)
+    execute(server, "CREATE ROLE grafana LOGIN PASSWORD 'g'")
+    grant(address(server), "grafana", writes=False)
+    with ServerWriter(address(server), "bank", STORE) as writer:
         writer.report(0, 0, now)
-    values = {"first": str(now - 7200), "last": str(now)}
+    (query,) = (v["query"] for v in dashboard["templating"]["list"] if v["type"] == "query")
+    macros = MACROS | {"$__unixEpochFrom()": str(now - 7200), "$__unixEpochTo()": str(now)}
     try:
-        reader = server.address(user="grafana:g", name="thermocald")
-        with psycopg.connect(reader) as connection:
-            (query,) = (v["query"] for v in dashboard["templating"]["list"] if v["type"] == "query")
-            assert connection.execute(query).fetchall() == [("bank",), ("hill",)]
+        with psycopg.connect(
+            server.address(user="grafana:g", name="thermocald"), row_factory=dict_row
+        ) as connection:
+            stations = [list(row.values()) for row in connection.execute(query)]
+            assert stations == [["bank"], ["hill"]]
             for title, sql in queries(dashboard):
-                for macro, value in MACROS.items():
-                    sql = sql.replace(macro, value.format(**values))
+                for macro, value in macros.items():
+                    sql = sql.replace(macro, value)
                 assert "$" not in sql, title
-                cursor = connection.execute(sql)
-                rows = cursor.fetchall()
+                rows = connection.execute(sql).fetchall()
                 assert rows, title
                 if '"time"' in sql and "kind" not in sql:
-                    assert [c.name for c in cursor.description] == ["time", "metric", "value"]
-            late = next(sql for title, sql in queries(dashboard) if "15 minutes" in title)
-            late = late.replace("${station:sqlstring}", "'bank','hill'")
-            assert connection.execute(late).fetchone() == (2,)
+                    assert [*rows[0]] == ["time", "metric", "value"]
+                if "15 minutes" in title:
+                    assert [*rows[0].values()] == [2]
     finally:
-        with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
-            connection.execute("DROP OWNED BY grafana")
-            connection.execute("DROP ROLE grafana")
+        execute(server, "DROP OWNED BY grafana; DROP ROLE grafana")

@@ -20,7 +20,6 @@ from thermocald.errors import (
     RecordingError,
     ServerError,
     ServerGone,
-    StoreError,
     StoreVersionError,
     TestFieldError,
 )
@@ -30,70 +29,67 @@ from thermocald.store.server.connection import ServerAddress, create_tables, gra
 from thermocald.store.server.fleet_reader import FleetReader
 from thermocald.store.server.reader import ServerStore
 
-HOSTILE = ["x'); DROP TABLE epoch; --", 'a"b', "%s", "{0}", "$1", "; SELECT pg_sleep(9)", "é\\'"]
 
-
-def test_names_are_values_and_never_statements(server, tmp_path, head, field, make_epoch):
+@pytest.mark.parametrize(
+    "evil",
+    ["x'); DROP TABLE epoch; --", 'a"b', "%s", "{0}", "$1", "; SELECT pg_sleep(9)", "é\\'"],
+)
+def test_names_are_values_and_never_statements(server, tmp_path, head, field, make_epoch, evil):
     """Any names of station, camera, series, channel and extra column are stored and selected by."""
-    base = Path(server.address(name="thermocald"))
-    for evil in HOSTILE:
-        channel = evil.translate(str.maketrans("", "", ",;='\"\\/")).strip()
-        camera = replace(head.camera, name=evil)
-        hostile = replace(head, series=evil, camera=camera,
-                          channels={channel: head.channels["temperature"]})  # fmt: skip
-        path = tmp_path / f"{HOSTILE.index(evil)}.db"
-        with Store.open(path, "append", durable=False) as store:
-            series = store.create_series(hostile, field)
-            epoch = replace(make_epoch(1), temperatures={channel: 21.5})
-            store.append(series, epoch, extra={f"x{evil}": 2.0})
-        Forwarder(path, address(server), evil).send_waiting()
-        narrowed = ServerAddress.parse(base).narrowed(evil, evil, evil)
-        with ServerStore.open(narrowed) as there:
-            (found,) = there.all_series()
-            columns = there.series_columns(found, [channel, f"x{evil}", "epoch"])
-            assert [float(c[0]) for c in columns.values()] == [21.5, 2.0, 1.0]
-            assert len([*there.epochs(found)]) == 1
-        with FleetReader(ServerAddress.parse(narrowed)) as fleet:
-            (record,) = fleet.cameras(2e9)
-            assert (record.station, record.camera) == (evil, evil)
-        with pytest.raises(ServerError, match="was not granted"):
-            grant(address(server), evil, writes=True)
-    assert count(server, "epoch") == len(HOSTILE)
-    tasks = find_tasks([base], tmp_path / "out", "discover")
-    assert {task[1].parent for task in tasks} == {tmp_path / "out"}
+    base, path = Path(server.address(name="thermocald")), tmp_path / "evil.db"
+    channel = evil.translate(str.maketrans("", "", ",;='\"\\/")).strip()
+    hostile = replace(head, series=evil, camera=replace(head.camera, name=evil),
+                      channels={channel: head.channels["temperature"]})  # fmt: skip
+    with Store.open(path, "append", durable=False) as store:
+        series = store.create_series(hostile, field)
+        epoch = replace(make_epoch(1), temperatures={channel: 21.5})
+        store.append(series, epoch, extra={f"x{evil}": 2.0})
+    Forwarder(path, address(server), evil).send_waiting()
+    narrowed = ServerAddress.parse(base).narrowed(evil, evil, evil)
+    with ServerStore.open(narrowed) as there:
+        (found,) = there.all_series()
+        columns = there.series_columns(found, [channel, f"x{evil}", "epoch"])
+        assert [float(c[0]) for c in columns.values()] == [21.5, 2.0, 1.0]
+        assert len([*there.epochs(found)]) == 1
+    with FleetReader(ServerAddress.parse(narrowed)) as fleet:
+        (record,) = fleet.cameras(2e9)
+        assert (record.station, record.camera) == (evil, evil)
+    with pytest.raises(ServerError, match="was not granted"):
+        grant(address(server), evil, writes=True)
+    assert count(server, "epoch") == 1
+    (task,) = find_tasks([base], tmp_path / "out", "discover")
+    assert task[1].parent == tmp_path / "out"
 
 
 def test_what_is_wrong_with_a_series_names_the_server_as_it_was_given(filled, server):
     """As a path, the address had lost a slash."""
-    store, _ = filled
-    Forwarder(store.path, address(server), "bank").send_waiting()
+    there = address(server)
+    Forwarder(filled[0].path, there, "bank").send_waiting()
     where = f"^postgresql://owner@127.0.0.1:{server.port}/thermocald, "
-    execute(server, "UPDATE testfield SET csv = replace(csv, 'target,', 'target,x,')")
-    with (
-        ServerStore(address(server)) as there,
-        pytest.raises(TestFieldError, match=where + "line"),
+    for change, error, what in (
+        ("testfield SET csv = replace(csv, 'target,', 'target,x,')", TestFieldError, "line"),
+        ("series SET head = replace(head, 'interval\": ', 'interval\": -')", RecordingError, "key"),
     ):
-        there.all_series()
-    execute(server, "UPDATE series SET head = replace(head, 'interval\": ', 'interval\": -')")
-    with ServerStore(address(server)) as there, pytest.raises(RecordingError, match=where + "key"):
-        there.all_series()
-    with FleetReader(address(server)) as fleet, pytest.raises(RecordingError, match=where + "key"):
+        execute(server, f"UPDATE {change}")
+        with ServerStore(there) as found, pytest.raises(error, match=where + what):
+            found.all_series()
+    with FleetReader(there) as fleet, pytest.raises(RecordingError, match=where + "key"):
         fleet.cameras(2e9)
 
 
 def test_a_newer_server_is_told_from_an_older_one(filled, server):
-    store, _ = filled
-    execute(server, "UPDATE thermocald_version SET version = 9999")
     there = address(server)
-    forwarder = Forwarder(store.path, there, "b")
-    for use in (forwarder.send_waiting, lambda: ServerStore(there), lambda: FleetReader(there)):
-        with pytest.raises(StoreVersionError, match="update thermocald here"):
+    forwarder = Forwarder(filled[0].path, there, "b")
+    newer, older = "update thermocald here", "server init"
+    for version, use, said in (
+        (9999, forwarder.send_waiting, newer), (9999, lambda: ServerStore(there), newer),
+        (9999, lambda: FleetReader(there), newer), (0, forwarder.send_waiting, older),
+    ):  # fmt: skip
+        execute(server, f"UPDATE thermocald_version SET version = {version}")
+        with pytest.raises(StoreVersionError, match=said):
             use()
-    execute(server, "UPDATE thermocald_version SET version = 0")
-    with pytest.raises(StoreVersionError, match="server init"):
-        Forwarder(store.path, there, "b").send_waiting()
     execute(server, "UPDATE thermocald_version SET version = 1")
-    assert Forwarder(store.path, address(server), "b").send_waiting().rows == 20
+    assert forwarder.send_waiting().rows == 20
 
 
 @pytest.fixture
@@ -137,58 +133,47 @@ def test_a_full_disk_of_the_server_is_said_and_made_up_for(small_disk, filled):
         assert numbers == [*range(1, 21), *range(1001, 1801)]
 
 
-@pytest.fixture
-def certificates(tmp_path):
-    """An authority, and certificates of a server and of the station `pi`, also expired ones;
-    and one of `pi` that no authority signed.
-    """
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is not installed")
-
-    def openssl(*arguments):
-        subprocess.run(["openssl", *arguments], cwd=tmp_path, check=True, capture_output=True)
-
-    made = ("req", "-newkey", "rsa:2048", "-nodes")
-    for name, common in (("ca", "ca"), ("foreign", "pi")):
-        openssl(*made, "-x509", "-subj", f"/CN={common}", "-keyout", f"{name}.key",
-                "-out", f"{name}.crt")  # fmt: skip
-    (tmp_path / "foreign.key").chmod(0o600)
-    for name, common, days in (("server", "localhost", "2"), ("stale", "localhost", "-1"),
-                               ("pi", "pi", "2"), ("late", "pi", "-1")):  # fmt: skip
-        openssl(*made, "-subj", f"/CN={common}", "-keyout", f"{name}.key", "-out", f"{name}.csr")
-        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.crt", "-CAkey", "ca.key",
-                "-CAcreateserial", "-days", days, "-out", f"{name}.crt")  # fmt: skip
-        (tmp_path / f"{name}.key").chmod(0o600)
-    return tmp_path
+def make_certificate(folder: Path, name: str, common: str, days: str, *signed: str) -> None:
+    """Write NAME.key and NAME.crt for a common name, signed by itself unless told by whom."""
+    key = f"{name}.key"
+    for command in (
+        ["req", "-new", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={common}", "-keyout", key,
+         "-out", "request"],
+        ["x509", "-req", "-in", "request", "-days", days, "-out", f"{name}.crt",
+         *(signed or ["-signkey", key])],
+    ):  # fmt: skip
+        subprocess.run(["openssl", *command], cwd=folder, check=True, capture_output=True)
+    (folder / key).chmod(0o600)
 
 
 @pytest.mark.slow
-def test_certificates(certificates, filled):
-    """A client certificate suffices; an expired or foreign one, of either side, is reported."""
-    store, _ = filled
-
-    def use(server, of: str) -> None:
-        for name in (f"{of}.crt", f"{of}.key", "ca.crt"):
-            target = server.folder / "data" / name.replace(of, "server")
-            shutil.copy(certificates / name, target)
-            target.chmod(0o600)
-            if server.user:
-                shutil.chown(target, "postgres")
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_certificates(filled, tmp_path):
+    """A client certificate suffices; an expired one, or one of another authority, is reported."""
+    by = "-CA", "ca.crt", "-CAkey", "ca.key"
+    make_certificate(tmp_path, "ca", "ca", "2")
+    make_certificate(tmp_path, "foreign", "pi", "2")
+    make_certificate(tmp_path, "server", "localhost", "2", *by)
+    make_certificate(tmp_path, "pi", "pi", "2", *by)
+    make_certificate(tmp_path, "late", "pi", "-1", *by)
 
     def prepare(server):
-        use(server, "server")
-        (server.folder / "data" / "pg_hba.conf").write_text(
+        for name in ("server.crt", "server.key", "ca.crt"):
+            shutil.copy(tmp_path / name, server.data)
+            if server.user:
+                shutil.chown(server.data / name, "postgres")
+        (server.data / "pg_hba.conf").write_text(
             "hostssl all pi 127.0.0.1/32 cert\nhost all all 127.0.0.1/32 scram-sha-256\n"
         )
         server.options = "-c ssl=on -c ssl_ca_file=ca.crt"
 
     def send(certificate="pi", root="ca") -> int:
         query = (
-            f"?sslmode=verify-full&sslrootcert={certificates}/{root}.crt&hostaddr=127.0.0.1"
-            f"&sslcert={certificates}/{certificate}.crt&sslkey={certificates}/{certificate}.key"
+            f"?sslmode=verify-full&sslrootcert={tmp_path}/{root}.crt&hostaddr=127.0.0.1"
+            f"&sslcert={tmp_path}/{certificate}.crt&sslkey={tmp_path}/{certificate}.key"
         )
         place = f"postgresql://pi@localhost:{server.port}/thermocald{query}"
-        return Forwarder(store.path, ServerAddress.parse(place), "bank").send_waiting().rows
+        return Forwarder(filled[0].path, ServerAddress.parse(place), "bank").send_waiting().rows
 
     with new_cluster(prepare) as server:
         with psycopg.connect(server.address(), autocommit=True) as connection:
@@ -196,25 +181,8 @@ def test_certificates(certificates, filled):
             connection.execute("CREATE ROLE pi LOGIN")
         create_tables(address(server))
         grant(address(server), "pi", writes=True)
-        with pytest.raises(ServerError, match="certificate") as late:
-            send("late")
-        with pytest.raises(ServerError, match="of another authority") as unknown:
-            send("foreign")
-        with pytest.raises(ServerError, match="certificate is not accepted"):
-            send(root="foreign")
-        use(server, "stale")
-        server.stop("fast")
-        server.start()
-        with pytest.raises(ServerError, match="certificate is not accepted; is it expired") as old:
-            send()
-        for told in (late, unknown, old):
+        for wrong in ({"certificate": "late"}, {"certificate": "foreign"}, {"root": "foreign"}):
+            with pytest.raises(ServerError, match="certificate is not accepted; is it") as told:
+                send(**wrong)
             assert not isinstance(told.value, ServerGone)
-        use(server, "server")
-        server.stop("fast")
-        server.start()
         assert send() == 20
-
-
-def test_a_path_that_is_not_there_is_said(tmp_path):
-    with pytest.raises(StoreError):
-        Forwarder(tmp_path / "none.db", ServerAddress.parse("postgresql://h/d"), "b").send_waiting()

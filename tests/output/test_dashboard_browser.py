@@ -7,11 +7,10 @@ import os
 
 import pytest
 
-from tests.output.test_dashboard import add_series, start_page
-from tests.output.test_pages import _WIDER, keep
+from tests.output.test_dashboard import DEVICE, add_series, start_page, status_of
+from tests.output.test_pages import FAULTS, keep
 from thermocald.daemon.live_state import status_warnings
 
-_OPEN = {"device": "open", "why": "", "since": None, "faults": 0}
 # c of camera k is k mm, which identifies the camera of a value
 _SHOWN = """() => ({
   selected: document.querySelector('#camera').value,
@@ -24,6 +23,8 @@ _SHOWN = """() => ({
 })"""
 _HIDDEN = """() => { const table = document.querySelector('.scroll:has(#devices)');
   return table.scrollHeight - table.clientHeight; }"""
+_RIGHT = """chosen => [...document.querySelectorAll(chosen)]
+  .map(e => e.getBoundingClientRect().right)"""
 _SETTLED = """name => document.querySelector('#course-note').textContent.startsWith(name + '/')
   && document.querySelector('#frame-caption').textContent.startsWith('epoch')"""
 
@@ -38,34 +39,27 @@ def page_with(tmp_path):
     servers = []
 
     def serve(cameras: int):
-        path, live = tmp_path / "t.db", tmp_path / "live"
+        path, live, parts = tmp_path / "t.db", tmp_path / "live", {}
         live.mkdir()
-        status = {
-            "version": "0", "pid": 1, "utc": 1.6e9, "started": 1.6e9, "stalled": [],
-            "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path),
-                                                  "lost": 2, "lost_why": "the disk was full"},
-            "frames": {"paused": ""}, "cameras": {}, "thermometers": {"housing": _OPEN},
-            "outputs": {"mqtt": {**_OPEN, "device": "out", "why": "no broker", "since": 1.6e9}},
-        }  # fmt: skip
         for k in range(1, cameras + 1):
             times = [1.6e9 + 10 * n for n in range(1, 31)]
             add_series(path, _name(k), times, [k] * 30, (640, 480))
             last = {"epoch": 30, "frame_time": 1.6e9 + 300, "temperature": 50.0, "c": float(k),
                     "sigma0": 1.0, "n_observations": k, "n_rejected": 0, "status": "ok",
                     "state": "ready"}  # fmt: skip
-            status["cameras"][_name(k)] = {
-                **_OPEN, "series": "M1", "period_s": 10.0, "late_p99_s": 0.0, "skipped": 0,
-                "lost": 0, "deferred": 0, "caught_up": 0, "last": last,
-            }  # fmt: skip
+            counts = dict.fromkeys(("late_p99_s", "skipped", "lost", "deferred", "caught_up"), 0)
+            parts[_name(k)] = {**counts, "last": last}
             targets = {"x": [9.0] * k, "y": [9.0] * k, "vx": [0.1] * k, "vy": [0.1] * k,
                        "rejected": [False] * k}  # fmt: skip
-            (live / f"{_name(k)}.json").write_text(
-                json.dumps({"row": {"epoch": 30}, "targets": targets})
-            )
+            shown = {"row": {"epoch": 30}, "targets": targets}
+            (live / f"{_name(k)}.json").write_text(json.dumps(shown))
         server, port = start_page(path, live)
         servers.append(server)
 
         def start() -> None:
+            mqtt = {**DEVICE, "device": "out", "why": "no broker", "since": 1.6e9}
+            status = status_of(path, parts, outputs={"mqtt": mqtt})
+            status["store"] |= {"lost": 2, "lost_why": "the disk was full"}
             document = {**status, "warnings": status_warnings(status)}
             (live / "status.json").write_text(json.dumps(document))
 
@@ -92,16 +86,24 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     box = page.locator("#course .modebar").bounding_box()
     curves = page.locator('#course .nsewdrag[data-subplot="xy"]').bounding_box()
     assert box["y"] + box["height"] <= curves["y"] + 1  # the toolbar covers no curve
-    right = page.evaluate(
-        "[...document.querySelectorAll('section')].map(e => e.getBoundingClientRect().right)"
-    )
+    right = page.evaluate(_RIGHT, "section")
     assert max(right) - min(r for r in right if r > 800) < 1  # the whole width is used
     keep(page, f"dashboard-{cameras}-1280")
     page.set_viewport_size({"width": 390, "height": 900})
     page.wait_for_timeout(500)  # the curves are drawn anew
-    assert page.evaluate(_WIDER, 390) == []
+    assert page.evaluate(FAULTS["wider"]) == []
     assert page.evaluate(_HIDDEN) == 0  # a device's reason is within its card
     keep(page, f"dashboard-{cameras}-390")
+    page.set_viewport_size({"width": 703, "height": 1000})  # A4 less margins
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    page.wait_for_timeout(500)
+    (curves,), (card,) = (page.evaluate(_RIGHT, s) for s in ("#course .main-svg", "section.wide"))
+    assert curves <= card <= 703  # on paper, the curves keep to their card
+    assert page.locator("#camera").is_visible()
+    assert page.locator(".modebar:visible, #series:visible").count() == 0
+    keep(page, f"dashboard-{cameras}-a4")
+    page.emulate_media(media="screen")
     page.set_viewport_size({"width": 1280, "height": 900})
 
     # answers for cameras that are no longer chosen arrive late
@@ -138,28 +140,6 @@ def test_the_page_of_a_silent_daemon_says_so_and_its_times_are_utc(page_with, pa
         "() => document.querySelector('#state').textContent.startsWith("
         "'the daemon has not answered since 2020-09-13 12:26:40 UTC')"
     )
-
-
-@pytest.mark.slow
-def test_on_paper_the_curves_keep_to_their_card(page_with, page_of):
-    """The page also names their camera."""
-    url, start = page_with(2)
-    page = page_of(url)
-    start()
-    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
-    page.wait_for_function(_SETTLED, arg=page.input_value("#camera"))
-    page.set_viewport_size({"width": 703, "height": 1000})  # A4 less margins
-    page.emulate_media(media="print")
-    page.evaluate("dispatchEvent(new Event('beforeprint'))")
-    page.wait_for_timeout(500)
-    right = page.evaluate(
-        """() => ['#course .main-svg', 'section.wide', '#camera'].map(
-        s => document.querySelector(s).getBoundingClientRect().right)"""
-    )
-    assert right[0] <= right[1] <= 703
-    assert page.locator("#camera").is_visible()
-    assert page.locator(".modebar:visible, #series:visible").count() == 0
-    keep(page, "dashboard-2-a4")
 
 
 def _all_of(k: int) -> dict:

@@ -14,6 +14,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -118,16 +119,17 @@ class Page:
 
     def __init__(self, page: str, shelf: Path, folder: Path) -> None:
         self.page, self.shelf, self.folder = page, shelf, folder
-        self.staying: list[tuple[str, subprocess.Popen[str]]] = []
-        self.started = 0
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.output = folder / "output-0"
+        """Where the last command's output goes; one that stays goes on writing to its own."""
 
     def run(self, block: Block) -> None:
         if block.language == "python":
-            self.finish("python", self.start(f"{sys.executable} -", block.text))
+            (self.folder / "block.py").write_text(block.text)
+            self.command("python block.py")
         elif block.language == "sql":
-            with closing(sqlite3.connect(self.folder / "thermocald.db")) as database, database:
+            with closing(sqlite3.connect(self.folder / "thermocald.db")) as database:
                 assert database.execute(block.text).fetchall()
-            database.close()
         elif block.language == "text" and self.page in SHOWN:
             self.compare(block)
         for command in block.commands() if block.language == "bash" else ():
@@ -140,87 +142,58 @@ class Page:
         shortened = command
         for part, (instead, _) in SHORTENED.items():
             shortened = shortened.replace(part, instead)
-        process = self.start(shortened)
-        if command not in UNTIL:
-            self.finish(command, process)
-            return
-        self.staying.append((command, process))
-        self.wait(command, process)
-        if command not in STAYS:
-            self.end(command)
-
-    def start(self, command: str, given: str = "") -> subprocess.Popen[str]:
-        self.started += 1
-        (self.folder / "given").write_text(given)
-        with (self.folder / "given").open() as stdin, self.said.open("w") as output:
-            return subprocess.Popen(
-                ["bash", "-euo", "pipefail", "-c", command],
-                cwd=self.folder,
-                env=ENVIRONMENT,
-                stdin=stdin,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                text=True,
+        self.output = self.folder / f"output-{int(self.output.name[7:]) + 1}"
+        with self.output.open("w") as output:
+            process = self.running[command] = subprocess.Popen(
+                ["bash", "-euo", "pipefail", "-c", shortened], cwd=self.folder, env=ENVIRONMENT,
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
                 start_new_session=True,
-            )
+            )  # fmt: skip
+        if command not in UNTIL:
+            assert self.finish(command) == 0, f"{self.page}: {command}:\n{self.said()[-3000:]}"
+            assert "Traceback" not in self.said()
+            assert "Warning" not in self.said(), self.said()
+            return
+        deadline = time.monotonic() + PATIENCE_S
+        while not UNTIL[command](self.folder, self.said()):
+            assert process.poll() is None, f"{self.page}: {command} ended:\n{self.said()}"
+            assert time.monotonic() < deadline, f"{self.page}: {command}:\n{self.said()}"
+            time.sleep(0.2)
+        if command not in STAYS:
+            self.interrupt(command)
 
-    @property
-    def said(self) -> Path:
-        """Where the last command's output goes."""
-        return self.folder / f"output-{self.started}"
+    def said(self) -> str:
+        return self.output.read_text(errors="replace")
 
-    def output(self) -> str:
-        return self.said.read_text(errors="replace")
+    def finish(self, command: str) -> int:
+        status = self.running[command].wait(PATIENCE_S)
+        del self.running[command]
+        return status
 
-    def finish(self, command: str, process: subprocess.Popen[str]) -> None:
-        try:
-            status = process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
-        said = self.output()
-        assert status == 0, f"{self.page}: {command}: exit status {status}\n{said[-3000:]}"
-        assert "Traceback" not in said
-        assert "Warning" not in said, said
+    def interrupt(self, command: str) -> None:
+        """Ctrl-C."""
+        os.killpg(self.running[command].pid, signal.SIGINT)
+        assert self.finish(command) in (0, 130), command
 
     def compare(self, block: Block) -> None:
         """Every line of the block was said, with numbers that agree to a tenth."""
-        said = " ".join(self.output().split())
+        said = " ".join(self.said().split())
         for line in block.text.splitlines():
             shown = " ".join(line.split())
             pattern = f"({NUMBER.pattern})".join(map(re.escape, NUMBER.split(shown)))
             expected = [float(n) for n in NUMBER.findall(shown)]
             found = [[float(n) for n in m.groups()] for m in re.finditer(pattern, said)]
             assert found, f"{self.page}:{block.line}: not said: {shown}\n{said[-2000:]}"
-            assert any(f == pytest.approx(expected, rel=0.1, abs=0.005) for f in found), (
-                shown,
-                found,
-            )
+            near = pytest.approx(expected, rel=0.1, abs=0.005)
+            assert any(numbers == near for numbers in found), (shown, found)
 
-    def wait(self, command: str, process: subprocess.Popen[str]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not UNTIL[command](self.folder, self.output()):
-            assert process.poll() is None, f"{self.page}: {command} ended:\n{self.output()}"
-            assert time.monotonic() < deadline, f"{self.page}: {command}:\n{self.output()}"
-            time.sleep(0.2)
+    def __enter__(self) -> Self:
+        return self
 
-    def end(self, only: str = "") -> None:
-        """Ctrl-C for what stays, or for one of them."""
-        for command, process in list(self.staying):
-            if only in ("", command):
-                os.killpg(process.pid, signal.SIGINT)
-                try:
-                    status = process.wait(PATIENCE_S)
-                except subprocess.TimeoutExpired:
-                    pytest.fail(f"{self.page}: Ctrl-C does not end it:\n{self.output()[-2000:]}")
-                self.staying.remove((command, process))
-                assert status in (0, 130), f"{command}: {status}"
-
-    def kill(self) -> None:
-        for _, process in self.staying:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+    def __exit__(self, *_: object) -> None:
+        for process in self.running.values():
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 def skipped(command: str) -> bool:
@@ -245,13 +218,11 @@ def runnable(page: Path) -> bool:
 def test_the_commands_of_a_page_run(page, shelf, tmp_path):
     if name(page) in WORLDS:
         WORLDS[name(page)](shelf, tmp_path)
-    running = Page(name(page), shelf, tmp_path)
-    try:
+    with Page(name(page), shelf, tmp_path) as opened:
         for block in blocks(page):
-            running.run(block)
-        running.end()
-    finally:
-        running.kill()
+            opened.run(block)
+        for command in list(opened.running):
+            opened.interrupt(command)
 
 
 def test_no_table_has_a_dead_entry():

@@ -216,8 +216,8 @@ def runnable(page: Path) -> bool:
     ids=name,
 )
 def test_the_commands_of_a_page_run(page, shelf, tmp_path):
-    if name(page) in WORLDS:
-        WORLDS[name(page)](shelf, tmp_path)
+    for put in WORLDS.get(name(page), ()):
+        put(shelf, tmp_path)
     with Page(name(page), shelf, tmp_path) as opened:
         for block in blocks(page):
             opened.run(block)

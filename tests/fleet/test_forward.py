@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from thermocald.config import ForwardConfig
-from thermocald.errors import ServerError, ServerGone
+from thermocald.errors import ServerError, ServerGone, StoreError, UsageError
 from thermocald.fleet.forward import Forwarder, forward_forever
 from thermocald.store.series import Event, LoggedReading
 
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
+from tests.commands import succeed
 from tests.fleet.conftest import address, count, execute
 from thermocald.store.schema import COLUMN_NAMES
 from thermocald.store.server.connection import ServerAddress, grant
 from thermocald.store.server.reader import ServerStore, ServerWriter
+
+
+def forwarder(server, station, choose, user="owner:secret", **options):
+    """A forwarder of a station's store, and of its frames by a rule."""
+    (store, folder), rule = station, ForwardConfig(frames=choose, **options)
+    return Forwarder(store, address(server, user=user), "bank", frames=folder, rule=rule)
+
 
 SENT = dict.fromkeys(("epoch", "event", "reading", "frame"), 0)
 
@@ -80,13 +90,12 @@ def test_a_role_that_may_only_insert_is_enough(station, server):
     """A role that may only log in, to which writing is granted."""
     execute(server, "CREATE ROLE pi LOGIN PASSWORD 'berry'")
     try:
-        pi, (store, frames) = address(server, user="pi:berry"), station
-        rule = ForwardConfig(frames="events")
-        forwarder = Forwarder(store, pi, "bank", frames=frames, rule=rule)
+        pi = address(server, user="pi:berry")
+        events = forwarder(server, station, "events", user="pi:berry")
         with pytest.raises(ServerError, match="grant it"):
-            forwarder.send_waiting()
+            events.send_waiting()
         grant(address(server), "pi", writes=True)
-        assert dict(forwarder.send_waiting().sent) == SENT | {"epoch": 20, "frame": 2}
+        assert dict(events.send_waiting().sent) == SENT | {"epoch": 20, "frame": 2}
         assert execute(server, "SELECT name, waiting FROM station") == [("bank", 0)]
         with ServerStore(pi) as there, pytest.raises(ServerError, match="lacks the permission"):
             there.all_series()
@@ -177,3 +186,107 @@ def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
     numbers = execute(server, "SELECT number FROM epoch ORDER BY 1")
     assert [n for (n,) in numbers] == [n for n in range(1, 21) if n not in (5, 9)]
     assert execute(server, "SELECT refused FROM station") == [(3,)]
+
+
+# --- frames: limited, resumable, checked, without effect on retention ------------------------
+
+
+def there(server):
+    rows = execute(server, "SELECT number, name, digest, data FROM frame ORDER BY number")
+    return {number: (name, digest, data) for number, name, digest, data in rows}
+
+
+@pytest.mark.parametrize(
+    ("choose", "numbers"),
+    [("events", [7, 13]), ("every_n", [5, 10, 15, 20]), ("all", list(range(1, 21)))],
+)
+def test_the_chosen_frames_arrive_whole(server, station, choose, numbers):
+    done = forwarder(server, station, choose, every_n=5).send_waiting()
+    assert done.sent["frame"] == len(numbers)
+    found = there(server)
+    assert [*found] == numbers
+    for number, (name, digest, data) in found.items():
+        assert (name, data) == (f"rpi/M1/{number:07d}.jpg", bytes([number]) * 1000)
+        assert digest == hashlib.sha256(data).hexdigest()
+
+
+def test_a_day_has_a_limit_and_the_next_goes_on(server, station):
+    limited = forwarder(server, station, "all", frames_mb_per_day=0.0035)
+    day = [1.7e9]
+    limited._clock = lambda: day[0]
+    assert limited.send_waiting().sent["frame"] == 3
+    assert limited.send_waiting().sent["frame"] == 0
+    day[0] += 86400
+    assert limited.send_waiting().sent["frame"] == 3
+    assert [*there(server)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_it_goes_on_where_the_network_failed(server, station, monkeypatch):
+    send, calls = ServerWriter.write_frame, []
+
+    def fails_twice(self, series, frame, data):
+        calls.append(frame.number)
+        if len(calls) in (4, 9):
+            raise ServerGone("cut")
+        send(self, series, frame, data)
+
+    monkeypatch.setattr(ServerWriter, "write_frame", fails_twice)
+    every = forwarder(server, station, "all")
+    for _ in range(2):
+        with pytest.raises(ServerGone):
+            every.send_waiting()
+    every.send_waiting()
+    assert [*there(server)] == list(range(1, 21))
+    assert len(calls) == 22  # each frame once, and the two that failed again
+
+
+def test_what_retention_has_deleted_or_leads_out_of_the_folder_is_passed_over(
+    server, station, tmp_path
+):
+    (tmp_path / "secret").write_text("key")
+    frames = station[1] / "rpi/M1"
+    for number in (1, 2, 3, 20):
+        (frames / f"{number:07d}.jpg").unlink()
+    (frames / "0000001.jpg").symlink_to(tmp_path / "secret")
+    assert forwarder(server, station, "all").send_waiting().sent["frame"] == 16
+    assert [*there(server)] == list(range(4, 20))
+
+
+def test_the_server_refuses_a_frame_that_is_not_what_was_read(server, station, monkeypatch):
+    wrong = SimpleNamespace(sha256=hashlib.md5)
+    monkeypatch.setattr("thermocald.store.server.reader.hashlib", wrong)
+    done = forwarder(server, station, "events").send_waiting()
+    assert (done.sent["frame"], done.refused) == (0, 2)
+    assert there(server) == {}
+
+
+# --- `thermocald forward` with the daemon's configuration, as its unit starts it --------------
+
+
+CONFIG = """
+store: {path: small.db}
+frames: {folder: frames}
+thermometers: [{name: air, driver: mock}]
+forward: {to: %s, station: gauge7, frames: events}
+"""
+
+
+def test_everything_comes_from_the_configuration(station, server, tmp_path, monkeypatch):
+    passwords = tmp_path / "pgpass"
+    passwords.write_text("127.0.0.1:*:*:owner:secret\n")
+    passwords.chmod(0o600)
+    monkeypatch.setenv("PGPASSFILE", str(passwords))
+    config = station[0].with_name("config.yaml")
+    config.write_text(CONFIG % "null")
+    assert "nothing is sent" in succeed("forward", "--config", config).stderr
+    config.write_text(CONFIG % server.address(user="owner", name="thermocald"))
+    result = succeed("forward", "--config", config, "--once", "--json", "-")
+    assert [count(server, t) for t in ("epoch", "frame", "station")] == [20, 2, 1]
+    assert "secret" not in result.output
+
+
+def test_what_is_missing_is_said(tmp_path):
+    with pytest.raises(UsageError, match="give STORE and --to"):
+        succeed("forward")
+    with pytest.raises(StoreError):
+        succeed("forward", tmp_path / "none.db", "--to", "postgresql://h/d", "--once")

@@ -12,7 +12,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Self
 
@@ -58,17 +58,12 @@ SHORTENED = {
 """Part of a command → what is run instead, and what it would take."""
 
 
-def epochs_in(*stores: str):
+def epochs_in(name: str):
     """Whether so many epochs were kept in a store of the folder."""
 
     def kept(folder: Path, _: str) -> bool:
-        for path in map(folder.joinpath, stores):
-            try:
-                with Store.open(path) as store:
-                    if any((store.last_epoch(s) or 0) >= 2 for s in store.all_series()):
-                        return True
-            except (OSError, ValueError):
-                continue
+        with suppress(OSError, ValueError), Store.open(folder / name) as store:
+            return any((store.last_epoch(s) or 0) >= 2 for s in store.all_series())
         return False
 
     return kept
@@ -96,15 +91,11 @@ SHOWN = {"docs/tutorial/raspberry-pi.md", "docs/tutorial/river.md"}
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+# `top` draws where it believes in a terminal, and one that can move its cursor
 ENVIRONMENT = {
-    **os.environ,
-    "PATH": PATH,
-    "PYTHONPATH": str(ROOT),
-    "OPENBLAS_NUM_THREADS": "1",
-    "COLUMNS": "120",
-    "FORCE_COLOR": "1",  # `top` draws where it believes in a terminal,
-    "TERM": "xterm",  # and one that can move its cursor
-}
+    **os.environ, "PATH": PATH, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1",
+    "COLUMNS": "120", "FORCE_COLOR": "1", "TERM": "xterm",
+}  # fmt: skip
 PATIENCE_S = 240.0
 
 

@@ -423,7 +423,7 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     page.emulate_media(media="print")
     page.evaluate("dispatchEvent(new Event('beforeprint'))")
     page.wait_for_timeout(500)
-    (curves,), (card,) = (page.evaluate(_RIGHT, s) for s in ("#course .main-svg", "section.wide"))
+    curves, card = (page.evaluate(_RIGHT, s)[0] for s in ("#course .main-svg", "section.wide"))
     assert curves <= card <= 703  # on paper, the curves keep to their card
     assert page.locator("#camera").is_visible()
     assert page.locator(".modebar:visible, #series:visible").count() == 0
@@ -453,8 +453,8 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
 def test_the_page_of_a_silent_daemon_says_so_and_its_times_are_utc(page_with, page_of, tmp_path):
     """A killed daemon's page said "live" for ever; the curves were drawn in local time."""
     url, start = page_with(2)
-    start()
     page = page_of(url, timezone_id="Asia/Tokyo")
+    start()
     page.wait_for_function(_SETTLED, arg=_name(1))  # always the first camera
     assert page.text_content("#connection") == "live"
     assert page.get_attribute("#overlay", "viewBox") == "0 0 640 480"  # of the first frame shown

@@ -49,18 +49,6 @@ def test_every_block_names_its_language():
     assert not unknown
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_no_code_hides_in_indented_blocks(page):
-    """An indented block has no language and would not be tested; lists and formulas may indent."""
-    text = re.sub(r"^ *```.*?^ *```\s*$", "", page.read_text(), flags=re.M | re.S)
-    in_list, blank = False, True
-    for line in text.splitlines():
-        if line.strip() and not line.startswith(" "):
-            in_list = bool(re.match(r"[-*] |\d+\. ", line))
-        assert in_list or not (blank and re.match(r" {4}", line) and line.strip()), line
-        blank = not line.strip()
-
-
 def thermocald_commands() -> list[tuple[str, str]]:
     found = []
     for block in all_blocks("bash") + all_blocks("text"):

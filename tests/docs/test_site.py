@@ -6,9 +6,7 @@ not resolve, and for pages that the navigation does not reach.
 
 from __future__ import annotations
 
-import inspect
 import os
-import pkgutil
 import re
 import subprocess
 import sys
@@ -26,7 +24,7 @@ from thermocald.physics import catalogue
 
 sys.path.insert(0, str(ROOT / "docs"))
 
-from _site import five_pages, reference
+from _site import reference
 
 LOADED = re.compile(
     r"""<(?:script|img|iframe|source|audio|video|embed|object|image|use|link)\b[^>]*?
@@ -104,17 +102,6 @@ def test_the_reference_has_every_command_key_effect_and_driver(site):
     for kind in ("cameras", "thermometers", "outputs"):
         for point in entry_points(group=f"thermocald.{kind}"):
             assert point.name in drivers or not point.value.startswith("thermocald_drivers")
-
-
-def test_five_pages_of_code(site):
-    """Each is there with its code, and none is longer than a page."""
-    folder, pages = site
-    text = text_of(pages[folder / "explanation/five-pages.html"])
-    for title, (_, *names) in five_pages.PAGES.items():
-        sources = [inspect.getsource(pkgutil.resolve_name(name)) for name in names]
-        assert title in text
-        assert all(source.splitlines()[0].strip() in text for source in sources)
-        assert sum(len(source.splitlines()) for source in sources) <= 66, title
 
 
 def keys(model) -> set[str]:

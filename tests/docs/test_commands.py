@@ -183,8 +183,9 @@ class Page:
 
     def __exit__(self, *_: object) -> None:
         for process in self.running.values():
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
 
 
 def skipped(command: str) -> bool:

@@ -111,7 +111,9 @@ def test_rasterised_rings_carry_the_code_of_the_csv(read, bits):
 
 
 def test_markers_are_found_by_opencv_where_the_csv_says(read):
-    field, image, places = read(Design((200.0, 250.0), 7.0, dictionary="DICT_APRILTAG_36h11"))
+    field, image, places = read(
+        Design(paper_size("200x250"), 7.0, dictionary="DICT_APRILTAG_36h11")
+    )
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
     found = {

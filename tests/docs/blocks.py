@@ -14,14 +14,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 LANGUAGES = {"bash", "csv", "ini", "json", "python", "sql", "text", "toml", "yaml"}
-PAGES = sorted(
-    [
-        *(ROOT / "docs").rglob("*.md"),
-        ROOT / "README.md",
-        ROOT / "CONTRIBUTING.md",
-        ROOT / "drivers/README.md",
-    ]
-)
+OTHERS = ("README.md", "CONTRIBUTING.md", "drivers/README.md")
+PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *(ROOT / other for other in OTHERS)])
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 

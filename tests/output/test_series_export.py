@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import thermocald as tc
 from tests.commands import succeed as run
 from thermocald.errors import UsageError
-from thermocald.physics.presets import preset_simulation
 from thermocald.physics.testfields import corner_field
 from thermocald.store.database.store import Store
 from thermocald.store.logger.temperatures import read_log
@@ -21,33 +20,27 @@ from thermocald.store.recording.reader import read_recording
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    place = tmp_path_factory.mktemp("export")
-    s = preset_simulation("rpi-v2.1-heating", seed=1, field=corner_field("circles", 4, 150.0))
-    replace(s, programme=replace(s.programme, epochs=10)).write(place / "M1")
-    return place / "M1"
+    place = tmp_path_factory.mktemp("export") / "M1"
+    field = corner_field("circles", 4, 150.0)
+    tc.simulate("rpi-v2.1-heating", seed=1, testfield=field, epochs=10, out=place)
+    return place
 
 
-def rows_of(text, separator=","):
-    return list(csv.DictReader(text.splitlines(), delimiter=separator))
+def rows_of(*words, separator=","):
+    return list(csv.DictReader(run("export", *words).stdout.splitlines(), delimiter=separator))
 
 
 def test_units_are_named_and_true(recording):
-    plain = rows_of(run("export", recording).stdout)
-    german = rows_of(
-        run("export", recording, "--units", "px,um,deg", "--time", "iso", "--separator", ";",
-            "--decimal", ",").stdout, ";",
-    )  # fmt: skip
+    plain = rows_of(recording)
+    style = ("--units", "px,um,deg", "--time", "iso", "--separator", ";", "--decimal", ",")
+    german = rows_of(recording, *style, separator=";")
     pitch = read_recording(recording).camera.sensor.pixel_pitch
+    units = {"c_px": 1 / pitch, "sd_x0_px": 1 / pitch, "X0_um": 1000, "omega_deg": 180 / np.pi}
     assert len(german) == len(plain) == 10
     for a, b in zip(plain, german, strict=True):
-
-        def number(name, row=b):
-            return float(row[name].replace(",", "."))
-
-        assert number("c_px") * pitch == pytest.approx(float(a["c"]), rel=1e-14)
-        assert number("sd_x0_px") * pitch == pytest.approx(float(a["sd_x0"]), rel=1e-14)
-        assert number("X0_um") == pytest.approx(1000 * float(a["X0"]), rel=1e-14)
-        assert number("omega_deg") == pytest.approx(np.degrees(float(a["omega"])), rel=1e-14)
+        for name, factor in units.items():
+            expected = factor * float(a[name.rpartition("_")[0]])
+            assert float(b[name].replace(",", ".")) == pytest.approx(expected, rel=1e-14)
         assert b["frame_time"].endswith("Z")
         assert "c" not in b
         assert b["status"] == a["status"] == "ok"
@@ -58,7 +51,7 @@ def test_parquet_is_bit_for_bit(recording, tmp_path):
     out = tmp_path / "new" / "M1.parquet"
     run("export", recording, "--format", "parquet", "-o", out)
     table = parquet.read_table(out)
-    plain = rows_of(run("export", recording).stdout)
+    plain = rows_of(recording)
     for name in ("c", "sd_c", "omega", "sigma0"):
         assert table[name].to_pylist() == [float(row[name]) for row in plain]
     assert table["sd_C1"].null_count == len(plain)  # held; a NaN would spoil a mean in polars
@@ -74,16 +67,17 @@ def test_extra_columns_of_a_store_are_exported_and_imported_the_same(recording, 
         series = store.create_series(opened.head, opened.testfield)
         for k, epoch in enumerate(opened.iter_epochs()):
             store.append(series, epoch, extra=settings if k != 3 else None)
-    source = ("export", tmp_path / "t.db", "--extra")
-    rows = rows_of(run(*source).stdout)
+    source = (tmp_path / "t.db", "--extra")
+    rows = rows_of(*source)
     assert [r["camera_gain"] for r in rows] == ["1.5"] * 3 + [""] + ["1.5"] * 6
     channels = opened.columns.temperatures
     assert {f"temperature {n}" for n in channels} <= set(rows[0])
-    by_json = json.loads(run(*source, "--format", "json").stdout)
+    by_json = json.loads(run("export", *source, "--format", "json").stdout)
     assert [r["camera_focus"] for r in by_json] == [-0.25] * 3 + [None] + [-0.25] * 6
 
     out = tmp_path / "german.csv"
-    run(*source, "--time", "iso", "--separator", ";", "--decimal", ",", "-o", out)
+    style = ("--time", "iso", "--separator", ";", "--decimal", ",", "-o", out)
+    run("export", *source, *style)
     log = read_log(out)  # no time zone needed: the times say UTC
     assert log.times == pytest.approx(opened.columns.frame_time, abs=2e-6)
     for name in channels:
@@ -97,7 +91,7 @@ def test_unknown_columns_of_a_recording_are_extra(recording, tmp_path):
     head, *lines = epochs.read_text().splitlines()
     noted = [f"{line},{'lamp on' if k > 4 else ''}" for k, line in enumerate(lines)]
     epochs.write_text("\n".join([f"{head},remark", *noted]) + "\n")
-    rows = rows_of(run("export", tmp_path / "M1", "--extra", "--exterior", "series").stdout)
+    rows = rows_of(tmp_path / "M1", "--extra", "--exterior", "series")
     assert [r["remark"] for r in rows] == [""] * 5 + ["lamp on"] * 5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -28,32 +29,37 @@ from thermocald.store.recording.testfield_file import read_testfield
 
 DPI = 200
 MM = DPI / 25.4  # px
+SHEET = Design(paper_size("A4"), 7.0, bits=12)
+CORNER = Design(paper_size("A3"), 14.0, sheets=3)
 
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """Map a design to its folder and the printed field, made once."""
+    """Map a design to its printed field and its folder, made once."""
 
     @cache
     def print_once(design):
         folder = tmp_path_factory.mktemp("printed")
-        return folder, print_testfield(design, folder)
+        return print_testfield(design, folder), folder
 
     return print_once
 
 
-raster = cache(rasterised)
-CORNER = Design(paper_size("A3"), 14.0, sheets=3)
+@pytest.fixture(scope="module")
+def read(printed):
+    """Map the design of a sheet to what its CSV says, the raster of its PDF, and places there."""
 
+    @cache
+    def read_once(design, dpi=DPI):
+        _, folder = printed(design)
+        field = read_testfield(folder / "testfield.csv")
+        image = rasterised(folder / "testfield.pdf", 0, dpi)
+        xy = field.points[:, :2] + TRIM
+        # px, (0, 0) a pixel's centre; the renderer stretches the page to whole pixels
+        scale = np.array(image.shape[::-1]) / design.page
+        return field, image, np.column_stack([xy[:, 0], design.page[1] - xy[:, 1]]) * scale - 0.5
 
-def page_px(field, rows, page, image):
-    """Where targets on a single sheet should be on the raster, px, (0, 0) a pixel's centre.
-
-    The renderer stretches the page to whole pixels.
-    """
-    xy = field.points[rows, :2] + TRIM
-    scale = np.array(image.shape[::-1]) / page
-    return np.column_stack([xy[:, 0], page[1] - xy[:, 1]]) * scale - 0.5
+    return read_once
 
 
 def centroid(image, centre, radius_px, light=False):
@@ -70,55 +76,44 @@ def centroid(image, centre, radius_px, light=False):
 
 
 @pytest.mark.parametrize(
-    ("paper", "options"),
+    "design",
     [
-        ("A4", {"bits": 12}),
+        pytest.param(SHEET, id="A4"),
         # the markers' white surround reached the plain circles
-        ("A4", {"light": True, "dictionary": "DICT_4X4_50"}),
+        pytest.param(replace(SHEET, bits=None, light=True, dictionary="DICT_4X4_50"), id="light"),
     ],
-    ids=["A4", "light on dark"],
 )
-def test_rasterised_discs_are_where_the_csv_says(printed, paper, options):
-    page = paper_size(paper)
-    design = Design(page, 7.0, **options)
-    folder, _ = printed(design)
-    field = read_testfield(folder / "testfield.csv")
-    image = raster(folder / "testfield.pdf", 0, DPI)
-    assert image.shape == pytest.approx((page[1] * MM, page[0] * MM), abs=1.01)
-    circles = np.flatnonzero(field.circles)
-    assert len(circles) >= 30
-    expected = page_px(field, circles, page, image)
+def test_rasterised_discs_are_where_the_csv_says(read, design):
+    field, image, places = read(design)
+    assert image.shape == pytest.approx((297 * MM, 210 * MM), abs=1.01)
+    assert field.circles.sum() >= 30
     # outside the disc, but without its ring and name
     reach = 1.3 / 2 * design.diameter * MM
+    expected = places[field.circles]
     found = np.array([centroid(image, p, reach, design.light) for p in expected])
     # a hundredth of a millimetre: a tenth of a printer's dot
     assert np.abs(found - expected).max() / MM < 0.01
 
 
 @pytest.mark.parametrize("bits", mostly_slow([12, 14], 12))
-def test_rasterised_rings_carry_the_code_of_the_csv(printed, bits):
+def test_rasterised_rings_carry_the_code_of_the_csv(read, bits):
     """The ring is read off the raster pixel by pixel, clockwise, without the program's decoder."""
-    page = paper_size("A4")
-    folder, _ = printed(Design(page, 7.0, bits=bits))
-    field = read_testfield(folder / "testfield.csv")
-    image = raster(folder / "testfield.pdf", 0, DPI)
+    field, image, places = read(replace(SHEET, bits=bits))
     coded = [i for i, code in enumerate(field.codes) if code]
     assert len({field.codes[i] for i in coded}) == len(coded) >= 20
     middle = 0.5 * (ring_code.RING_INNER + ring_code.RING_OUTER) * 3.5 * MM
-    for i, centre in zip(coded, page_px(field, coded, page, image), strict=True):
-        turns = 2 * np.pi * (np.arange(bits) + 0.5) / bits  # y down: clockwise
-        at = centre[:, None] + middle * np.array([np.cos(turns), np.sin(turns)])
-        x, y = np.rint(at).astype(int)
-        word = "".join("1" if grey < 128 else "0" for grey in image[y, x])
+    turns = 2 * np.pi * (np.arange(bits) + 0.5) / bits  # y down: clockwise
+    for i in coded:
+        x, y = np.rint(places[i][:, None] + middle * np.array([np.cos(turns), np.sin(turns)]))
+        word = "".join("1" if grey < 128 else "0" for grey in image[y.astype(int), x.astype(int)])
         smallest = min(int(word[k:] + word[:k], 2) for k in range(bits))
         assert f"RING{bits}:{smallest}" == field.codes[i]
 
 
-def test_markers_are_found_by_opencv_where_the_csv_says(printed):
-    page = paper_size("200x250")
-    folder, _ = printed(Design(page, 7.0, dictionary="DICT_APRILTAG_36h11"))
-    field = read_testfield(folder / "testfield.csv")
-    image = raster(folder / "testfield.pdf", 0, DPI)
+def test_markers_are_found_by_opencv_where_the_csv_says(read):
+    field, image, places = read(
+        Design(paper_size("200x250"), 7.0, dictionary="DICT_APRILTAG_36h11")
+    )
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
     found = {
@@ -128,38 +123,31 @@ def test_markers_are_found_by_opencv_where_the_csv_says(printed):
     }
     rows = [i for i, kind in enumerate(field.kinds) if kind == "marker_corner"]
     assert {field.codes[i] for i in rows} == set(found)
-    expected = page_px(field, rows, page, image)
-    errors = [found[field.codes[i]] - p for i, p in zip(rows, expected, strict=True)]
+    errors = [found[field.codes[i]] - places[i] for i in rows]
     assert np.abs(errors).max() / MM < 0.2  # OpenCV's corners without refinement: 1 to 2 px
 
 
-def test_rulers_are_as_long_as_they_say(printed):
-    folder, _ = printed(Design(paper_size("A4"), 7.0, bits=12))
-    image = raster(folder / "testfield.pdf", 0, 600)
-    mm = 600 / 25.4
-    dark = image < 128
-    for lengthwise in (dark, np.rot90(dark, k=-1)):  # the second: the left edge becomes the top
-        height = lengthwise.shape[0]
-        # the ten-millimetre ticks stand 6 to 7 mm inside the trimmed edge, alone there
-        level = TRIM + 6.5
-        row = int(height - level * mm) if lengthwise is dark else int(level * mm)
-        ticks = np.flatnonzero(np.diff(np.concatenate([[0], lengthwise[row].astype(int)])) == 1)
+def test_rulers_are_as_long_as_they_say(read):
+    dark, mm = read(SHEET, 600.0)[1] < 128, 600 / 25.4
+    # the ten-millimetre ticks stand 6 to 7 mm inside the trimmed edge, alone there
+    level = int((TRIM + 6.5) * mm)
+    for line in (dark[-level], dark[:, level]):
+        ticks = np.flatnonzero(np.diff(line.astype(int), prepend=0) == 1)
         assert len(ticks) == 11
         assert (ticks[-1] - ticks[0]) / mm == pytest.approx(100.0, abs=0.05)
         assert np.diff(ticks) / mm == pytest.approx(10.0, abs=0.06)
 
 
 def test_svg_draws_the_same_page(printed):
-    page = paper_size("A4")
-    folder, _ = printed(Design(page, 7.0, bits=12))
-    root = ET.parse(folder / "testfield.svg").getroot()
+    root = ET.parse(printed(SHEET)[1] / "testfield.svg").getroot()
     size = [float(root.get(side).removesuffix("pt")) / 72 * 25.4 for side in ("width", "height")]
-    assert size == pytest.approx(page, abs=0.01)
+    assert size == pytest.approx(SHEET.page, abs=0.01)
     assert sum(1 for _ in root.iter("{http://www.w3.org/2000/svg}path")) > 40
 
 
-def test_corner_is_three_perpendicular_sheets_with_distinct_codes(printed):
-    _, done = printed(CORNER)
+def test_corner_is_three_perpendicular_sheets_with_distinct_codes_and_a_plan(printed):
+    pdfium = pytest.importorskip("pypdfium2")
+    done, folder = printed(CORNER)
     assert [f.name for f in done.files] == [
         "testfield.pdf", "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv",
     ]  # fmt: skip
@@ -172,50 +160,48 @@ def test_corner_is_three_perpendicular_sheets_with_distinct_codes(printed):
     # seen from outside, on each sheet the order right, up, towards the viewer is right-handed:
     # otherwise the ring codes of that sheet would be mirrored
     for rows, sheet, normal in zip(planes, done.sheets, np.eye(3)[[2, 1, 0]], strict=True):
-        local = np.column_stack([sheet.field.points[:, :2], np.ones(len(rows))])
-        axes = np.linalg.lstsq(local, field.points[rows], rcond=None)[0][:2]
-        assert np.cross(axes[0], axes[1]) == pytest.approx(normal, abs=1e-9)
-
-
-def test_the_plan_and_the_coordinates_agree_on_left_and_right(printed):
-    """Looking into the corner, sheet 2 is on the left; letters are on edges that coincide."""
-    sheets = printed(CORNER)[1].sheets
-    field = field_of(sheets)
-    camera = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04))
-    image = camera.project(usual_station(camera, field), field.points)
-    rows = {s.title: [field.index[name] for name in s.field.names] for s in sheets}
-    floor, left, right = (image[r].mean(axis=0) for r in rows.values())
-    assert left[0] < floor[0] < right[0]
-    assert floor[1] > max(left[1], right[1])
-    ends = {"left": ((0, 0), (0, 1)), "right": ((1, 0), (1, 1)), "lower": ((0, 0), (1, 0))}
-    edges: dict[str, list[set[int]]] = {}
-    for sheet, (_, r) in zip(sheets, rows.items(), strict=True):
-        local = np.column_stack([sheet.field.points[:, :2], np.ones(len(r))])
-        placing = np.linalg.lstsq(local, field.points[r], rcond=None)[0]
-        for side, letter in sheet.edges.items():
-            line = np.array([[*np.array(end) * sheet.size, 1.0] for end in ends[side]]) @ placing
-            on = {axis for axis in range(3) if np.abs(line[:, axis]).max() < 1e-6}
-            edges.setdefault(letter, []).append(on)
-    # both sheets with a letter have that edge on the same axis, where the two others are 0
-    assert sorted(edges) == ["A", "B", "C"]
-    for first, second in edges.values():
-        assert first == second
-        assert len(first) == 2
-
-
-def test_a_corner_comes_with_the_plan_to_put_it_up(printed):
-    pdfium = pytest.importorskip("pypdfium2")
-    with pdfium.PdfDocument(printed(CORNER)[0] / "testfield.pdf") as document:
+        right, up, _ = placing_of(sheet, field.points[rows])
+        assert np.cross(right, up) == pytest.approx(normal, abs=1e-9)
+    with pdfium.PdfDocument(folder / "testfield.pdf") as document:
         assert len(document) == 4
         words = " ".join(document[3].get_textpage().get_text_bounded().split())
     for said in ("Glue", "brackets", "0.4°", "survey", "edges with the same letter meet"):
         assert said in words
 
 
-def test_sigmas_are_those_of_an_unsurveyed_print():
-    flat = field_of(lay_out(Design(paper_size("A3"), 9.0)))
+def placing_of(sheet, points):
+    """The space directions of a sheet's right and up, and the place of its origin, (3, 3)."""
+    local = np.column_stack([sheet.field.points[:, :2], np.ones(len(points))])
+    return np.linalg.lstsq(local, points, rcond=None)[0]
+
+
+def test_the_plan_and_the_coordinates_agree_on_left_and_right(printed):
+    """Looking into the corner, sheet 2 is on the left; letters are on edges that coincide."""
+    done = printed(CORNER)[0]
+    field, sheets = done.field, done.sheets
+    camera = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04))
+    image = camera.project(usual_station(camera, field), field.points)
+    rows = [[field.index[name] for name in sheet.field.names] for sheet in sheets]
+    floor, left, right = (image[r].mean(axis=0) for r in rows)
+    assert left[0] < floor[0] < right[0]
+    assert floor[1] > max(left[1], right[1])
+    ends = {"left": ((0, 0), (0, 1)), "right": ((1, 0), (1, 1)), "lower": ((0, 0), (1, 0))}
+    edges: dict[str, list[set[int]]] = {}
+    for sheet, r in zip(sheets, rows, strict=True):
+        placing = placing_of(sheet, field.points[r])
+        for side, letter in sheet.edges.items():
+            line = np.array([[*np.array(end) * sheet.size, 1.0] for end in ends[side]]) @ placing
+            on = {axis for axis in range(3) if np.abs(line[:, axis]).max() < 1e-6}
+            edges.setdefault(letter, []).append(on)
+    # both sheets with a letter have that edge on the same axis, where the two others are 0
+    assert sorted(edges) == ["A", "B", "C"]
+    assert all(first == second and len(first) == 2 for first, second in edges.values())
+
+
+def test_sigmas_are_those_of_an_unsurveyed_print(printed):
+    flat = field_of(lay_out(SHEET))
     assert flat.sigmas[:, 2].min() > flat.sigmas[:, 0].max() > flat.sigmas[:, 0].min() > 0.09
-    assert field_of(lay_out(CORNER)).sigmas.min() > 2.9
+    assert printed(CORNER)[0].field.sigmas.min() > 2.9
 
 
 @pytest.mark.parametrize("name", ["A4", "A3", "A2", "A1", "A0"])

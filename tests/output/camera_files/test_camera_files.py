@@ -7,7 +7,6 @@ import re
 import subprocess
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -26,22 +25,19 @@ from thermocald.photogrammetry.camera.camera_model import (
 
 TOLERANCE_PX = 1e-6
 SENSOR = Sensor(3280, 2464, 0.00112)
-PLAIN = InteriorOrientation(
-    c=3.05, x0=0.021, y0=-0.013, A1=-2.1e-3, A2=4.0e-4, A3=-2.0e-5, B1=4e-5, B2=-3e-5
-)
+PINHOLE = InteriorOrientation(c=3.05, x0=0.021, y0=-0.013)
+PLAIN = replace(PINHOLE, A1=-2.1e-3, A2=4.0e-4, A3=-2.0e-5, B1=4e-5, B2=-3e-5)
+FORMATS = set(camera_files.FORMATS)
 CAMERAS = {
-    "plain": PLAIN,
-    "without A3": replace(PLAIN, A3=0.0),
-    "pinhole with shear": InteriorOrientation(c=3.05, x0=0.02, y0=-0.01, C1=2e-3, C2=-1e-3),
-    "all": replace(PLAIN, C1=3e-4, C2=-2e-4),
+    "plain": (PLAIN, FORMATS - {"kalibr"}),
+    "without A3": (replace(PLAIN, A3=0.0), FORMATS),
+    "affinity": (replace(PLAIN, C1=3e-4), {"json"}),
+    "shear": (replace(PLAIN, C2=3e-4), {"json"}),
+    "all": (replace(PLAIN, C1=3e-4, C2=-2e-4), {"json"}),
+    "pinhole with affinity": (replace(PINHOLE, C1=3e-4), FORMATS),
+    "pinhole with both": (replace(PINHOLE, C1=2e-3, C2=-1e-3), {"metashape", "aicon", "json"}),
 }
-FORMATS = list(camera_files.FORMATS)
-every_camera = pytest.mark.parametrize("camera", CAMERAS)
-
-
-def _camera(name="plain", **changes):
-    return CameraModel(SENSOR, replace(CAMERAS[name], **changes))
-
+"""By name: the camera, and the formats whose convention holds it exactly."""
 
 X, Y = (v.ravel() for v in np.meshgrid(np.linspace(-0.58, 0.58, 23), np.linspace(-0.43, 0.43, 17)))
 VIEW = (
@@ -50,134 +46,95 @@ VIEW = (
 """Points (n, 3) before a camera, in OpenCV's axes, that fill the image of `plain`."""
 
 
+def _camera():
+    return CameraModel(SENSOR, PLAIN)
+
+
 def _pixels(model, view=VIEW):
     """The truth: our own projection of points in OpenCV's axes."""
     return model.project(ExteriorOrientation(0, 0, 0, 0, 0, 0), view * [1, -1, -1])
 
 
-def _stated(text):
-    """Largest and RMS residual that a file states, 0 where it is exact."""
-    if "conversion: exact" in text:
-        return 0.0, 0.0
-    found = re.search(r"largest residual ([\d.e-]+) px, RMS ([\d.e-]+) px", text)
-    return float(found.group(1)), float(found.group(2))
-
-
-def _allowed(text):
-    """How far pixels may be off: what the file states, of which three digits are printed."""
-    return 1.01 * _stated(text)[0] + TOLERANCE_PX
-
-
 # --- other programs: OpenCV's and mrcal's own readers; formulas from the others' manuals -------
 
 
-def _projected(view, fx, fy, cx, cy, *distortion):
+def _projected(fx, fy, cx, cy, *distortion):
     """OpenCV's projection, which ROS, COLMAP and Kalibr share."""
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    return cv2.projectPoints(view, np.zeros(3), np.zeros(3), K, np.array(distortion))[0][:, 0]
+    return cv2.projectPoints(VIEW, np.zeros(3), np.zeros(3), K, np.array(distortion))[0][:, 0]
 
 
-def _opencv(path, camera, view):
+def _opencv(path):
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     K, d = (storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients"))
     assert [int(storage.getNode(n).real()) for n in ("image_width", "image_height")] == [3280, 2464]
     storage.release()
-    return _projected(view, *K[[0, 1, 0, 1], [0, 1, 2, 2]], *d.ravel())
+    return _projected(*K[[0, 1, 0, 1], [0, 1, 2, 2]], *d.ravel())
 
 
 _MRCAL = """
 import json, sys
 import numpy as np
 import mrcal
-for line in sys.stdin:
-    path, points = json.loads(line)
-    model = mrcal.cameramodel(path)
-    print(json.dumps({"size": [int(v) for v in model.imagersize()], "lens": model.intrinsics()[0],
-                      "pixels": mrcal.project(np.array(points), *model.intrinsics()).tolist()}),
-          flush=True)
+model = mrcal.cameramodel(sys.argv[1])
+assert list(model.imagersize()) == [3280, 2464]
+points = np.array(json.load(sys.stdin))
+print(json.dumps(mrcal.project(points, *model.intrinsics()).tolist()))
 """
 
 
-_PYTHON = Path("/usr/bin/python3")
-
-
-@pytest.fixture(scope="module")
-def ask_mrcal():
-    """(path, points) → what Debian's python3-mrcal makes of them, in the system's interpreter."""
-    probe = [_PYTHON, "-c", "import mrcal"]
-    if not _PYTHON.exists() or subprocess.run(probe, capture_output=True, check=False).returncode:
+def _mrcal(path):
+    """What Debian's python3-mrcal makes of it, in the system's interpreter."""
+    if not Path("/usr/lib/python3/dist-packages/mrcal").exists():
         pytest.skip("python3-mrcal is not installed (apt install python3-mrcal)")
-    command = [_PYTHON, "-c", _MRCAL]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
-
-        def ask(path, points):
-            one.stdin.write(json.dumps([str(path), points.tolist()]) + "\n")
-            one.stdin.flush()
-            return json.loads(one.stdout.readline())
-
-        yield ask
+    command = ["/usr/bin/python3", "-c", _MRCAL, path]
+    given = json.dumps(VIEW.tolist())
+    return np.array(json.loads(subprocess.check_output(command, input=given, text=True)))
 
 
-def _mrcal(path, camera, view, ask):
-    answer = ask(path, view)
-    assert answer["size"] == [3280, 2464]
-    assert answer["lens"] == ("LENSMODEL_OPENCV5" if camera.interior.A3 else "LENSMODEL_OPENCV4")
-    return np.array(answer["pixels"])
-
-
-def _ros(path, camera, view):
+def _ros(path):
     info = yaml.safe_load(path.read_text())
-    assert info["camera_name"] == "left"
-    assert info["distortion_model"] == "plumb_bob"
-    for key, shape in (
-        ("camera_matrix", (3, 3)), ("distortion_coefficients", (1, 5)),
-        ("rectification_matrix", (3, 3)), ("projection_matrix", (3, 4)),
-    ):  # fmt: skip
-        assert (info[key]["rows"], info[key]["cols"]) == shape
-        assert len(info[key]["data"]) == shape[0] * shape[1]
-    K = np.array(info["camera_matrix"]["data"])
-    return _projected(view, *K[[0, 4, 2, 5]], *info["distortion_coefficients"]["data"])
+    assert (info["camera_name"], info["distortion_model"]) == ("left", "plumb_bob")
+    K, d, _, _ = (
+        np.reshape(info[key]["data"], (info[key]["rows"], info[key]["cols"]))
+        for key in ("camera_matrix", "distortion_coefficients", "rectification_matrix",
+                    "projection_matrix")
+    )  # fmt: skip
+    return _projected(*K[[0, 1, 0, 1], [0, 1, 2, 2]], *d.ravel())
 
 
-def _colmap(path, camera, view):
+def _colmap(path):
     """The upper left pixel's centre is (0.5, 0.5)."""
     (line,) = [row for row in path.read_text().splitlines() if not row.startswith("#")]
     _, model, width, height, *parameters = line.split()
     assert (int(width), int(height)) == (3280, 2464)
-    assert (model, len(parameters)) == (
-        ("FULL_OPENCV", 12) if camera.interior.A3 else ("OPENCV", 8)
-    )
-    return _projected(view, *(float(p) for p in parameters)) - 0.5
+    assert (model, len(parameters)) in [("FULL_OPENCV", 12), ("OPENCV", 8)]
+    return _projected(*(float(p) for p in parameters)) - 0.5
 
 
-def _kalibr(path, camera, view):
+def _kalibr(path):
     cam = yaml.safe_load(path.read_text())["cam0"]
     assert (cam["camera_model"], cam["distortion_model"]) == ("pinhole", "radtan")
     assert cam["resolution"] == [3280, 2464]
-    # without a sixth-order term the fit cannot be exact, and says so
-    assert _stated(path.read_text())[0] > 0.1 or camera.interior.A3 == 0
-    return _projected(view, *cam["intrinsics"], *cam["distortion_coeffs"])
+    return _projected(*cam["intrinsics"], *cam["distortion_coeffs"])
 
 
-def _metashape(path, camera, view):
+def _metashape(path):
     """u = w/2 + cx + x'f + x'B1 + y'B2, the upper left pixel's centre is (0.5, 0.5)."""
     root = ET.parse(path).getroot()
     assert (root.tag, root.findtext("projection")) == ("calibration", "frame")
-    v = {
-        tag: float(root.findtext(tag))
-        for tag in ["f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"]
-    }
-    x, y = (view[:, :2] / view[:, 2:]).T
+    tags = ("width", "height", "f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+    v = {tag: float(root.findtext(tag)) for tag in tags}
+    x, y = (VIEW[:, :2] / VIEW[:, 2:]).T
     r2 = x * x + y * y
     f = 1 + v["k1"] * r2 + v["k2"] * r2**2 + v["k3"] * r2**3 + v["k4"] * r2**4
     xd = x * f + v["p1"] * (r2 + 2 * x * x) + 2 * v["p2"] * x * y
     yd = y * f + v["p2"] * (r2 + 2 * y * y) + 2 * v["p1"] * x * y
-    w, h = int(root.findtext("width")), int(root.findtext("height"))
-    u = w * 0.5 + v["cx"] + xd * v["f"] + xd * v["b1"] + yd * v["b2"]
-    return np.column_stack([u, h * 0.5 + v["cy"] + yd * v["f"]]) - 0.5
+    u = v["width"] * 0.5 + v["cx"] + xd * v["f"] + xd * v["b1"] + yd * v["b2"]
+    return np.column_stack([u, v["height"] * 0.5 + v["cy"] + yd * v["f"]]) - 0.5
 
 
-def _aicon(path, camera, view):
+def _aicon(path):
     """FlowVeloTool splits the whole file at single blanks and counts fields; its formulas, in mm.
 
     This is that program's reading of the format, not a check against the vendor's own.
@@ -186,7 +143,7 @@ def _aicon(path, camera, view):
     ck, xh, yh, a1, a2, r0, a3, b1, b2, c1, c2 = (float(f) for f in fields[2:13])
     width, height, columns, rows = (float(f) for f in fields[13:17])
     assert ck < 0 < r0
-    x, y = -ck * view[:, 0] / view[:, 2], ck * view[:, 1] / view[:, 2]
+    x, y = -ck * VIEW[:, 0] / VIEW[:, 2], ck * VIEW[:, 1] / VIEW[:, 2]
     r2, q = x * x + y * y, r0**2
     radial = a1 * (r2 - q) + a2 * (r2**2 - q**2) + a3 * (r2**3 - q**3)
     x, y = (
@@ -205,83 +162,46 @@ READERS = {
 }  # fmt: skip
 
 
-@every_camera
-@pytest.mark.parametrize("name", READERS)
-def test_another_program_projects_the_same_pixels(tmp_path, camera, name, request):
-    reader, camera = READERS[name], _camera(camera)
-    if name == "mrcal":
-        reader = partial(reader, ask=request.getfixturevalue("ask_mrcal"))
-    path = tmp_path / f"camera{camera_files.FORMATS[name].suffix}"
-    statement = camera_files.write(camera, path, name, name="left", comment="a comment 1 2 3")
-    off = np.linalg.norm(reader(path, camera, VIEW) - _pixels(camera), axis=1).max()
-    exact = statement.startswith("exact")
-    assert off < (TOLERANCE_PX if exact else _allowed(path.read_text()))
-
-
-# --- which conversions are exact ---------------------------------------------------------------
-
-
-_STRAIGHT = dict.fromkeys(("A1", "A2", "A3", "B1", "B2"), 0.0)
-_ALL = set(FORMATS)
-
-
-@pytest.mark.parametrize(
-    ("interior", "exact_in"),
-    [
-        ({}, _ALL - {"kalibr"}),
-        ({"A3": 0.0}, _ALL),
-        ({"C1": 3e-4}, {"json"}),
-        ({"C2": 3e-4}, {"json"}),
-        ({**_STRAIGHT, "C1": 3e-4}, _ALL),
-        ({**_STRAIGHT, "C1": 3e-4, "C2": 2e-4}, {"metashape", "aicon", "json"}),
-    ],
-    ids=["no affinity", "no A3", "C1", "C2", "pinhole C1", "pinhole C1 C2"],
-)
-def test_exact_where_the_convention_allows(tmp_path, interior, exact_in):
-    exact = set()
-    for name in FORMATS:
-        statement = camera_files.write(_camera(**interior), tmp_path / name, name)
-        if statement.startswith("exact"):
-            exact.add(name)
-        assert name == "json" or statement in (tmp_path / name).read_text()
-    assert exact == exact_in
-
-
-# --- round trips -------------------------------------------------------------------------------
-
-
-@every_camera
-@pytest.mark.parametrize("name", FORMATS)
-def test_round_trip(tmp_path, camera, name):
-    camera = _camera(camera)
-    path = tmp_path / f"camera{camera_files.FORMATS[name].suffix}"
-    camera_files.write(camera, path, name, comment="21 °C\nin the workshop")
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("name", camera_files.FORMATS)
+def test_the_other_program_and_ours_project_the_same_pixels(tmp_path, camera, name):
+    """Exactly where the format's convention allows, else as well as the file states."""
+    (interior, exact_in), path = CAMERAS[camera], tmp_path / "camera"
+    model = CameraModel(SENSOR, interior)
+    comment = "21 °C\nin workshop 3"
+    statement = camera_files.write(model, path, name, name="left", comment=comment)
     text = path.read_text(encoding="utf-8")
-    assert "in the workshop" in text
+    assert "in workshop 3" in text
+    assert name == "json" or statement in text
+    assert statement.startswith("exact") is (name in exact_in)
+    # three digits are printed
+    stated = re.search(r"largest residual ([\d.e-]+) px", statement)
+    allowed = (1.01 * float(stated[1]) if stated else 0.0) + TOLERANCE_PX
+    if name in READERS:
+        assert np.linalg.norm(READERS[name](path) - _pixels(model), axis=1).max() < allowed
     back = camera_files.read(path)
     assert back.format == name
-    assert back.model.sensor.pixel_pitch == pytest.approx(SENSOR.pixel_pitch, rel=1e-15)
-    assert (back.model.sensor.width, back.model.sensor.height) == (3280, 2464)
-    stated = 0.0 if name == "json" else _allowed(text)
-    off = np.linalg.norm(_pixels(back.model) - _pixels(camera), axis=1).max()
-    assert off < stated + 1.01 * back.largest_px + TOLERANCE_PX
-    if "conversion: exact" in text or name == "json":
-        values, own = back.model.interior.as_array(), camera.interior.as_array()
-        assert values == pytest.approx(own, rel=1e-9, abs=1e-13)
+    sensor = back.model.sensor
+    assert (sensor.width, sensor.height) == (3280, 2464)
+    assert sensor.pixel_pitch == pytest.approx(SENSOR.pixel_pitch, rel=1e-15)
+    off = np.linalg.norm(_pixels(back.model) - _pixels(model), axis=1).max()
+    assert off < allowed + 1.01 * back.largest_px
+    if name in exact_in:
+        values = back.model.interior.as_array()
+        assert values == pytest.approx(interior.as_array(), rel=1e-9, abs=1e-13)
 
 
 def test_pixel_pitch_is_asked_for_where_nobody_states_it_and_must_be_the_files(tmp_path):
     path = tmp_path / "camera.yaml"
+    camera_files.write(_camera(), path, "json")
+    with pytest.raises(ConfigurationError, match=r"0\.002 mm was given"):
+        camera_files.read(path, pixel_pitch=0.002)
     camera_files.write(_camera(), path, "opencv")
-    text = "\n".join(row for row in path.read_text().splitlines() if "pixel_pitch" not in row)
-    path.write_text(text)
+    path.write_text(re.sub("(?m)^.*pixel_pitch.*$", "", path.read_text()))
     with pytest.raises(ConfigurationError, match="--pixel-pitch"):
         camera_files.read(path)
     back = camera_files.read(path, pixel_pitch=0.00112)
     assert back.model.interior.as_array() == pytest.approx(PLAIN.as_array(), rel=1e-9)
-    camera_files.write(_camera(), tmp_path / "a.json", "json")
-    with pytest.raises(ConfigurationError, match=r"0\.002 mm was given"):
-        camera_files.read(tmp_path / "a.json", pixel_pitch=0.002)
 
 
 # --- imports that nobody writes here -----------------------------------------------------------
@@ -291,11 +211,9 @@ def test_rational_model_is_imported_by_a_fit_that_states_its_residual(tmp_path):
     K = np.array([[2723.0, 0, 1650.0], [0, 2720.0, 1220.0], [0, 0, 1]])
     d = np.array([0.11, -0.2, 1e-4, -2e-4, 0.02, 0.08, -0.15, 0.01])
     path = tmp_path / "rational.yaml"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for key, value in (("image_width", 3280), ("image_height", 2464), ("camera_matrix", K),
-                       ("distortion_coefficients", d)):  # fmt: skip
-        storage.write(key, value)
-    storage.release()
+    document = {"image_width": 3280, "image_height": 2464, "camera_matrix": K.ravel().tolist(),
+                "distortion_coefficients": d.tolist()}  # fmt: skip
+    path.write_text(f"%YAML:1.0\n---\n{yaml.safe_dump(document)}")
     back = camera_files.read(path, pixel_pitch=0.00112)
     assert not back.exact
     inside = VIEW[np.abs(VIEW[:, 0] / VIEW[:, 2]) < 0.55]
@@ -319,8 +237,8 @@ def test_colmap_simple_models(tmp_path, line, expected):
     path.write_text(f"# Camera list\n{line}\n")
     back = camera_files.read(path, pixel_pitch=0.001)
     assert back.exact
-    for name, value in expected.items():
-        assert getattr(back.model.interior, name) == pytest.approx(value, abs=1e-12)
+    found = {name: getattr(back.model.interior, name) for name in expected}
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_metashape_sensor_with_covariance(tmp_path):
@@ -381,26 +299,21 @@ def _covariance():
 
 @pytest.mark.parametrize("name", ["opencv", "json", "aicon"])
 def test_covariance_comes_back(tmp_path, name):
-    Q = _covariance()
+    """AICON's file has only standard deviations, of other terms than ours but for x0, y0."""
+    Q, path = _covariance(), tmp_path / "camera"
     if name == "opencv":
         Q[9:], Q[:, 9:] = 0, 0  # shear has no slot
-    path = tmp_path / "camera"
     camera_files.write(_camera(), path, name, Q)
-    back = camera_files.read(path).covariance
-    sd = np.sqrt(np.diag(Q))
+    back, sd = np.sqrt(np.diag(camera_files.read(path).covariance)), np.sqrt(np.diag(Q))
     if name == "opencv":
         document = yaml.safe_load(re.sub("(?m)^%.*|!!opencv-matrix", "", path.read_text()))
-        stated = np.array(document["intrinsics_covariance"]["data"]).reshape(9, 9)
-        sds = document["std_deviation_intrinsics"]["data"]
-        assert sds == pytest.approx(np.sqrt(np.diag(stated)))
-        assert sds[1] == pytest.approx(sd[0] / SENSOR.pixel_pitch, rel=1e-4)  # fy
-        assert sds[2] == pytest.approx(sd[1] / SENSOR.pixel_pitch, rel=1e-4)  # cx
+        _, *fy_cx = document["std_deviation_intrinsics"]["data"][:3]
+        assert fy_cx == pytest.approx(sd[:2] / SENSOR.pixel_pitch, rel=1e-4)
     if name == "aicon":
-        rows = [row.split() for row in path.read_text().splitlines()]
-        (stated,) = (float(row[3]) for row in rows if row[:3] == ["#", "sd", "Xh"])
-        assert stated == pytest.approx(sd[1], rel=0.01)
-        back, sd = back[1:2, 1:2], sd[1:2]
-    assert np.sqrt(np.diag(back)) == pytest.approx(sd, rel=2e-2, abs=1e-7)
+        stated = re.search(r"# sd +Xh +([\d.e-]+)", path.read_text())
+        assert float(stated[1]) == pytest.approx(sd[1], rel=0.01)
+    same = slice(1, 2) if name == "aicon" else slice(None)
+    assert back[same] == pytest.approx(sd[same], rel=2e-2, abs=1e-7)
 
 
 @pytest.mark.parametrize("to", ["json", "aicon", "opencv"])
@@ -428,88 +341,84 @@ def _own(**changes):
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "reason"),
+    ("text", "reason"),
     [
-        ("a.yaml", "%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "not valid YAML"),
-        ("b.yaml", "hello: 1\n", "not a camera file of any"),
-        ("c.yaml", "image_width: 10\ndistortion_model: equidistant\n", "equidistant"),
-        ("d.yaml", "cam0:\n  camera_model: omni\n", "omni"),
-        ("e.txt", "1 OPENCV_FISHEYE 100 100 1 2 3 4 5 6 7 8\n", "OPENCV_FISHEYE"),
-        ("f.txt", "1 PINHOLE 100 100 90 90 50 50\n2 PINHOLE 100 100 90 90 50 50\n", "2 cameras"),
-        ("g.cameramodel", "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC', 'imagersize': 1}",
-         "SPLINED"),
-        ("h.cameramodel", "__import__('os') # lensmodel imagersize", "Python's notation"),
-        ("i.xml", "<calibration><projection>fisheye</projection></calibration>", "fisheye"),
-        ("j.xml", "<!DOCTYPE x><calibration/>", "DOCTYPE"),
-        ("k.xml", "<calibration><f>nan</f></calibration>", "finite"),
-        ("l.ior", "Ck -8\nCk -9\n", "line 2: Ck is duplicated"),
-        ("m.ior", "Ck\n", "no value"),
-        ("n.ior", "Ck -8\nfoo 3\n", "foo"),
-        ("s.ior", "1 1 -8 0 0 1e-3 0 0 0 0 0 0 0 8 6 2000 1500", "R0 is 0"),
-        ("t.ior", "1 1 -8 0 0 0 0 2 0 0 0 0 0 8 6 0 1500", "columns"),
-        ("o.json", '{"format": "thermocald-camera/1"}', "sensor or interior"),
-        ("u.json", _own(covariance=[]), "covariance.matrix"),
-        ("order.json", _own(covariance={"parameters": ["x0", "c"]}), "covariance.parameters"),
-        ("variance.json", _own(covariance={"matrix": (-np.eye(10)).tolist()}), "negative variance"),
-        ("tilted.json", _own(covariance={"matrix": np.tri(10).tolist()}), "not symmetric"),
-        ("beyond.json", _own(covariance={"matrix": (2 - np.eye(10)).tolist()}), "above 1"),
-        ("name.json", _own(interior={"c": 0.1, "a1": 2.0}), "interior.a1 is none of c"),
-        ("half.json", _own(sensor={"width": 100.5, "height": 100, "pixel_pitch": 0.001}),
-         "100.5 × 100"),
-        ("v.yaml", "image_width: 10\ndistortion_model: []\n", "distortion_model"),
-        ("w.cameramodel", "{'lensmodel': [], 'imagersize': 1}", "lensmodel"),
-        ("x.cameramodel", "{[]: 'lensmodel imagersize'}", "Python's notation"),
-        ("y.yaml", "%YAML:1.0\n---\ncamera_matrix: !!int ''\n", "not valid YAML"),
-        ("z.yaml", "%YAML:1.0\n---\ncamera_matrix: !!timestamp x\n", "not valid YAML"),
-        ("p.txt", "1 PINHOLE 100 100 -90 90 50 50\n", "principal distance of -90"),
-        ("q.txt", "1 RADIAL 4000 3000 3500 2000 1500 -3 0\n", "folds back"),
-        ("r.txt", "1 PINHOLE 100 0 90 90 50 50\n", "100 × 0"),
-        ("fy.txt", "1 PINHOLE 1280 720 944 94.4 640 360\n", "fx is 10 times fy"),
-        ("sign.txt", "1 PINHOLE 1280 720 944 -944 640 360\n", "fx is -1 times fy"),
-        ("decimal.yaml", """cam0: {camera_model: pinhole, intrinsics: [944,2, 635.5, 359.5],
+        ("%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "not valid YAML"),
+        ("hello: 1\n", "not a camera file of any"),
+        ("image_width: 10\ndistortion_model: equidistant\n", "equidistant"),
+        ("cam0:\n  camera_model: omni\n", "omni"),
+        ("1 OPENCV_FISHEYE 100 100 1 2 3 4 5 6 7 8\n", "OPENCV_FISHEYE"),
+        ("1 PINHOLE 100 100 90 90 50 50\n2 PINHOLE 100 100 90 90 50 50\n", "2 cameras"),
+        ("{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC', 'imagersize': 1}", "SPLINED"),
+        ("__import__('os') # lensmodel imagersize", "Python's notation"),
+        ("<calibration><projection>fisheye</projection></calibration>", "fisheye"),
+        ("<!DOCTYPE x><calibration/>", "DOCTYPE"),
+        ("<calibration><f>nan</f></calibration>", "finite"),
+        ("Ck -8\nCk -9\n", "line 2: Ck is duplicated"),
+        ("Ck\n", "no value"),
+        ("Ck -8\nfoo 3\n", "foo"),
+        ("1 1 -8 0 0 1e-3 0 0 0 0 0 0 0 8 6 2000 1500", "R0 is 0"),
+        ("1 1 -8 0 0 0 0 2 0 0 0 0 0 8 6 0 1500", "columns"),
+        ('{"format": "thermocald-camera/1"}', "sensor or interior"),
+        (_own(covariance=[]), "covariance.matrix"),
+        (_own(covariance={"parameters": ["x0", "c"]}), "covariance.parameters"),
+        (_own(covariance={"matrix": (-np.eye(10)).tolist()}), "negative variance"),
+        (_own(covariance={"matrix": np.tri(10).tolist()}), "not symmetric"),
+        (_own(covariance={"matrix": (2 - np.eye(10)).tolist()}), "above 1"),
+        (_own(interior={"c": 0.1, "a1": 2.0}), "interior.a1 is none of c"),
+        (_own(sensor={"width": 100.5, "height": 100, "pixel_pitch": 0.001}), "100.5 × 100"),
+        ("image_width: 10\ndistortion_model: []\n", "distortion_model"),
+        ("{'lensmodel': [], 'imagersize': 1}", "lensmodel"),
+        ("{[]: 'lensmodel imagersize'}", "Python's notation"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!int ''\n", "not valid YAML"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!timestamp x\n", "not valid YAML"),
+        ("1 PINHOLE 100 100 -90 90 50 50\n", "principal distance of -90"),
+        ("1 RADIAL 4000 3000 3500 2000 1500 -3 0\n", "folds back"),
+        ("1 PINHOLE 100 0 90 90 50 50\n", "100 × 0"),
+        ("1 PINHOLE 1280 720 944 94.4 640 360\n", "fx is 10 times fy"),
+        ("1 PINHOLE 1280 720 944 -944 640 360\n", "fx is -1 times fy"),
+        ("""cam0: {camera_model: pinhole, intrinsics: [944,2, 635.5, 359.5],
          resolution: [1280, 720]}""", "fx is 472 times fy"),
-        ("point.txt", "1 PINHOLE 1280 720 944 944 6400 360\n", r"\(6400, 360\) px lies outside"),
-        ("cx.xml", """<calibration><width>1280</width><height>720</height><f>944</f><cx>635</cx>
+        ("1 PINHOLE 1280 720 944 944 6400 360\n", r"\(6400, 360\) px lies outside"),
+        ("""<calibration><width>1280</width><height>720</height><f>944</f><cx>635</cx>
          </calibration>""", r"\(1274, 360\) px lies outside"),
-        ("comma.yaml", """%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720
+        ("""%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720
 camera_matrix: [944., 0., 635.5, 0., 944., 359.5, 0., 0., 1.]
 distortion_coefficients: {rows: 1, cols: 4, data: [-0,05, 0.1, 0.001, 0.0005]}
 """, "has 5 numbers, not 1 × 4: is a comma wrong"),
     ],
 )  # fmt: skip
-def test_wrong_files_are_one_error_that_names_the_file(tmp_path, name, text, reason):
-    path = tmp_path / name
+def test_wrong_files_are_one_error_that_names_the_file(tmp_path, text, reason):
+    path = tmp_path / "camera.file"
     path.write_text(text)
-    with pytest.raises(ConfigurationError, match=reason) as caught:
+    with pytest.raises(ConfigurationError, match=rf"camera\.file.*{reason}"):
         camera_files.read(path, pixel_pitch=0.001)
-    assert name in str(caught.value)
 
 
 def test_absent_binary_and_unknown(tmp_path):
-    with pytest.raises(ConfigurationError, match=r"nowhere\.xml"):
-        camera_files.read(tmp_path / "nowhere.xml")
     (tmp_path / "x.jpg").write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(ConfigurationError, match="not a text file"):
-        camera_files.read(tmp_path / "x.jpg")
-    with pytest.raises(UsageError, match="give one of opencv"):
-        camera_files.write(_camera(), tmp_path / "x", "vision9000")
-    with pytest.raises(UsageError, match="cannot be written"):
-        camera_files.write(_camera(), tmp_path / "x.jpg" / "folder.yaml", "opencv")
-    with pytest.raises(UsageError, match="shape"):
-        camera_files.write(_camera(), tmp_path / "x", "json", np.eye(3))
+    for name, reason in (("nowhere.xml", r"nowhere\.xml"), ("x.jpg", "not a text file")):
+        with pytest.raises(ConfigurationError, match=reason):
+            camera_files.read(tmp_path / name)
+    for name, to, more, reason in (
+        ("x", "vision9000", (), "give one of opencv"),
+        ("x.jpg/folder.yaml", "opencv", (), "cannot be written"),
+        ("x", "json", (np.eye(3),), "shape"),
+    ):
+        with pytest.raises(UsageError, match=reason):
+            camera_files.write(_camera(), tmp_path / name, to, *more)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.jpg"]
 
 
-@pytest.mark.parametrize("damages", [20, pytest.param(60, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", FORMATS)
-def test_damaged_files_are_an_error_or_a_camera_never_a_traceback(tmp_path, name, damages):
+@pytest.mark.parametrize("name", camera_files.FORMATS)
+def test_damaged_files_are_an_error_or_a_camera_never_a_traceback(tmp_path, name):
     """Seeded damages per format: characters lost, doubled, replaced, the end cut off."""
     path = tmp_path / "camera"
-    camera_files.write(_camera("without A3"), path, name)
+    camera_files.write(CameraModel(SENSOR, replace(PLAIN, A3=0.0)), path, name)
     text = path.read_text(encoding="utf-8")
     rng = np.random.default_rng(11)
     errors = 0
-    for _ in range(damages):
+    for _ in range(40):
         damaged = list(text)
         for _ in range(int(rng.integers(1, 4))):
             at = int(rng.integers(len(damaged)))

@@ -17,6 +17,9 @@ import yaml
 from tests.daemon.forking import Forked, Forker
 from tests.drivers.small_camera import write_small_camera
 from tests.store.small import write_recording
+from thermocald.config import parse_config
+from thermocald.daemon.control import ask
+from thermocald.daemon.service import Service
 from thermocald.epoch import Epoch
 from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import project
@@ -29,14 +32,18 @@ from thermocald.store.recording.testfield_file import write_testfield
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-def fast_run(document: str, epochs: int) -> str:
-    """Return a script that runs the daemon as `run --recording … --fast` does, but in a loop."""
-    return (
-        "import json; from pathlib import Path; from thermocald.config import parse_config; "
-        "from thermocald.daemon.service import Service; "
-        f"config = parse_config(json.loads({document!r}), Path('config.yaml')); "
-        f"Service(config, fast=True, epochs={epochs}, until_finished=True).run()"
-    )
+def play(folder: Path, cameras: list[dict], epochs: int = 0) -> Store:
+    """Play recordings as fast as a daemon can, a series for each camera; return the store."""
+    thermometers = {
+        name: {"name": name, "driver": "replay", "recording": camera["recording"],
+               "after": camera.get("after")}
+        for camera in cameras for name in camera.get("thermometers", ())
+    }  # fmt: skip
+    document = {"cameras": cameras, "thermometers": [*thermometers.values()],
+                "frames": {"keep": "none"}, "store": {"durable": False}}  # fmt: skip
+    config = parse_config(document, folder / "config.yaml")
+    assert Service(config, fast=True, epochs=epochs, until_finished=True).run()
+    return Store.open(config.store.path)
 
 
 class Daemon:
@@ -82,9 +89,18 @@ class Daemon:
         path = self.folder / "log.txt"
         return path.read_text() if path.exists() else ""
 
+    @property
+    def live(self) -> Path:
+        """The folder of its live state."""
+        return self.store.with_name(f"{self.store.name}.live")
+
     def status(self) -> dict:
         """Return the daemon's status document, {} without one."""
-        return read_json(self.store.with_name(f"{self.store.name}.live") / "status.json")
+        return read_json(self.live / "status.json")
+
+    def ask(self, do: str, **values) -> dict | None:
+        """Send a request to the control socket."""
+        return ask(self.live, do, **values)
 
     def results(self) -> list[dict]:
         path = self.folder / "results.jsonl"
@@ -178,6 +194,13 @@ def devices(small_camera, small_field):
         }
 
     return make
+
+
+def changed_recording(path: Path, taken, epochs, field=None) -> Path:
+    """Write a recording with the head of another one, but other epochs, and perhaps field."""
+    head = Head(path.name, "M1", 10.0, taken.camera, taken.head.channels)
+    write_recording(path, head, field or taken.testfield, epochs)
+    return path
 
 
 def warming(k: int) -> float:
@@ -283,25 +306,30 @@ def preloaded(tmp_path_factory):
     forker.close()
 
 
-def tool(*command: object) -> subprocess.CompletedProcess[str]:
-    """Run a program of the system, which may fail."""
-    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+@pytest.fixture
+def mount():
+    """Words of `mount` → mounted until the test ends; skips where nothing can be mounted."""
+    mounted: list[Path] = []
+
+    def mounts(*words: object) -> None:
+        command = ["mount", *map(str, words)]
+        if not shutil.which("mount") or subprocess.run(command, check=False).returncode:
+            pytest.skip("nothing can be mounted here: needs root and tmpfs")
+        mounted.append(words[-1])
+
+    yield mounts
+    for folder in reversed(mounted):
+        subprocess.run(["umount", "-q", "-l", folder], check=False)
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path):
-    """MB → the folder of a disk of this size; skips if nothing can be mounted."""
-    mounted = []
+def small_disk(tmp_path: Path, mount):
+    """MB → the folder of a disk of this size."""
 
-    def mount(size_mb: int) -> Path:
-        folder = tmp_path / f"disk{len(mounted)}"
+    def make(size_mb: int) -> Path:
+        folder = tmp_path / "disk"
         folder.mkdir()
-        wanted = ("mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder)
-        if not shutil.which("mount") or tool(*wanted).returncode:
-            pytest.skip("a small disk cannot be mounted here: needs root and tmpfs")
-        mounted.append(folder)
+        mount("-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder)
         return folder
 
-    yield mount
-    for folder in mounted:
-        tool("umount", "-l", folder)
+    return make

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import fast_run, make_recording, replayed_camera
-from tests.store.small import write_recording
+from tests.daemon.conftest import changed_recording, make_recording, play, replayed_camera
 from thermocald.config import CalibrationConfig
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.database.store import Store
-from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording
 
-EPOCHS = 12
 PLAIN = {"target_offsets": False, "exterior": "per_epoch"}
 KEYS = {
     "plain": {},
@@ -31,50 +26,29 @@ KEYS = {
 }
 
 
-@pytest.fixture(scope="module")
-def stored(tmp_path_factory, forker):
-    """{key: columns of the series taken with it}; target 7 is 3 px off in all epochs."""
-    folder = tmp_path_factory.mktemp("keys")
-    taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4))
-    field = TestField.build(taken.testfield.names, taken.testfield.points, 0.05)
-
-    def spoilt():
-        for epoch in taken.epochs:
-            points = epoch.observations.points.copy()
-            points[7] += 3.0
-            yield replace(epoch, observations=replace(epoch.observations, points=points))
-
-    path = folder / "spoilt"
-    head = Head("spoilt", "M1", 10.0, taken.camera, taken.head.channels)
-    write_recording(path, head, field, spoilt())
-    cameras = [
-        replayed_camera(path, name=key, calibration={**PLAIN, **changed})
-        for key, changed in KEYS.items()
-    ]
-    document = {"cameras": cameras, "frames": {"keep": "none"}, "store": {"durable": False}}
-    run = fast_run(json.dumps(document), EPOCHS)
-    assert forker.start(folder, script=run).wait(300.0) == 0
-    names = ["status", "sigma0", "n_rejected", "c", "sd_c", "x0", "sd_x0", "A1", "sd_A1", "X0"]
-    with Store.open(folder / "thermocald.db") as store:
-        found = {s.camera: s for s in store.all_series()}
-        for key, changed in KEYS.items():
-            assert {**found[key].settings, **changed} == found[key].settings
-        in_series = ["series_x0", "sd_series_x0"]
-        yield {
-            key: store.series_columns(found[key], names + in_series * (key == "exterior"))
-            for key in KEYS
-        }
-
-
-def test_every_key_changes_what_is_stored(stored):
+def test_every_key_changes_what_is_stored(tmp_path):
+    """Target 7 is 3 px off in all epochs."""
     assert set(KEYS) - {"plain"} == set(CalibrationConfig.model_fields)
-    plain, series, offsets = stored["plain"], stored["exterior"], stored["target_offsets"]
+    taken = read_recording(make_recording(tmp_path / "taken", 12, per_side=4))
+    field = TestField.build(taken.testfield.names, taken.testfield.points, 0.05)
+    off = np.where(np.arange(len(field)) == 7, 3.0, 0.0)[:, None]
+    seen = [(e, e.observations) for e in taken.epochs]
+    epochs = (replace(e, observations=replace(o, points=o.points + off)) for e, o in seen)
+    path = changed_recording(tmp_path / "spoilt", taken, epochs, field)
+    cameras = [replayed_camera(path, name=k, calibration=PLAIN | KEYS[k]) for k in KEYS]
+    names = ["status", "sigma0", "n_rejected", "c", "x0", "sd_x0", "A1", "sd_A1"]
+    with play(tmp_path, cameras, 12) as store:
+        found = {s.camera: s for s in store.all_series()}
+        stored = {key: store.series_columns(found[key], names) for key in KEYS}
+        series = store.series_columns(found["exterior"], ["series_x0", "sd_series_x0"])
+    assert all(KEYS[key].items() <= found[key].settings.items() for key in KEYS)
+    plain, offsets = stored["plain"], stored["target_offsets"]
     assert (plain["status"] == "ok").all()
     assert (plain["n_rejected"] >= 1).all()
     # with one orientation, the principal point of the series has a far smaller sd
     assert series["sd_series_x0"][-1] < 0.5 * plain["sd_x0"][-1]
     assert np.ptp(series["series_x0"][-5:]) < 0.5 * np.ptp(plain["x0"][-5:])
-    np.testing.assert_array_equal(series["x0"], plain["x0"])
+    np.testing.assert_array_equal(stored["exterior"]["x0"], plain["x0"])
     assert np.isnan(stored["free"]["sd_A1"]).all()
     assert np.isfinite(plain["sd_A1"]).all()
     assert (stored["fixed"]["A1"] == 0.002).all()

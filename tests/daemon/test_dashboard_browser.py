@@ -19,51 +19,63 @@ _UNLABELLED = """() => [...document.querySelectorAll('a, button, select, input, 
   .map(e => e.outerHTML)"""
 _WIDER = "() => document.documentElement.scrollWidth > document.documentElement.clientWidth + 1"
 _DRAWN = """() => [...document.querySelectorAll('#course .scatterlayer path.js-line')]
-  .filter(p => (p.getAttribute('d') || '').length > 20 && p.getBBox().width > 0).length"""
+  .filter(p => (p.getAttribute('d') || '').length > 20 && p.getBBox().width > 0).length >= 5"""
+_FIGURES = "() => document.querySelector('#figures dd') !== null"
 
 
 @pytest.fixture
-def shown(daemon, devices):
-    """The address of a running daemon's page."""
-    port = free_port()
-    # slow enough for a busy machine: a deferred epoch is calibrated later and not drawn
-    daemon.run(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
-    daemon.more(3)
-    daemon.until(lambda: serves(port))
-    yield f"http://127.0.0.1:{port}/"
+def page(daemon):
+    """Sections → the address of the page of a daemon that runs with them."""
+
+    def start(**sections) -> str:
+        port = free_port()
+        daemon.run(**sections, dashboard={"enabled": True, "port": port})
+        daemon.until(lambda: serves(port))
+        return f"http://127.0.0.1:{port}/"
+
+    yield start
     if daemon.process.poll() is None:
         daemon.stop()
     assert "Traceback" not in daemon.log()  # a page was open when the daemon stopped
 
 
-def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
-    page = page_of(shown)
-    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
-    epoch = int(page.text_content("#figures dd").split()[0])
-    page.wait_for_function(
+@pytest.fixture
+def shown(daemon, devices, page):
+    """The address of the page of a daemon with epochs."""
+    # slow enough for a busy machine: a deferred epoch is calibrated later and not drawn
+    address = page(**devices(period_s=1.5))
+    daemon.more(3)
+    return address
+
+
+def test_it_is_live_on_desk_and_phone_light_and_dark(shown, page_of):
+    desk = page_of(shown)
+    desk.wait_for_function(_FIGURES)
+    epoch = int(desk.text_content("#figures dd").split()[0])
+    desk.wait_for_function(
         f"() => parseInt(document.querySelector('#figures dd').textContent) > {epoch + 2}"
     )
-    assert page.text_content("#connection") == "live"
-    page.wait_for_function("() => document.querySelectorAll('#overlay circle').length > 40")
-    page.wait_for_function("() => document.querySelectorAll('#overlay line').length > 40")
-    page.wait_for_function("() => document.querySelector('#frame').naturalWidth > 300")
-    page.wait_for_function(f"() => ({_DRAWN})() >= 5")
+    assert desk.text_content("#connection") == "live"
+    for what in ("circle", "line"):
+        desk.wait_for_function(f"() => document.querySelectorAll('#overlay {what}').length > 40")
+    desk.wait_for_function("() => document.querySelector('#frame').naturalWidth > 300")
+    desk.wait_for_function(_DRAWN)
     for span in ("86400", ""):
-        page.check(f'input[name=span][value="{span}"]')
-        page.wait_for_function(f"() => ({_DRAWN})() >= 5")
-    assert "started" in page.text_content("#events")
-    assert "housing" in page.text_content("#devices")
-    assert page.evaluate(_UNLABELLED) == []
-    assert page.get_attribute("html", "lang") == "en"
-    light = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert page.problems == []
-
+        desk.check(f'input[name=span][value="{span}"]')
+        desk.wait_for_function(_DRAWN)
+    assert "started" in desk.text_content("#events")
+    assert "housing" in desk.text_content("#devices")
+    assert desk.evaluate(_UNLABELLED) == []
+    assert desk.get_attribute("html", "lang") == "en"
     phone = page_of(shown, width=390, color_scheme="dark")
-    phone.wait_for_function("() => document.querySelector('#figures dd') !== null")
-    phone.wait_for_function(f"() => ({_DRAWN})() >= 5")
+    phone.wait_for_function(_FIGURES)
+    phone.wait_for_function(_DRAWN)
     assert not phone.evaluate(_WIDER)
-    assert phone.evaluate("getComputedStyle(document.body).backgroundColor") != light
-    assert phone.problems == []
+    light, dark = (
+        one.evaluate("getComputedStyle(document.body).backgroundColor") for one in (desk, phone)
+    )
+    assert dark != light
+    assert desk.problems == phone.problems == []
     reached = []
     for _ in range(12):
         phone.keyboard.press("Tab")
@@ -80,7 +92,7 @@ def test_a_page_that_dies_is_started_again_and_says_when_acquisition_ended(daemo
     daemon.more(2)
     daemon.until(lambda: serves(int(shown.split(":")[2][:-1])))
     page = page_of(shown)
-    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
+    page.wait_for_function(_FIGURES)
     daemon.stop()
     page.wait_for_function(
         "() => document.querySelector('#connection').textContent"
@@ -90,21 +102,16 @@ def test_a_page_that_dies_is_started_again_and_says_when_acquisition_ended(daemo
 
 
 @pytest.mark.parametrize(
-    ("series", "state", "note"),
-    [(None, "idle until a session begins", "no epoch of camera one is stored yet"),
-     ("", "this daemon has no camera; its thermometers are listed under Devices",
+    ("cameras", "state", "note"),
+    [(1, "idle until a session begins", "no epoch of camera one is stored yet"),
+     (0, "this daemon has no camera; its thermometers are listed under Devices",
       "there is no series yet")],
 )  # fmt: skip
-def test_without_an_epoch_it_says_why(daemon, devices, page_of, series, state, note):
-    port = free_port()
-    sections = devices(period_s=1.0, series=series)
-    if series == "":
-        sections["cameras"] = []
-    daemon.run(**sections, dashboard={"enabled": True, "port": port})
-    daemon.until(lambda: serves(port))
-    page = page_of(f"http://127.0.0.1:{port}/")
-    page.wait_for_function("() => document.querySelector('#course-note').textContent !== ''")
-    assert page.text_content("#state") == state
-    assert page.text_content("#course-note") == note
-    assert "housing" in page.text_content("#devices")
-    assert daemon.stop() == 0
+def test_without_an_epoch_it_says_why(devices, page, page_of, cameras, state, note):
+    sections = devices(period_s=1.0, series=None)
+    sections["cameras"] = sections["cameras"][:cameras]
+    shown = page_of(page(**sections))
+    shown.wait_for_function("() => document.querySelector('#course-note').textContent !== ''")
+    assert shown.text_content("#state") == state
+    assert shown.text_content("#course-note") == note
+    assert "housing" in shown.text_content("#devices")

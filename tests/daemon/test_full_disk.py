@@ -12,12 +12,11 @@ import pytest
 
 from tests.commands import call
 from tests.marks import mostly_slow
-from thermocald.daemon.live_state import LiveState
 from thermocald.output.dashboard.view import View
 
 
-def fill(folder: Path) -> None:
-    """Fill the disk of a folder to the last byte."""
+def fill(folder: Path) -> Path:
+    """Fill the disk of a folder to the last byte; return the file that does so."""
     with (folder / "filler").open("ab", buffering=0) as file:
         for size in (1 << 20, 1 << 16, 1 << 12, 512, 1):
             try:
@@ -25,70 +24,53 @@ def fill(folder: Path) -> None:
                     pass
             except OSError:
                 continue
+    return folder / "filler"
 
 
-@pytest.fixture
-def disk(daemon, measured, small_disk):
-    """A small disk with the store of a configured daemon."""
-    folder = small_disk(40)
-    daemon.store = folder / "thermocald.db"
-    daemon.configure(**measured)
-    return folder
-
-
-def said(daemon) -> tuple[int, str, bool, str]:
-    """Return exit status and text of `status`, and the page's answer to a health check."""
+def told(daemon) -> str:
+    """Return what the exit status of `status`, its text and the page agree on."""
     done = call("status", "--store", daemon.store)
-    well, why = View(daemon.store, LiveState.beside(daemon.store).folder).healthy()
-    return done.returncode, done.stdout + done.stderr, well, why
+    answer = done.returncode, View(daemon.store, daemon.live).healthy()
+    waits = "epochs wait" in done.stdout + done.stderr
+    words = {(0, (True, "")): "well", (1, (False, "the store cannot be written")): "out"}
+    return words.get(answer, "") if waits == (done.returncode == 1) else ""
 
 
-def epochs_wait(daemon) -> bool:
-    status, text, well, why = said(daemon)
-    return (
-        status == 1 and "epochs wait" in text and not well and why == "the store cannot be written"
-    )
-
-
-def test_it_is_said_and_waited_for(daemon, disk):
-    daemon.start()
-    daemon.more(2)
-    daemon.until(lambda: said(daemon)[0] == 0)
-    fill(disk)
-    daemon.until(lambda: epochs_wait(daemon))
-    waiting = daemon.status()["store"]["waiting"]
-    # the status is current, not from before the disk was full
-    daemon.until(lambda: daemon.status()["store"]["waiting"] > waiting + 2)
-    count = len(daemon.results())
-    (disk / "filler").unlink()
-    daemon.until(lambda: any(r["stored"] for r in daemon.results()[count:]))
-    daemon.until(lambda: said(daemon)[::2] == (0, True))
-    assert daemon.stop() == 0
-    numbers, _ = daemon.stored()
-    assert len(numbers) >= len(daemon.results())
-    assert any(not r["stored"] for r in daemon.results())
-    assert {"store_out", "observations_paused"} <= set(daemon.events())
-
-
-def test_it_is_said_at_the_start_and_what_waits_at_the_end_is_counted(daemon, disk):
-    fill(disk)
+def test_it_is_said_and_waited_for_and_what_waits_at_the_end_is_counted(
+    daemon, measured, small_disk
+):
+    disk = small_disk(40)
+    daemon.store = disk / "thermocald.db"
+    daemon.configure(**measured)
+    filler = fill(disk)
     daemon.start()
     assert daemon.wait() in (1, 3)
     assert "error: " in daemon.log()
-    (disk / "filler").unlink()
+    filler.unlink()
     daemon.start()
     daemon.more(2)
-    daemon.until(lambda: said(daemon)[0] == 0)  # its status needs room, the first time
+    daemon.until(lambda: told(daemon) == "well")  # its status needs room, the first time
     fill(disk)
-    daemon.until(lambda: epochs_wait(daemon))
+    daemon.until(lambda: told(daemon) == "out")
+    waiting = daemon.status()["store"]["waiting"]
+    # the status is current, not from before the disk was full
+    daemon.until(lambda: daemon.status()["store"]["waiting"] > waiting + 2)
+    had = len(daemon.results())
+    filler.unlink()
+    daemon.until(lambda: any(r["stored"] for r in daemon.results()[had:]))
+    daemon.until(lambda: told(daemon) == "well")
+    had = len(daemon.results())
+    assert set(range(1, had + 1)) <= set(daemon.stored()[0])
+    assert any(not r["stored"] for r in daemon.results())
+    fill(disk)
+    daemon.until(lambda: told(daemon) == "out")
     assert daemon.stop() == 1
-    taken = daemon.results()[-1]["epoch"]
-    (disk / "filler").unlink()
-    numbers, _ = daemon.stored()
+    filler.unlink()
     (lost,) = map(int, re.findall(r"error: (\d+) epochs? lost", daemon.log()))
     assert daemon.log().count(" lost: epoch ") == 2  # in the log, and by the command at its end
     assert lost > 0
-    assert len(numbers) + lost >= taken
+    assert len(daemon.stored()[0]) + lost >= daemon.results()[-1]["epoch"]
+    assert {"store_out", "observations_paused"} <= set(daemon.events())
 
 
 @pytest.mark.parametrize("room", mostly_slow([1, 4095, 8193, 30_000], 1))
@@ -101,8 +83,8 @@ def test_what_was_reported_kept_is_kept_where_a_little_room_is_left(daemon, meas
     daemon.kill()
     kept = {r["epoch"] for r in daemon.results() if r["stored"]}
     assert kept <= set(daemon.stored()[0])
-    count = len(daemon.results())
+    had = len(daemon.results())
     daemon.start()
-    daemon.until(lambda: any(r["stored"] for r in daemon.results()[count:]))
+    daemon.until(lambda: any(r["stored"] for r in daemon.results()[had:]))
     assert daemon.stop() == 0
     assert kept <= set(daemon.stored()[0])

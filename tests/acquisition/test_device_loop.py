@@ -77,10 +77,7 @@ def test_what_no_retry_mends_is_given_up_and_told(link_of, kind, error):
     link = link_of(kind)
     link.device.warnings = lambda: ["focus: auto"]
     assert link.status(0.0, 60.0)["warnings"] == ["focus: auto"]
-    opens = link.device.open
-    link.device.open = partial(fail, error("no"))
-    assert not link.do(lambda: None)
-    link.device.open = opens
+    assert not link.do(partial(fail, error("no")))
     assert not link.do(lambda: None)
     assert link.ended
     assert link.events == ["device_failed"]

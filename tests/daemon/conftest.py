@@ -46,6 +46,12 @@ def play(folder: Path, cameras: list[dict], epochs: int = 0) -> Store:
     return Store.open(config.store.path)
 
 
+def columns_of(path: Path, *names: str) -> dict[str, np.ndarray]:
+    """Return columns of a store's only series."""
+    with Store.open(path) as store:
+        return store.series_columns(store.find_series(), list(names))
+
+
 class Daemon:
     """A `thermocald run` in a folder."""
 
@@ -54,15 +60,26 @@ class Daemon:
         self.forker = forker
         self.store = folder / "thermocald.db"
         self.config = folder / "config.yaml"
+        self.frames = folder / "frames"
         self.process: subprocess.Popen[bytes] | Forked | None = None
+        self.commands: list[Forked] = []
 
-    def configure(self, **sections) -> None:
-        document = {"store": {"path": str(self.store)}, "frames": {"keep": "none"}, **sections}
+    def configure(self, keep: str = "none", **sections) -> None:
+        """Write a configuration that keeps no frames, or some; keep: which."""
+        frames = {"keep": keep, "folder": str(self.frames), "min_free_gb": 0.0}
+        frames |= sections.pop("frames", {})
+        document = {"store": {"path": str(self.store)}, "frames": frames, **sections}
         self.config.write_text(yaml.safe_dump(document))
 
-    def start(self, *options: str, config: bool = True, **environment: str) -> None:
-        arguments = ["run", *(["--config", str(self.config)] if config else []), *options]
+    def start(self, *options: str, **environment: str) -> None:
+        arguments = ["run", "--config", str(self.config), *options]
         self.process = self.forker.start(self.folder, *arguments, **environment)
+
+    def command(self, *arguments: str) -> Forked:
+        """Start a `thermocald …` in the folder, which is killed after the test."""
+        log = f"command-{len(self.commands)}.txt"
+        self.commands.append(self.forker.start(self.folder, *arguments, log=log))
+        return self.commands[-1]
 
     def run(self, *options: str, **sections) -> None:
         self.configure(**sections)
@@ -125,7 +142,7 @@ class Daemon:
         """Return (numbers, statuses) of the only series; the store must be sound, without gaps."""
         with Store.open(self.store) as store:
             assert store.examine().damaged == ()
-            columns = store.series_columns(store.find_series(), ["epoch", "status"])
+        columns = columns_of(self.store, "epoch", "status")
         numbers = columns["epoch"].astype(int).tolist()
         assert numbers == list(range(1, len(numbers) + 1))
         return numbers, columns["status"].tolist()
@@ -135,23 +152,10 @@ class Daemon:
             return [event.kind for event in store.events()]
 
     def close(self) -> None:
-        if self.process is not None and self.process.poll() is None:
-            self.kill()
-
-
-@pytest.fixture
-def spawn(forker: Forker):
-    """(folder, arguments) → a running `thermocald …`, which is killed after the test."""
-    started = []
-
-    def start(folder: Path, *arguments: str) -> Forked:
-        started.append(forker.start(folder, *arguments, log=f"command-{len(started)}.txt"))
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
+        for process in (self.process, *self.commands):
+            if process is not None and process.poll() is None:
+                process.kill()
+                process.wait()
 
 
 @pytest.fixture

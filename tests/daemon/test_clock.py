@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 
+from tests.daemon.conftest import columns_of
 from thermocald.store.database.archive import archive_series
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
@@ -23,9 +24,7 @@ DAY = 86400.0
 @pytest.fixture
 def set_clock(daemon, devices, preloaded, tmp_path):
     """s → the clock of the daemon is off by this; begin: start it, and wait for two epochs."""
-    frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
-              "min_free_gb": 0.0}  # fmt: skip
-    daemon.configure(**devices(period_s=0.3), frames=frames)
+    daemon.configure(**devices(period_s=0.3), keep="all", frames={"max_age_days": 90})
     daemon.forker = preloaded
 
     def set_clock(seconds: float, begin: bool = False) -> None:
@@ -45,12 +44,11 @@ def content(daemon):
     assert daemon.stop() == 0
     numbers, _ = daemon.stored()
     assert numbers == [r["epoch"] for r in daemon.results()]
-    assert len(list((daemon.folder / "frames").rglob("*.png"))) == len(numbers)
+    assert len(list(daemon.frames.rglob("*.png"))) == len(numbers)
     with Store.open(daemon.store) as store:
-        series = store.find_series()
-        columns = store.series_columns(series, ["frame_time", "temperature_time"])
         steps = [e.data for e in store.events() if e.kind == "clock_step"]
-        archive_series(store, series, daemon.folder / "archive")
+        archive_series(store, store.find_series(), daemon.folder / "archive")
+    columns = columns_of(daemon.store, "frame_time", "temperature_time")
     return columns, steps, read_recording(daemon.folder / "archive").columns.frame_time
 
 

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT, make_recording
+from tests.daemon.conftest import ENVIRONMENT, columns_of, make_recording
 from tests.daemon.test_page_attacks import resident_mb
 from tests.daemon.test_systemd import values
-from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
 
@@ -119,9 +118,7 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
     assert np.ptp(files[warm]) <= 2  # status.json may be open
     assert np.ptp(threads[warm]) == 0
     assert cost_ms[2] < 1.25 * cost_ms[0]  # on a machine that may be busy; measured: 1.00 and 1.15
-    with Store.open(daemon.store) as store:
-        series = store.find_series()
-        assert store.last_epoch(series) == ticks
-        times = store.series_columns(series, ["frame_time"])["frame_time"]
+    times = columns_of(daemon.store, "frame_time")["frame_time"]
+    assert len(times) == ticks
     assert np.ptp(times) > 89 * 86_400
     assert (np.diff(times) > 0).all()

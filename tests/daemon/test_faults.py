@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.commands import finish
-from tests.daemon.conftest import make_photographs
+from tests.daemon.conftest import columns_of, make_photographs
 from tests.marks import mostly_slow
 from tests.recordings import read_rows
 from thermocald.config import load_config
@@ -48,8 +48,7 @@ def test_what_was_told_as_stored_is_there_and_right_in_a_hostile_week(
         time.sleep(rng.uniform(0.0, 0.3))
         daemon.kill()
         daemon.stored()
-        with Store.open(daemon.store) as store:
-            kept = store.series_columns(store.find_series(), ["frame_time", "c"])
+        kept = columns_of(daemon.store, "frame_time", "c")
         for row in daemon.results():
             here = {name: column[row["epoch"] - 1] for name, column in kept.items()}
             assert row["stored"]
@@ -253,18 +252,22 @@ def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
-def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, count):
+def test_garbage_frames_are_epochs_with_a_reason_and_kept_as_events(
+    daemon, recording, replayed, tmp_path, count
+):
     rng = np.random.default_rng(1)
     heads = [b"\xff\xd8\xff\xe0", b"\xff\xd8" + b"\xff\xd9", b"\xff\xd8\xff\xdb\x00\x43\xff\xd9"]
     garbage = make_photographs(tmp_path / "garbage", recording, [
         heads[k % 3] + rng.bytes(int(rng.integers(0, 3000))) + b"\xff\xd9" * (k % 2)
         for k in range(1, count + 1)
     ])  # fmt: skip
-    daemon.start("--recording", str(garbage), "--fast", "--store", str(daemon.store), config=False)
+    daemon.run("--epochs", str(count), **replayed(garbage, loop=False), keep="events")
     assert daemon.wait(300) == 0
     numbers, statuses = daemon.stored()
     assert numbers == list(range(1, count + 1))
     assert "ok" not in statuses
+    kept = sorted(int(p.stem) for p in daemon.frames.rglob("*.jpg"))
+    assert kept == numbers
     assert "Traceback" not in daemon.log()
     assert daemon.log().count("its last 20 epochs have no result; ") == 1
     assert daemon.events().count("no_result") == 1

@@ -1,7 +1,8 @@
-"""The page under clients that read slowly, send nothing, or request everything."""
+"""The page beside a real daemon: its process, hostile clients, and what a browser shows."""
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import time
@@ -137,3 +138,100 @@ def test_under_systemd_the_page_is_not_the_daemons_child(daemon, measured):
     children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children")
     assert children.read_text().split() == []
     assert daemon.stop() == 0
+
+
+_UNLABELLED = """() => [...document.querySelectorAll('a, button, select, input, [tabindex="0"]')]
+  .filter(e => e.offsetParent !== null && !e.closest('.js-plotly-plot'))
+  .filter(e => !(e.textContent.trim() || e.getAttribute('aria-label')
+    || e.getAttribute('aria-labelledby') || (e.labels && e.labels.length)))
+  .map(e => e.outerHTML)"""
+_WIDER = "() => document.documentElement.scrollWidth > document.documentElement.clientWidth + 1"
+_DRAWN = """() => [...document.querySelectorAll('#course .scatterlayer path.js-line')]
+  .filter(p => (p.getAttribute('d') || '').length > 20 && p.getBBox().width > 0).length >= 5"""
+_FIGURES = "() => document.querySelector('#figures dd') !== null"
+
+
+@pytest.fixture
+def page(daemon):
+    """Return a call for the address of the page of a daemon with some sections."""
+
+    def start(**sections) -> str:
+        port = free_port()
+        daemon.run(**sections, dashboard={"enabled": True, "port": port})
+        daemon.until(lambda: serves(port))
+        return f"http://127.0.0.1:{port}/"
+
+    yield start
+    if daemon.process.poll() is None:
+        daemon.stop()
+    assert "Traceback" not in daemon.log()  # a page was open when the daemon stopped
+
+
+@pytest.mark.slow
+def test_it_is_live_on_desk_and_phone_light_and_dark_until_the_daemon_stops(
+    daemon, devices, page, page_of
+):
+    # slow enough for a busy machine: a deferred epoch is calibrated later and not drawn
+    address = page(**devices(period_s=1.5))
+    daemon.more(3)
+    desk = page_of(address)
+    desk.wait_for_function(_FIGURES)
+    epoch = int(desk.text_content("#figures dd").split()[0])
+    desk.wait_for_function(
+        f"() => parseInt(document.querySelector('#figures dd').textContent) > {epoch + 2}"
+    )
+    assert desk.text_content("#connection") == "live"
+    for what in ("circle", "line"):
+        desk.wait_for_function(f"() => document.querySelectorAll('#overlay {what}').length > 40")
+    desk.wait_for_function("() => document.querySelector('#frame').naturalWidth > 300")
+    for span in ("3600", "86400", ""):
+        desk.check(f'input[name=span][value="{span}"]')
+        desk.wait_for_function(_DRAWN)
+    assert "started" in desk.text_content("#events")
+    assert "housing" in desk.text_content("#devices")
+    assert desk.evaluate(_UNLABELLED) == []
+    assert desk.get_attribute("html", "lang") == "en"
+    phone = page_of(address, width=390, color_scheme="dark")
+    phone.wait_for_function(_FIGURES)
+    phone.wait_for_function(_DRAWN)
+    assert not phone.evaluate(_WIDER)
+    colour = "getComputedStyle(document.body).backgroundColor"
+    assert phone.evaluate(colour) != desk.evaluate(colour)
+    reached = []
+    for _ in range(12):
+        phone.keyboard.press("Tab")
+        focus = "document.activeElement.id || document.activeElement.className"
+        reached.append(phone.evaluate(focus))
+    assert reached[:2] == ["skip", "camera"]
+    assert {"series", "download"} <= set(reached)
+    assert desk.problems == phone.problems == []
+    # a page that dies is started again
+    children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children")
+    os.kill(int(children.read_text()), signal.SIGKILL)
+    daemon.until(lambda: "it is started again" in daemon.log())
+    daemon.until(lambda: serves(int(address.split(":")[2][:-1])))
+    desk = page_of(address)
+    desk.wait_for_function(_FIGURES)
+    daemon.stop()
+    desk.wait_for_function(
+        "() => document.querySelector('#connection').textContent"
+        ".startsWith('acquisition has stopped: no daemon has run since 20')"
+    )
+    assert "stored data are shown below" in desk.text_content("#state")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cameras", "state", "note"),
+    [(1, "idle until a session begins", "no epoch of camera one is stored yet"),
+     (0, "this daemon has no camera; its thermometers are listed under Devices",
+      "there is no series yet")],
+)  # fmt: skip
+def test_without_an_epoch_it_says_why(devices, page, page_of, cameras, state, note):
+    sections = devices(period_s=1.0, series=None)
+    sections["cameras"] = sections["cameras"][:cameras]
+    shown = page_of(page(**sections))
+    shown.wait_for_function("() => document.querySelector('#course-note').textContent !== ''")
+    assert shown.text_content("#state") == state
+    assert shown.text_content("#course-note") == note
+    assert "housing" in shown.text_content("#devices")

@@ -6,11 +6,13 @@ import os
 import re
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
 from tests.commands import call
+from thermocald.store.recording.reader import read_recording
 
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
 FILES = [path for path in UNITS.iterdir() if path.suffix in (".service", ".timer")]
@@ -92,3 +94,51 @@ def test_everything_is_installed_where_it_belongs(tmp_path):
     }  # fmt: skip
     subprocess.run([*script, "--uninstall"], env=environment, check=True, capture_output=True)
     assert files(tmp_path) == {"etc/thermocald/config.yaml"}
+
+
+# a synchronised clock, without which no frame is deleted for its age
+SYNCHRONISED = {"CLOCK_SYNCHRONISED": "1"}
+
+
+@pytest.mark.slow
+def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
+    daemon, devices, preloaded
+):
+    """The command of the timer's unit, its paths moved below the daemon's folder."""
+    daemon.forker = preloaded
+    (line,) = values("thermocald-archive.service", "ExecStart")
+    for place in ("/etc/thermocald/", "/var/lib/thermocald/"):
+        line = line.replace(place, "")
+    program, *words = line.split()
+    assert program == "/opt/thermocald/bin/thermocald"
+
+    def timer() -> tuple[int, str]:
+        done = preloaded.start(daemon.folder, *words, log="timer.txt", **SYNCHRONISED)
+        said = done.said()
+        (daemon.folder / "timer.txt").unlink()
+        return done.returncode, said
+
+    def delete_an_old_frame() -> str:
+        old = sorted(daemon.frames.rglob("*.png"))[0]
+        os.utime(old, (time.time() - 2 * 86400,) * 2)
+        status, said = timer()
+        assert (status, old.exists()) == (0, False), said
+        return said
+
+    assert timer()[0] == 2  # no configuration: one line, no traceback
+    daemon.configure(**devices())
+    assert "nothing was stored yet" in timer()[1]
+    for series in ("M1", "M2"):
+        daemon.configure(**devices(series=series), keep="all", frames={"max_age_days": 1})
+        daemon.start(**SYNCHRONISED)
+        daemon.more(4)
+        if series == "M1":
+            assert daemon.stop() == 0
+    # while the daemon runs, it deletes an old frame and logs it
+    assert "frames deleted: 1 " in delete_an_old_frame()
+    assert not (daemon.folder / "recordings/one-M2").exists()
+    assert len(read_recording(daemon.folder / "recordings/one-M1").epochs) >= 4
+    assert daemon.stop() == 0
+    # without a daemon, the command deletes and logs it; a second run archives nothing
+    assert "one-M1" not in delete_an_old_frame()
+    assert daemon.events().count("frames_deleted") == 2

@@ -32,6 +32,9 @@ from thermocald.store.recording.testfield_file import write_testfield
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
+OUTPUTS = [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}]
+
+
 def play(folder: Path, cameras: list[dict], epochs: int = 0) -> Store:
     """Play recordings as fast as a daemon can, a series for each camera; return the store."""
     thermometers = {
@@ -39,11 +42,20 @@ def play(folder: Path, cameras: list[dict], epochs: int = 0) -> Store:
                "after": camera.get("after")}
         for camera in cameras for name in camera.get("thermometers", ())
     }  # fmt: skip
-    document = {"cameras": cameras, "thermometers": [*thermometers.values()],
+    document = {"cameras": cameras, "thermometers": [*thermometers.values()], "outputs": OUTPUTS,
                 "frames": {"keep": "none"}, "store": {"durable": False}}  # fmt: skip
     config = parse_config(document, folder / "config.yaml")
     assert Service(config, fast=True, epochs=epochs, until_finished=True).run()
     return Store.open(config.store.path)
+
+
+def results_of(folder: Path) -> list[dict]:
+    """Return the results in `results.jsonl`."""
+    path = folder / "results.jsonl"
+    if not path.exists():
+        return []
+    lines = path.read_text().split("\n")[:-1]  # an incomplete line may follow the last line end
+    return [json.loads(line) for line in lines]
 
 
 def columns_of(path: Path, *names: str) -> dict[str, np.ndarray]:
@@ -120,11 +132,7 @@ class Daemon:
         return ask(self.live, do, **values)
 
     def results(self) -> list[dict]:
-        path = self.folder / "results.jsonl"
-        if not path.exists():
-            return []
-        lines = path.read_text().split("\n")[:-1]  # an incomplete line may follow the last line end
-        return [json.loads(line) for line in lines]
+        return results_of(self.folder)
 
     def until(self, condition, timeout_s: float = 120.0, alive: bool = True) -> None:
         deadline = time.monotonic() + timeout_s
@@ -194,7 +202,7 @@ def devices(small_camera, small_field):
         return {
             "cameras": [cameras],
             "thermometers": [housing],
-            "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
+            "outputs": [*OUTPUTS],
         }
 
     return make
@@ -282,7 +290,7 @@ def replayed():
         return {
             "cameras": [camera],
             "thermometers": [recorded],
-            "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
+            "outputs": [*OUTPUTS],
         }
 
     return make

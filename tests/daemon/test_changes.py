@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import changed_recording, make_recording, play, replayed_camera
+from tests.daemon.conftest import (
+    changed_recording,
+    make_recording,
+    play,
+    replayed_camera,
+    results_of,
+)
 from thermocald.analysis.series.recorded import series_epochs
 from thermocald.config import CalibrationConfig
 from thermocald.daemon.series_run import START_EPOCHS, drift_columns
@@ -84,12 +90,10 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
     assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))
 
 
-def test_drift_in_pixels_against_the_start(daemon, measured):
+def test_drift_in_pixels_against_the_start(tmp_path, recording):
     """Regression: of a new series, the first epoch counted twice in the start."""
-    daemon.run(**measured)
-    daemon.until(lambda: len(daemon.results()) > START_EPOCHS)
-    daemon.stop()
-    told = daemon.results()[: START_EPOCHS + 1]
+    play(tmp_path, [replayed_camera(recording, name="one")], START_EPOCHS + 1).close()
+    told = results_of(tmp_path)
     mean = sum(row["c"] for row in told[:START_EPOCHS]) / START_EPOCHS
     known = [row["drift_c_px"] for row in told if row["drift_c_px"] is not None]
     last = [(row["c"] - mean) / told[0]["pixel_pitch"] for row in told[START_EPOCHS - 1 :]]

@@ -16,6 +16,7 @@ import yaml
 
 from tests.daemon.forking import Forked, Forker
 from tests.drivers.small_camera import write_small_camera
+from tests.recordings import write_table
 from tests.store.small import write_recording
 from thermocald.config import parse_config
 from thermocald.daemon.control import ask
@@ -199,11 +200,7 @@ def devices(small_camera, small_field):
         }  # fmt: skip
         housing = {"name": "housing", "driver": "mock", "period_s": period_s,
                    "conversion_s": 0.01, "faults": list(thermometer)}  # fmt: skip
-        return {
-            "cameras": [cameras],
-            "thermometers": [housing],
-            "outputs": [*OUTPUTS],
-        }
+        return {"cameras": [cameras], "thermometers": [housing], "outputs": [*OUTPUTS]}
 
     return make
 
@@ -235,9 +232,8 @@ def make_recording(
             now = iop.copy()
             now[:3] += np.array([2.0e-4, -4.5e-4, -3.0e-4]) * (temperature - 25.0)
             points = project(model.sensor, now, eop, field.points)
-            points = points + rng.normal(0, 0.04, points.shape)
-            rows = np.arange(len(field))
-            seen = Observations(rows, points, np.full(points.shape, 0.04))
+            points += rng.normal(0, 0.04, points.shape)
+            seen = Observations(np.arange(len(field)), points, np.full(points.shape, 0.04))
             time_s = 1.7e9 + interval * k
             reading = {"temperature": round(temperature * 16) / 16}
             yield Epoch(k + 1, time_s, time_s + 0.001, reading, observations=seen)
@@ -253,11 +249,12 @@ def make_photographs(path: Path, recording: Path, frames: list[bytes]) -> Path:
     (path / "frames").mkdir(parents=True)
     for name in ("recording.yaml", "testfield.csv"):
         shutil.copy(recording / name, path / name)
-    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
+    rows = []
     for k, data in enumerate(frames, 1):
         (path / f"frames/{k:04d}.jpg").write_bytes(data)
-        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k:04d}.jpg")
-    (path / "epochs.csv").write_text("\n".join(rows) + "\n")
+        rows.append((k, 1.7e9 + 10 * k, 1.7e9 + 10 * k, 25.0, f"frames/{k:04d}.jpg"))
+    columns = ("epoch", "frame_time", "temperature_time", "temperature", "frame")
+    write_table(path / "epochs.csv", columns, rows)
     return path
 
 
@@ -287,11 +284,7 @@ def replayed():
         rhythm = {"loop": loop, "period_s": period_s}
         camera = replayed_camera(path, name="rpi", thermometers=["recorded"], **rhythm)
         recorded = {"name": "recorded", "driver": "replay", "recording": str(path), **rhythm}
-        return {
-            "cameras": [camera],
-            "thermometers": [recorded],
-            "outputs": [*OUTPUTS],
-        }
+        return {"cameras": [camera], "thermometers": [recorded], "outputs": [*OUTPUTS]}
 
     return make
 

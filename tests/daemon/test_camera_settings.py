@@ -56,6 +56,13 @@ def keep(run, number: int, **temperatures: float) -> Epoch:
     return epoch
 
 
+def test_a_thermometer_that_was_never_there_is_assumed_to_have_a_temperature():
+    """Regression: of one that was plugged in later, no analysis had a temperature."""
+    config = {"thermometers": [{"name": "air", "driver": "hwmon", "chip": "tmp102"}]}
+    thermometers = Thermometers(parse_config(config, Path("c.yaml")), VirtualClock())
+    assert thermometers.columns(["air"]) == ["temperature"]
+
+
 def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(run, caplog):
     run.amend(CalibratedEpoch(Epoch(1, 1e9, 1e9, {}), failed("no_observations", ""), {}))
     assert "the calibration of epoch 1 waits: series M1 has not begun" in caplog.text

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import random
+import shutil
 import socket
 import stat
 import time
@@ -69,6 +70,17 @@ def test_an_answer_is_json_and_a_refusal_is_raised(ear, tmp_path):
         ask(ear.folder, "session start", session={**SESSION, "epochs": -1})
     for nobody_listens in (tmp_path, tmp_path / "away"):
         assert ask(nobody_listens, "session status") is None
+
+
+def test_a_socket_that_cannot_be_opened_is_said_once(ear, caplog):
+    """After `rm -r thermocald.db.live` it listens again, see test_sessions."""
+    shutil.rmtree(ear.folder)
+    ear.folder.write_text("in the way")
+    for _ in range(3):
+        ear.ensure_open()
+    why = "sessions wait until the control socket can be opened: File exists"
+    assert caplog.messages == [f"{ear.folder}: {why}"]
+    ear.folder.unlink()
 
 
 def test_it_listens_again_after_it_failed(ear, monkeypatch):

@@ -33,7 +33,7 @@ def test_a_daemon_that_waits_keeps_to_88_mb(daemon, replayed, tmp_path):
     path = make_recording(tmp_path / "short", 60, per_side=2, interval=1.0)
     daemon.configure(**replayed(path, period_s=1.0))
     words = ("-m", "thermocald", "run", "--config", str(daemon.config))
-    start(daemon, *words, HOME=str(tmp_path), **own)
+    start(daemon, *words, **{**own, "HOME": str(tmp_path)})
     daemon.more(12)
     assert resident_mb(daemon.process.pid) < 88.0
     assert daemon.stop() == 0

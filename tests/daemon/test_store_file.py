@@ -170,12 +170,14 @@ def test_a_file_that_is_no_store_is_left_alone_and_results_wait(guard, path):
     path.unlink()
     path.write_text("mine, and not a store")
     guard.keep(4, 5)
+    guard.event(1.0, "seen", "an event waits, too")
     assert path.read_text() == "mine, and not a store"
     assert (state(guard), guard.told[4]) == (("out", 2, 0), False)
     path.unlink()
     guard.flush()
     assert guard.status()["state"] == "ok"
     assert numbers(path) == [4, 5]
+    assert "seen" in [event.kind for event in guard.store.events()]
     (copy,) = path.parent.glob("t-rescued-*.db")
     assert numbers(copy) == [1, 2, 3]
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.acquisition import calibrator as module
 from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
@@ -15,49 +14,38 @@ from thermocald.physics.testfields import corner_field, demonstration_model
 BLOCK = 12
 
 
-@pytest.fixture(autouse=True)
-def _short_blocks(monkeypatch):
-    monkeypatch.setattr(module, "EPOCHS_OF_A_BLOCK", BLOCK)
-
-
-def scene(count):
-    """Return a calibrator and epochs of noisy image points."""
+@pytest.fixture
+def calibrator(monkeypatch):
+    """Return a call for a new calibrator, whose blocks are short."""
+    monkeypatch.setattr("thermocald.acquisition.calibrator.EPOCHS_OF_A_BLOCK", BLOCK)
     field = corner_field("plain", per_side=4, pitch_mm=150.0)
-    model, rng = demonstration_model(field), np.random.default_rng(3)
-    image = project(
-        model.sensor, model.interior.as_array(), model.exterior.as_array(), field.points
-    )
-    epochs = []
-    for number in range(count):
-        points = image + rng.normal(0, 0.05, image.shape)
-        seen = Observations(np.arange(len(field)), points, np.full(points.shape, 0.05))
-        epochs.append(Epoch(number, 10.0 * number, 10.0 * number, {}, observations=seen))
-    return lambda: Calibrator(model.sensor, field, nominal_c=3.04), epochs
+    return lambda: Calibrator(demonstration_model(field).sensor, field, nominal_c=3.04)
 
 
-def test_a_repeated_frame_is_no_new_observation():
-    calibrator, (a, b, c) = scene(3)
-    nothing = Epoch(7, 0.0, 0.0, {}, observations=Observations.none())
-    again = [replace(epoch, number=n) for n, epoch in enumerate([nothing, a, a, a, b, nothing, c])]
-    done = list(calibrated_epochs(calibrator(), again))
-    same, none = "repeated_frame", "no_observations"
-    statuses = [none, "ok", same, same, "ok", none, "ok"]
-    assert [d.adjustment.status for d in done] == statuses
-    assert "epoch 1" in done[3].adjustment.reason
-    assert [d.epoch.observations is None for d in done[2:5]] == [True, True, False]
+def seen(calibrator, count):
+    """Return epochs of noisy image points."""
+    field, rng = calibrator().testfield, np.random.default_rng(3)
+    model = demonstration_model(field)
+    iop, eop = model.interior.as_array(), model.exterior.as_array()
+    image, rows = project(model.sensor, iop, eop, field.points), np.arange(len(field))
+    points = image + rng.normal(0, 0.05, (count, *image.shape))
+    observations = [Observations(rows, one, np.full(one.shape, 0.05)) for one in points]
+    return [Epoch(n, 10.0 * n, 10.0 * n, observations=o) for n, o in enumerate(observations)]
 
 
-def test_an_epoch_that_is_calibrated_late_is_not_the_last_one():
-    calibrator, (a, b, c) = scene(3)
-    one = calibrator()
-    late = [replace(a, number=7), replace(b, number=3), replace(a, number=8), replace(c, number=9)]
-    statuses = [one.calibrate(epoch).adjustment.status for epoch in late]
-    assert statuses == ["ok", "ok", "repeated_frame", "ok"]
+def test_a_late_epoch_or_one_without_targets_is_not_the_one_that_others_repeat(calibrator):
+    a, b, c = seen(calibrator, 3)
+    nothing = Epoch(0, 0.0, 0.0, observations=Observations.none())
+    one, order = calibrator(), [(a, 7), (b, 3), (nothing, 8), (a, 9), (c, 10)]
+    done = [one.calibrate(replace(epoch, number=number)).adjustment for epoch, number in order]
+    statuses = ["ok", "ok", "no_observations", "repeated_frame", "ok"]
+    assert [adjustment.status for adjustment in done] == statuses
+    assert "epoch 7" in done[3].reason
 
 
-def test_processes_do_not_matter_and_a_block_knows_the_frame_before_it():
+def test_processes_do_not_matter_and_a_block_knows_the_frame_before_it(calibrator):
     """A daemon calibrates without blocks, and says of a replayed series what a replay says."""
-    calibrator, epochs = scene(3 * BLOCK + 4)
+    epochs = seen(calibrator, 3 * BLOCK + 4)
     epochs[BLOCK] = replace(epochs[BLOCK - 1], number=BLOCK)
     one, two = (list(calibrated_epochs(calibrator(), epochs, jobs)) for jobs in (1, 2))
     assert [done.epoch.number for done in two] == list(range(3 * BLOCK + 4))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,72 +14,62 @@ from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.config import FramesConfig
 from thermocald.hal import Frame
 
+JPEG = b"\xff\xd8" + bytes(998)
+DAY = 86400.0
+
 
 @pytest.fixture
 def folder_of(tmp_path):
     def make(**options) -> FrameFolder:
-        return FrameFolder(
-            FramesConfig(folder=tmp_path / "frames", **{"min_free_gb": 0, **options})
-        )
+        options = {"folder": tmp_path / "frames", "min_free_gb": 0, **options}
+        return FrameFolder(FramesConfig(**options))
 
     return make
 
 
-def frame(encoded: bytes | None = None) -> Frame:
-    image = None if encoded else np.arange(600, dtype=np.uint16).reshape(20, 30)
-    return Frame(image, 0.0, 0.0, encoded=encoded)
+def keep(folder: FrameFolder, number: int, taken: float | None = None) -> Path | None:
+    """Keep a JPEG, as taken at a time; return its file."""
+    relative = folder.keep("cam", "M1", number, Frame(None, 0.0, 0.0, encoded=JPEG))
+    if relative is None:
+        return None
+    path = folder.root / relative
+    if taken is not None:
+        os.utime(path, (taken, taken))
+    return path
 
 
-def test_the_frames_that_are_wanted_are_kept(folder_of):
-    def wanted(eventful=False, **options):
-        folder = folder_of(**options)
-        return [number for number in range(1, 11) if folder.wanted(number, eventful)]
-
-    every = list(range(1, 11))
-    assert wanted(keep="all") == wanted(keep="events", eventful=True) == every
-    assert wanted(keep="events") == wanted(keep="none", eventful=True) == []
-    assert wanted(keep="every_n", every_n=5) == [5, 10]
-
-
-def test_a_jpeg_stays_as_it_came_and_grey_values_lose_nothing(folder_of):
-    folder = folder_of()
-    jpeg = folder.keep("cam", "M1", 1234, frame(b"\xff\xd8 as it came \xff\xd9"))
-    assert str(jpeg) == "cam/M1/0001/0001234.jpg"
-    assert (folder.root / jpeg).read_bytes() == b"\xff\xd8 as it came \xff\xd9"
-    png = folder.keep("cam", "M1", 7, frame())
+def test_a_jpeg_stays_as_it_came_grey_values_lose_nothing_and_what_is_corrected_goes_along(
+    folder_of,
+):
+    folder, image = folder_of(), np.arange(600, dtype=np.uint16).reshape(20, 30)
+    jpeg = keep(folder, 1234)
+    assert jpeg == folder.root / "cam/M1/0001/0001234.jpg"
+    assert jpeg.read_bytes() == JPEG
+    png = folder.keep("cam", "M1", 7, Frame(image, 0.0, 0.0))
     back = cv2.imread(str(folder.root / png), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(back, frame().image)
-
-
-def test_a_corrected_frame_goes_with_its_frame(folder_of):
-    folder = folder_of()
-    path = folder.keep("cam", "M1", 7, frame())
-    folder.keep_corrected(path, b"\xff\xd8")
+    assert np.array_equal(back, image)
+    folder.keep_corrected(png, JPEG)
     assert (folder.root / "cam/M1/0000/0000007-corrected.jpg").exists()
-    folder.delete(path)
-    assert not [p for p in folder.root.rglob("*") if p.is_file()]
+    folder.delete(png)
+    assert [path for path in folder.root.rglob("*") if path.is_file()] == [jpeg]
 
 
 def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
-    folder = folder_of(max_age_days=10, max_size_gb=2.5e-6)
-    now = time.time()
+    folder, now = folder_of(max_age_days=10, max_size_gb=2.5e-6), time.time()
     for n in range(1, 7):
-        path = folder.root / folder.keep("cam", "M1", n, frame(b"\xff\xd8" + bytes(998)))
-        os.utime(path, (now - 86400 * (14 - 2 * n),) * 2)  # 12, 10.. days old
-    deleted = folder.enforce(now - 1.0)
-    left = sorted(p.stem for p in folder.root.rglob("*.jpg"))
-    assert left == ["0000005", "0000006"]
-    assert deleted == [
+        keep(folder, n, now - DAY * (14 - 2 * n))  # 12, 10.. days old
+    assert folder.enforce(now - 1.0) == [
         "frames deleted: 1 (0.0 MB), older than 10 days",
         "frames deleted: 3 (0.0 MB), more than 2.5e-06 GB",
     ]
+    left = sorted(p.stem for p in folder.root.rglob("*.jpg"))
+    assert left == ["0000005", "0000006"]
     assert folder.enforce(now - 1.0) == []
 
 
 def test_below_the_least_free_space_no_frame_is_written(folder_of, caplog):
     folder = folder_of(min_free_gb=1e6)
-    assert folder.keep("cam", "M1", 1, frame()) is None
-    assert folder.keep("cam", "M1", 2, frame()) is None
+    assert [keep(folder, n) for n in (1, 2)] == [None, None]
     assert "min_free_gb" in folder.paused
     assert caplog.text.count("no frames are kept") == 1
 
@@ -86,26 +77,21 @@ def test_below_the_least_free_space_no_frame_is_written(folder_of, caplog):
 def test_without_a_trusted_clock_nothing_is_deleted_for_its_age(folder_of):
     """Nor ever a frame of 1970, which has none."""
     folder = folder_of(max_age_days=1)
-    for number, taken in ((1, 1.75e9), (2, 3600.0)):
-        path = folder.root / folder.keep("cam", "M1", number, frame())
-        os.utime(path, (taken, taken))
+    keep(folder, 1, 1.75e9)
+    unknown = keep(folder, 2, 3600.0)
     assert folder.enforce(None) == []
     assert folder.enforce(1.76e9)[0].startswith("frames deleted: 1 ")
     assert folder.enforce(time.time()) == []
-    assert path.exists()
+    assert unknown.exists()
 
 
 def test_frames_taken_before_the_clock_was_set_are_as_old_as_they_are(folder_of):
     """Found on a Pi without a battery: NTP came, and all frames looked 90 days old."""
-    folder = folder_of(max_age_days=90)
-    wrong = 100 * 86400.0  # the clock stood at the time of the last shutdown
-    paths = [folder.root / folder.keep("cam", "M1", n, frame()) for n in (1, 2)]
-    older = folder.root / folder.keep("cam", "M1", 3, frame())
-    now = time.time()
+    folder, now = folder_of(max_age_days=90), time.time()
+    wrong = 100 * DAY  # the clock stood at the time of the last shutdown
     folder._since = now - wrong - 60.0
-    for path in paths:
-        os.utime(path, (now - wrong - 10.0,) * 2)
-    os.utime(older, (now - wrong - 7200.0,) * 2)  # of the run before
+    paths = [keep(folder, n, now - wrong - 10.0) for n in (1, 2)]
+    older = keep(folder, 3, now - wrong - 7200.0)  # of the run before
     folder.restamp(wrong)
     assert [abs(p.stat().st_mtime - (now - 10.0)) < 5.0 for p in paths] == [True, True]
     assert folder.enforce(now)[0].startswith("frames deleted: 1 ")
@@ -125,12 +111,10 @@ def test_photographs_of_somebody_else_are_never_deleted(folder_of, name):
     folder = folder_of(max_age_days=1, max_size_gb=1e-9)
     path = folder.root / name
     path.parent.mkdir(parents=True)
-    path.write_bytes(b"\xff\xd8" + bytes(998))
+    path.write_bytes(JPEG)
     os.utime(path, (1.7e9 + 1,) * 2)
-    ours = folder.root / folder.keep("cam", "M1", 7, frame(b"\xff\xd8" + bytes(998)))
+    ours = keep(folder, 7)
     cut_off = ours.with_name("0000008.jpg.partial")
     cut_off.write_bytes(bytes(9))
     assert len(folder.enforce(time.time())) == 1
-    assert path.exists()
-    assert not ours.exists()
-    assert not cut_off.exists()
+    assert [one.exists() for one in (path, ours, cut_off)] == [True, False, False]

@@ -1,4 +1,4 @@
-"""Time stamps while the machine's UTC is stepped."""
+"""Time stamps while the machine's UTC is stepped; glitches are in daemon/test_clock."""
 
 from __future__ import annotations
 
@@ -8,71 +8,45 @@ from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.hal import VirtualClock
 
 
-@pytest.fixture
-def make():
-    """machine → its steady clock, which is watched four times a second as in the daemon."""
-
-    class Watched(SteadyClock):
-        def watch(self, machine, seconds, each=0.25):
-            steps = []
-            for _ in range(int(seconds / each)):
-                machine.advance(each)
-                steps += [step] if (step := self.check()) is not None else []
-            return [(round(seconds), adopted) for seconds, adopted, _ in steps]
-
-    def build(machine, synchronised=lambda: True):
-        return Watched(machine, synchronised=synchronised)
-
-    return build
+def watch(clock: SteadyClock, machine: VirtualClock, seconds: float, each: float = 0.25):
+    """Look at the clock four times a second, as the daemon; return its steps (s, followed)."""
+    steps = []
+    for _ in range(int(seconds / each)):
+        machine.advance(each)
+        if (step := clock.check()) is not None:
+            steps.append((round(step[0]), step[1]))
+    return steps
 
 
-@pytest.mark.parametrize("seconds", [120 * 86400.0, -3600.0, 5.0])
-def test_a_glitch_moves_nothing(make, seconds):
+@pytest.mark.parametrize("seconds", [7200.0, -7200.0, 5.0])
+def test_a_time_that_stands_is_followed_in_both_directions(seconds):
     machine = VirtualClock(utc=1.75e9)
-    clock = make(machine)
+    clock = SteadyClock(machine, synchronised=lambda: True)
     assert clock.settled()
     machine.step_utc(seconds)
-    clock.check()
+    assert watch(clock, machine, 59.0) == [(seconds, False)]
+    assert clock.utc() == 1.75e9 + 59.0
     assert not clock.trusted()
-    assert not clock.settled()
-    assert clock.watch(machine, 3.0) == []
-    machine.step_utc(-seconds)
-    assert clock.watch(machine, 100.0) == [(-seconds, False)]
-    assert clock.utc() == 1.75e9 + 103.0
+    assert watch(clock, machine, 3.0) == [(seconds, True)]
+    assert clock.utc() == 1.75e9 + 62.0 + seconds
     assert clock.trusted()
     # ages are not judged for a day after a leap
     assert clock.settled() is (abs(seconds) < 3600.0)
-    clock.watch(machine, 86400.0, each=10.0)
+    watch(clock, machine, 86400.0, each=10.0)
     assert clock.settled()
 
 
-@pytest.mark.parametrize("seconds", [7200.0, -7200.0])
-def test_a_time_that_stands_is_followed_in_both_directions(make, seconds):
-    machine = VirtualClock(utc=1.75e9)
-    clock = make(machine)
-    machine.step_utc(seconds)
-    assert clock.watch(machine, 59.0) == [(seconds, False)]
-    assert clock.utc() == 1.75e9 + 59.0
-    assert clock.watch(machine, 3.0) == [(seconds, True)]
-    assert clock.utc() == 1.75e9 + 62.0 + seconds
-    assert clock.trusted()
-
-
 @pytest.mark.parametrize("start", [0.0, 1.74e9])  # no battery at all, or the time it was shut down
-def test_a_pi_that_learns_the_time_after_boot_follows_at_once(make, start):
+def test_a_pi_that_learns_the_time_after_boot_follows_at_once(start):
     known = []
     machine = VirtualClock(utc=start)
-    clock = make(machine, synchronised=lambda: bool(known))
+    clock = SteadyClock(machine, synchronised=lambda: bool(known))
     assert not clock.trusted()
-    machine.advance(30.0)
     machine.step_utc(1.75e9 - start)
     known.append(True)
-    step = clock.check()
-    assert step is not None
-    assert step[1]
-    assert clock.utc() == 1.75e9 + 30.0
+    assert watch(clock, machine, 1.0) == [(1.75e9 - start, True)]
+    assert clock.utc() == 1.75e9 + 1.0
     assert clock.trusted()
-    assert clock.check() is None
 
 
 def test_a_thread_that_had_to_wait_between_two_clocks_moves_no_time_stamp():

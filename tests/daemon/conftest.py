@@ -16,7 +16,11 @@ import yaml
 
 from tests.daemon.forking import Forked, Forker
 from tests.drivers.small_camera import write_small_camera
+from tests.recordings import write_table
 from tests.store.small import write_recording
+from thermocald.config import parse_config
+from thermocald.daemon.control import ask
+from thermocald.daemon.service import Service
 from thermocald.epoch import Epoch
 from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import project
@@ -29,14 +33,36 @@ from thermocald.store.recording.testfield_file import write_testfield
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-def fast_run(document: str, epochs: int) -> str:
-    """Return a script that runs the daemon as `run --recording … --fast` does, but in a loop."""
-    return (
-        "import json; from pathlib import Path; from thermocald.config import parse_config; "
-        "from thermocald.daemon.service import Service; "
-        f"config = parse_config(json.loads({document!r}), Path('config.yaml')); "
-        f"Service(config, fast=True, epochs={epochs}, until_finished=True).run()"
-    )
+OUTPUTS = [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}]
+
+
+def play(folder: Path, cameras: list[dict], epochs: int = 0) -> Store:
+    """Play recordings as fast as a daemon can, a series for each camera; return the store."""
+    thermometers = {
+        name: {"name": name, "driver": "replay", "recording": camera["recording"],
+               "after": camera.get("after")}
+        for camera in cameras for name in camera.get("thermometers", ())
+    }  # fmt: skip
+    document = {"cameras": cameras, "thermometers": [*thermometers.values()], "outputs": OUTPUTS,
+                "frames": {"keep": "none"}, "store": {"durable": False}}  # fmt: skip
+    config = parse_config(document, folder / "config.yaml")
+    assert Service(config, fast=True, epochs=epochs, until_finished=True).run()
+    return Store.open(config.store.path)
+
+
+def results_of(folder: Path) -> list[dict]:
+    """Return the results in `results.jsonl`."""
+    path = folder / "results.jsonl"
+    if not path.exists():
+        return []
+    lines = path.read_text().split("\n")[:-1]  # an incomplete line may follow the last line end
+    return [json.loads(line) for line in lines]
+
+
+def columns_of(path: Path, *names: str) -> dict[str, np.ndarray]:
+    """Return columns of a store's only series."""
+    with Store.open(path) as store:
+        return store.series_columns(store.find_series(), list(names))
 
 
 class Daemon:
@@ -47,15 +73,26 @@ class Daemon:
         self.forker = forker
         self.store = folder / "thermocald.db"
         self.config = folder / "config.yaml"
+        self.frames = folder / "frames"
         self.process: subprocess.Popen[bytes] | Forked | None = None
+        self.commands: list[Forked] = []
 
-    def configure(self, **sections) -> None:
-        document = {"store": {"path": str(self.store)}, "frames": {"keep": "none"}, **sections}
+    def configure(self, keep: str = "none", **sections) -> None:
+        """Write a configuration that keeps no frames, or some; keep: which."""
+        frames = {"keep": keep, "folder": str(self.frames), "min_free_gb": 0.0}
+        frames |= sections.pop("frames", {})
+        document = {"store": {"path": str(self.store)}, "frames": frames, **sections}
         self.config.write_text(yaml.safe_dump(document))
 
-    def start(self, *options: str, config: bool = True, **environment: str) -> None:
-        arguments = ["run", *(["--config", str(self.config)] if config else []), *options]
+    def start(self, *options: str, **environment: str) -> None:
+        arguments = ["run", "--config", str(self.config), *options]
         self.process = self.forker.start(self.folder, *arguments, **environment)
+
+    def command(self, *arguments: str) -> Forked:
+        """Start a `thermocald …` in the folder, which is killed after the test."""
+        log = f"command-{len(self.commands)}.txt"
+        self.commands.append(self.forker.start(self.folder, *arguments, log=log))
+        return self.commands[-1]
 
     def run(self, *options: str, **sections) -> None:
         self.configure(**sections)
@@ -82,16 +119,21 @@ class Daemon:
         path = self.folder / "log.txt"
         return path.read_text() if path.exists() else ""
 
+    @property
+    def live(self) -> Path:
+        """The folder of its live state."""
+        return self.store.with_name(f"{self.store.name}.live")
+
     def status(self) -> dict:
         """Return the daemon's status document, {} without one."""
-        return read_json(self.store.with_name(f"{self.store.name}.live") / "status.json")
+        return read_json(self.live / "status.json")
+
+    def ask(self, do: str, **values) -> dict | None:
+        """Send a request to the control socket."""
+        return ask(self.live, do, **values)
 
     def results(self) -> list[dict]:
-        path = self.folder / "results.jsonl"
-        if not path.exists():
-            return []
-        lines = path.read_text().split("\n")[:-1]  # an incomplete line may follow the last line end
-        return [json.loads(line) for line in lines]
+        return results_of(self.folder)
 
     def until(self, condition, timeout_s: float = 120.0, alive: bool = True) -> None:
         deadline = time.monotonic() + timeout_s
@@ -109,7 +151,7 @@ class Daemon:
         """Return (numbers, statuses) of the only series; the store must be sound, without gaps."""
         with Store.open(self.store) as store:
             assert store.examine().damaged == ()
-            columns = store.series_columns(store.find_series(), ["epoch", "status"])
+        columns = columns_of(self.store, "epoch", "status")
         numbers = columns["epoch"].astype(int).tolist()
         assert numbers == list(range(1, len(numbers) + 1))
         return numbers, columns["status"].tolist()
@@ -119,23 +161,10 @@ class Daemon:
             return [event.kind for event in store.events()]
 
     def close(self) -> None:
-        if self.process is not None and self.process.poll() is None:
-            self.kill()
-
-
-@pytest.fixture
-def spawn(forker: Forker):
-    """(folder, arguments) → a running `thermocald …`, which is killed after the test."""
-    started = []
-
-    def start(folder: Path, *arguments: str) -> Forked:
-        started.append(forker.start(folder, *arguments, log=f"command-{len(started)}.txt"))
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
+        for process in (self.process, *self.commands):
+            if process is not None and process.poll() is None:
+                process.kill()
+                process.wait()
 
 
 @pytest.fixture
@@ -171,13 +200,16 @@ def devices(small_camera, small_field):
         }  # fmt: skip
         housing = {"name": "housing", "driver": "mock", "period_s": period_s,
                    "conversion_s": 0.01, "faults": list(thermometer)}  # fmt: skip
-        return {
-            "cameras": [cameras],
-            "thermometers": [housing],
-            "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
-        }
+        return {"cameras": [cameras], "thermometers": [housing], "outputs": [*OUTPUTS]}
 
     return make
+
+
+def changed_recording(path: Path, taken, epochs, field=None) -> Path:
+    """Write a recording with the head of another one, but other epochs, and perhaps field."""
+    head = Head(path.name, "M1", 10.0, taken.camera, taken.head.channels)
+    write_recording(path, head, field or taken.testfield, epochs)
+    return path
 
 
 def warming(k: int) -> float:
@@ -200,9 +232,8 @@ def make_recording(
             now = iop.copy()
             now[:3] += np.array([2.0e-4, -4.5e-4, -3.0e-4]) * (temperature - 25.0)
             points = project(model.sensor, now, eop, field.points)
-            points = points + rng.normal(0, 0.04, points.shape)
-            rows = np.arange(len(field))
-            seen = Observations(rows, points, np.full(points.shape, 0.04))
+            points += rng.normal(0, 0.04, points.shape)
+            seen = Observations(np.arange(len(field)), points, np.full(points.shape, 0.04))
             time_s = 1.7e9 + interval * k
             reading = {"temperature": round(temperature * 16) / 16}
             yield Epoch(k + 1, time_s, time_s + 0.001, reading, observations=seen)
@@ -218,11 +249,12 @@ def make_photographs(path: Path, recording: Path, frames: list[bytes]) -> Path:
     (path / "frames").mkdir(parents=True)
     for name in ("recording.yaml", "testfield.csv"):
         shutil.copy(recording / name, path / name)
-    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
+    rows = []
     for k, data in enumerate(frames, 1):
         (path / f"frames/{k:04d}.jpg").write_bytes(data)
-        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k:04d}.jpg")
-    (path / "epochs.csv").write_text("\n".join(rows) + "\n")
+        rows.append((k, 1.7e9 + 10 * k, 1.7e9 + 10 * k, 25.0, f"frames/{k:04d}.jpg"))
+    columns = ("epoch", "frame_time", "temperature_time", "temperature", "frame")
+    write_table(path / "epochs.csv", columns, rows)
     return path
 
 
@@ -252,11 +284,7 @@ def replayed():
         rhythm = {"loop": loop, "period_s": period_s}
         camera = replayed_camera(path, name="rpi", thermometers=["recorded"], **rhythm)
         recorded = {"name": "recorded", "driver": "replay", "recording": str(path), **rhythm}
-        return {
-            "cameras": [camera],
-            "thermometers": [recorded],
-            "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
-        }
+        return {"cameras": [camera], "thermometers": [recorded], "outputs": [*OUTPUTS]}
 
     return make
 
@@ -283,25 +311,30 @@ def preloaded(tmp_path_factory):
     forker.close()
 
 
-def tool(*command: object) -> subprocess.CompletedProcess[str]:
-    """Run a program of the system, which may fail."""
-    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+@pytest.fixture
+def mount():
+    """Words of `mount` → mounted until the test ends; skips where nothing can be mounted."""
+    mounted: list[Path] = []
+
+    def mounts(*words: object) -> None:
+        command = ["mount", *map(str, words)]
+        if not shutil.which("mount") or subprocess.run(command, check=False).returncode:
+            pytest.skip("nothing can be mounted here: needs root and tmpfs")
+        mounted.append(words[-1])
+
+    yield mounts
+    for folder in reversed(mounted):
+        subprocess.run(["umount", "-q", "-l", folder], check=False)
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path):
-    """MB → the folder of a disk of this size; skips if nothing can be mounted."""
-    mounted = []
+def small_disk(tmp_path: Path, mount):
+    """MB → the folder of a disk of this size."""
 
-    def mount(size_mb: int) -> Path:
-        folder = tmp_path / f"disk{len(mounted)}"
+    def make(size_mb: int) -> Path:
+        folder = tmp_path / "disk"
         folder.mkdir()
-        wanted = ("mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder)
-        if not shutil.which("mount") or tool(*wanted).returncode:
-            pytest.skip("a small disk cannot be mounted here: needs root and tmpfs")
-        mounted.append(folder)
+        mount("-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder)
         return folder
 
-    yield mount
-    for folder in mounted:
-        tool("umount", "-l", folder)
+    return make

@@ -49,38 +49,35 @@ def run(tmp_path):
 
 def keep(run, number: int, **temperatures: float) -> Epoch:
     """Take an epoch; return it."""
-    settings = {"focus": 30.0, "gain": 4.0}
-    utc = 1e9 + number
+    utc, settings = 1e9 + number, {"focus": 30.0, "gain": 4.0}
     frame = Frame(np.zeros((48, 64), np.uint8), 1.0, utc, settings=settings)
     epoch = Epoch(number, utc, utc, temperatures)
     run.keep(AcquiredEpoch(number, frame, True, epoch))
     return epoch
 
 
+def test_a_thermometer_that_was_never_there_is_assumed_to_have_a_temperature():
+    """Regression: of one that was plugged in later, no analysis had a temperature."""
+    config = {"thermometers": [{"name": "air", "driver": "hwmon", "chip": "tmp102"}]}
+    thermometers = Thermometers(parse_config(config, Path("c.yaml")), VirtualClock())
+    assert thermometers.columns(["air"]) == ["temperature"]
+
+
 def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(run, caplog):
     run.amend(CalibratedEpoch(Epoch(1, 1e9, 1e9, {}), failed("no_observations", ""), {}))
     assert "the calibration of epoch 1 waits: series M1 has not begun" in caplog.text
-    for number in (1, 2):
-        keep(run, number, air=20.0)
-    store = run.runtime.guard.store
-    store.amend(run.series, 1, EpochResult("ok"), extra={"blur": 0.7})
-    columns = store.series_columns(run.series, ["camera_focus", "camera_gain", "blur"])
-    assert columns["camera_focus"].tolist() == [30.0, 30.0]
-    assert columns["camera_gain"].tolist() == [4.0, 4.0]
-    assert columns["blur"][0] == 0.7
-
-
-def test_a_temperature_that_a_series_began_without_is_reported_once(run, caplog):
-    """Regression: of a thermometer that was plugged in later, no analysis had a temperature."""
-    config = {"thermometers": [{"name": "air", "driver": "hwmon", "chip": "tmp102"}]}
-    thermometers = Thermometers(parse_config(config, Path("c.yaml")), VirtualClock())
-    assert thermometers.columns(["air"]) == ["temperature"]  # what it has once it is there
+    # a temperature that the series began without is told once: no analysis had any
     for number, channel in enumerate(("temperature", "lens", "lens"), 1):
         keep(run, number, **{channel: 20.0})
-    events = run.runtime.guard.store.events()
-    assert [event.kind for event in events] == ["series_begun", "channel_unknown"]
-    assert all(event.text.startswith("camera river: series M1 beg") for event in events)
     assert caplog.text.count("series M1 began without lens: no analysis") == 1
+    store = run.runtime.guard.store
+    assert [event.kind for event in store.events()] == ["series_begun", "channel_unknown"]
+    assert all(event.text.startswith("camera river: series M1 beg") for event in store.events())
+    store.amend(run.series, 1, EpochResult("ok"), extra={"blur": 0.7})
+    columns = store.series_columns(run.series, ["camera_focus", "camera_gain", "blur"])
+    assert columns["camera_focus"].tolist() == [30.0] * 3
+    assert columns["camera_gain"].tolist() == [4.0] * 3
+    assert columns["blur"][0] == 0.7
 
 
 AIR, CASE = ({"name": name, "driver": "mock"} for name in ("air", "case"))
@@ -102,17 +99,16 @@ GONE = {"faults": [{"kind": "unplugged", "at_s": 0, "for_s": 1e9}]}
 def test_a_start_is_refused_only_for_other_thermometers_or_targets(tmp_path, before, after, why):
     recording = make_recording(tmp_path / "R", 2)
     for name in ("recording.yaml", "epochs.csv"):
-        text = (recording / name).read_text()
-        text = text.replace("temperature:", "lens:").replace(",temperature,", ",lens,")
-        (recording / name).write_text(text)
+        text = (recording / name).read_text().replace("temperature:", "lens:")
+        (recording / name).write_text(text.replace(",temperature,", ",lens,"))
 
     def start(thermometers):
-        devices = [{**one, "recording": str(recording)} if one["name"] == "u" else one
+        devices = [{**one, "recording": str(recording)} if one is UNNAMED else one
                    for one in thermometers]  # fmt: skip
         names = [one["name"] for one in thermometers]
-        document = {"cameras": [replayed_camera(recording, name="r", thermometers=names)],
+        camera = replayed_camera(recording, name="r", thermometers=names)
+        document = {"cameras": [camera, {**camera, "name": "idle", "series": None}],
                     "thermometers": devices, "frames": {"keep": "none"}}  # fmt: skip
-        document["cameras"].append({**document["cameras"][0], "name": "idle", "series": None})
         config = parse_config(document, tmp_path / "config.yaml")
         assert Service(config, fast=True, epochs=1, until_finished=True).run()
 

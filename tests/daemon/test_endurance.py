@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
-import json
 import os
 import subprocess
 import sys
@@ -13,80 +11,58 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from tests.daemon.conftest import ENVIRONMENT, columns_of, make_recording
 from tests.daemon.test_page_attacks import resident_mb
-from thermocald.store.database.store import Store
+from tests.daemon.test_systemd import values
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[2]
 
-
-def unit():
-    """Return the service section of the daemon's unit."""
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    parser.optionxform = str
-    parser.read(ROOT / "systemd/thermocald.service")
-    return parser["Service"]
-
-
-def watched(daemon, run):
-    """Run a script; return rows of epochs stored, MB resident, open files, threads, CPU seconds."""
+def start(daemon, *words: str, **environment: str) -> None:
+    """Start Python as a process of its own: a fork would share its memory."""
     daemon.process = subprocess.Popen(
-        [sys.executable, "-c", run], cwd=daemon.folder, env=ENVIRONMENT
-    )
-    proc = Path(f"/proc/{daemon.process.pid}")
-    seen = []
-    while daemon.process.poll() is None:
-        time.sleep(1.0)
-        try:
-            status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
-            epoch = daemon.status()["cameras"]["rpi"]["stored"]
-            files = len(list((proc / "fd").iterdir()))
-            used = sum(map(int, (proc / "stat").read_text().rpartition(")")[2].split()[11:13]))
-        except (OSError, ValueError, KeyError):
-            continue
-        if epoch:
-            resident_mb = int(status["VmRSS"].split()[0]) / 1024
-            ticks = os.sysconf("SC_CLK_TCK")
-            seen.append((epoch, resident_mb, files, int(status["Threads"]), used / ticks))
-    assert daemon.process.returncode == 0
-    return seen
+        [sys.executable, *words], cwd=daemon.folder, env={**ENVIRONMENT, **environment},
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
 
 
 def test_a_daemon_that_waits_keeps_to_88_mb(daemon, replayed, tmp_path):
     """With its unit's variables, between two epochs of 12 targets: 84 with replay's series."""
-    own = dict(pair.split("=") for pair in unit()["Environment"].split())
+    (variables,) = values("thermocald.service", "Environment")
+    own = dict(pair.split("=") for pair in variables.split())
     path = make_recording(tmp_path / "short", 60, per_side=2, interval=1.0)
     daemon.configure(**replayed(path, period_s=1.0))
-    daemon.process = subprocess.Popen(
-        [sys.executable, "-m", "thermocald", "run", "--config", str(daemon.config)],
-        cwd=daemon.folder, env={**ENVIRONMENT, **own, "HOME": str(tmp_path)},
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    while len(daemon.results()) < 12:
-        assert daemon.process.poll() is None
-        time.sleep(0.2)
+    words = ("-m", "thermocald", "run", "--config", str(daemon.config))
+    start(daemon, *words, **{**own, "HOME": str(tmp_path)})
+    daemon.more(12)
     assert resident_mb(daemon.process.pid) < 88.0
     assert daemon.stop() == 0
 
 
-def test_an_epoch_every_second_while_two_processes_burn_the_cores(daemon, devices):
-    burn = [sys.executable, "-c", "while True: pass"]
-    burners = [subprocess.Popen(burn) for _ in range(2)]
-    try:
-        daemon.run("--epochs", "20", **devices(period_s=1.0))
-        assert daemon.wait() == 0
-    finally:
-        for burner in burners:
-            burner.kill()
-            burner.wait()
-    assert len(daemon.stored()[0]) == 20
-    # the first frame waits for the renderer's modules
-    times = np.array([row["frame_time"] for row in daemon.results()])[1:]
-    late_s = np.ptp(times - np.arange(len(times)))
-    print(f"frames are at most {late_s:.3f} s off the second")
-    assert late_s < 0.3
+FAST = """
+from pathlib import Path
+from thermocald.config import load_config
+from thermocald.daemon.service import Service
+Service(load_config(Path({config!r})), fast=True, epochs={epochs}, until_finished=True).run()
+"""
+
+
+def watched(daemon) -> np.ndarray:
+    """Return epochs stored, MB resident, open files, threads, CPU seconds: a row each a second."""
+    proc, seen = Path(f"/proc/{daemon.process.pid}"), []
+    while daemon.process.poll() is None:
+        time.sleep(1.0)
+        try:
+            epoch = daemon.status()["cameras"]["rpi"]["stored"]
+            files, threads = (len(list((proc / what).iterdir())) for what in ("fd", "task"))
+            used = sum(map(int, (proc / "stat").read_text().rpartition(")")[2].split()[11:13]))
+            resident = resident_mb(daemon.process.pid)
+        except (OSError, KeyError, StopIteration):  # it has not begun, or has ended
+            continue
+        if epoch:
+            seen.append((epoch, resident, files, threads, used / os.sysconf("SC_CLK_TCK")))
+    assert daemon.process.returncode == 0
+    return np.array(seen).T
 
 
 @pytest.mark.timeout(1800)
@@ -102,12 +78,10 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
         tmp_path / "days", 5 * day, interval=period_s,
         temperature_of=lambda k: 25.0 + 8.0 * np.sin(2 * np.pi * k / day),
     )  # fmt: skip
-    sections = replayed(path, period_s=period_s)
-    sections["outputs"] = []
-    sections["store"] = {"path": str(daemon.store), "durable": False}
-    document = json.dumps({**sections, "frames": {"keep": "none"}})
-    seen = watched(daemon, fast_run(document, ticks))
-    epochs, resident, files, threads, used = map(np.array, zip(*seen, strict=True))
+    store = {"path": str(daemon.store), "durable": False}
+    daemon.configure(**{**replayed(path, period_s=period_s), "outputs": []}, store=store)
+    start(daemon, "-c", FAST.format(config=str(daemon.config), epochs=ticks))
+    epochs, resident, files, threads, used = watched(daemon)
     cost_ms, held_mb = [], []
     for third in range(3):
         # during the first days modules are loaded and windows fill
@@ -120,14 +94,13 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
           f"files {set(files.tolist())}, threads {set(threads.tolist())}")  # fmt: skip
     assert held_mb[2] - held_mb[1] < 1.5
     assert held_mb[2] - held_mb[0] < 5.0
-    assert resident.max() < 0.5 * int(unit()["MemoryMax"].removesuffix("M"))
+    (most,) = values("thermocald.service", "MemoryMax")
+    assert resident.max() < 0.5 * int(most.removesuffix("M"))
     warm = (epochs > 0.7 * ticks) & (epochs < 0.98 * ticks)
     assert np.ptp(files[warm]) <= 2  # status.json may be open
     assert np.ptp(threads[warm]) == 0
     assert cost_ms[2] < 1.25 * cost_ms[0]  # on a machine that may be busy; measured: 1.00 and 1.15
-    with Store.open(daemon.store) as store:
-        series = store.find_series()
-        assert store.last_epoch(series) == ticks
-        times = store.series_columns(series, ["frame_time"])["frame_time"]
-        assert np.ptp(times) > 89 * 86_400
-        assert (np.diff(times) > 0).all()
+    times = columns_of(daemon.store, "frame_time")["frame_time"]
+    assert len(times) == ticks
+    assert np.ptp(times) > 89 * 86_400
+    assert (np.diff(times) > 0).all()

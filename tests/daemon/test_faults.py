@@ -13,8 +13,10 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import make_photographs
+from tests.commands import finish
+from tests.daemon.conftest import columns_of, make_photographs
 from tests.marks import mostly_slow
+from tests.recordings import read_rows
 from thermocald.config import load_config
 from thermocald.daemon.service import Service
 from thermocald.daemon.station import Station
@@ -22,84 +24,118 @@ from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
 
 
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize("kills", [3, pytest.param(80, marks=pytest.mark.slow)])
-def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed, kills):
-    """40 more kills in test_chaos, and 300 of the store's writer in store/test_kills."""
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("rounds", [3, pytest.param(60, marks=pytest.mark.slow)])
+def test_what_was_told_as_stored_is_there_and_right_in_a_hostile_week(
+    daemon, recording, replayed, preloaded, tmp_path, rounds
+):
+    """Every round ends with a kill; before, files of the store were deleted or the clock leapt."""
+    daemon.forker = preloaded
     daemon.configure(**replayed(recording))
-    rng = np.random.default_rng(5)
-    for _ in range(kills):
-        daemon.start()
+    rng, offset = np.random.default_rng(5), tmp_path / "offset"
+    for number in range(rounds):
+        offset.write_text("0".ljust(12))
+        daemon.start(CLOCK_OFFSET_FILE=str(offset))
         daemon.more(int(rng.integers(1, 6)))
-        time.sleep(rng.uniform(0.0, 0.1))  # two periods
+        if number % 3 == 1:
+            files = sorted(p for p in daemon.folder.glob("thermocald.db*") if p.is_file())
+            for path in files if number % 2 else [files[number % len(files)]]:
+                path.unlink()
+            daemon.more(2)  # the first one may have been written before
+        elif number % 3 == 2:
+            leap_s = rng.choice([120 * 86400, -3600, 7200, -86400])
+            offset.write_text(str(leap_s).ljust(12))
+        time.sleep(rng.uniform(0.0, 0.3))
         daemon.kill()
-        told = [result["epoch"] for result in daemon.results()]
-        numbers, _ = daemon.stored()
-        assert set(told) <= set(numbers)
-    assert len(numbers) > 3 * kills
+        daemon.stored()
+        kept = columns_of(daemon.store, "frame_time", "c")
+        for row in daemon.results():
+            here = {name: column[row["epoch"] - 1] for name, column in kept.items()}
+            assert row["stored"]
+            assert here["frame_time"] == row["frame_time"]
+            # a deferred calibration may have been added since
+            assert row["c"] is None or here["c"] == row["c"]
+    assert "Traceback" not in daemon.log()
 
 
-def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, devices):
+def times(daemon, device: str) -> list[float]:
+    """Return the times of a camera's epochs."""
+    return [r["frame_time"] for r in daemon.results() if r["device"] == device]
+
+
+def readings_of(daemon, name: str | None = None) -> list:
+    try:
+        with Store.open(daemon.store) as store:
+            return list(store.readings(name))
+    except StoreError:  # it is being created
+        return []
+
+
+def test_an_unplugged_camera_is_told_once_and_no_other_device_waits(daemon, devices):
+    """Readings that belong to no epoch are stored and archived: of a thermometer of no camera,
+    and of a camera's thermometer while it is away.
+    """
     gone = [{"kind": "unplugged", "at_s": 1.0, "for_s": 1.5}]
     sections = devices(camera=gone, period_s=0.4)
-    second = {**sections["cameras"][0], "name": "two", "faults": []}
-    sections["cameras"].append(second)
+    sections["cameras"].append({**sections["cameras"][0], "name": "two", "thermometers": [],
+                                "faults": []})  # fmt: skip
+    sections["thermometers"].append({**sections["thermometers"][0], "name": "air", "seed": 7})
     daemon.run(**sections)
     daemon.until(lambda: "camera one is back" in daemon.log())
-    daemon.until(lambda: sum(r["device"] == "two" for r in daemon.results()) > 8)
+    daemon.until(lambda: len(times(daemon, "two")) > 8)
+    daemon.until(lambda: len(readings_of(daemon, "air")) > 5)
     assert daemon.stop() == 0
-    assert daemon.log().count("camera one is out") == 1
-    assert daemon.log().count("camera one is back") == 1
     assert [e for e in daemon.events() if e.startswith("device")] == ["device_out", "device_back"]
-    times = {name: [r["frame_time"] for r in daemon.results() if r["device"] == name]
-             for name in ("one", "two")}  # fmt: skip
-    away = np.diff(times["one"])
+    one, two = times(daemon, "one"), times(daemon, "two")
+    away = np.diff(one)
     assert 1.5 < away.max() < 4.5  # 1.5 s away, and a few ticks until the retry
     assert np.sort(away)[-2] < 1.5
     # the other camera continued meanwhile
-    begin = times["one"][int(away.argmax())]
-    usual = 1.5 / np.mean(np.diff(times["two"]))  # epochs in 1.5 s
-    assert sum(begin < t < begin + 1.5 for t in times["two"]) >= 0.3 * usual - 1
+    begin = one[int(away.argmax())]
+    usual = 1.5 / np.mean(np.diff(two))  # epochs in 1.5 s
+    assert sum(begin < t < begin + 1.5 for t in two) >= 0.3 * usual - 1
+    housing, air = readings_of(daemon, "housing"), readings_of(daemon, "air")
+    assert [r for r in housing if begin < r.utc < begin + away.max()]
+    # a reading of an epoch is not stored twice, except at both ends
+    paired = {r["temperature_time"] for r in daemon.results() if r["device"] == "one"}
+    assert len(paired & {r.utc for r in housing}) <= 3
+    finish("archive", "--config", "config.yaml", "--to", "out", folder=daemon.folder)
+    archived = read_rows(daemon.folder / "out/thermometer-air.csv")
+    told = [float(row["temperature"]) for row in archived]
+    assert told == [r.values["temperature"] for r in air]
 
 
-@pytest.fixture
-def heard(tmp_path):
-    """s → the messages to the notification socket, in place of systemd's, in this time."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
-        channel.bind(str(tmp_path / "notify.sock"))
-        channel.settimeout(0.1)
-
-        def listen(seconds: float) -> list[str]:
-            messages: list[str] = []
-            end = time.monotonic() + seconds
-            while time.monotonic() < end:
-                with suppress(TimeoutError):
-                    messages += channel.recv(4096).decode().split("\n")
-            return messages
-
-        yield listen
+def received(channel: socket.socket) -> bytes:
+    """Return what has been received on a channel that does not wait."""
+    data = b""
+    with suppress(BlockingIOError):
+        while True:
+            data += channel.recv(4096)
+    return data
 
 
 @pytest.mark.slow  # waits for the watchdog
-def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(
-    daemon, devices, heard, tmp_path
-):
-    hangs = [{"kind": "timeout", "at": 8}]
-    sections = devices(camera=hangs, timeout_s=3600.0)
+def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, devices, tmp_path):
+    sections = devices(camera=[{"kind": "timeout", "at": 8}], timeout_s=3600.0)
     sections["cameras"].append({**sections["cameras"][0], "name": "two", "faults": []})
     daemon.configure(**sections)
-    place = str(tmp_path / "notify.sock")
-    daemon.start("--hang-after", "3", NOTIFY_SOCKET=place, WATCHDOG_USEC="2000000")
-    daemon.until(lambda: "READY=1" in heard(0.1))
-    assert "WATCHDOG=1" in heard(1.2)
-    # on a busy machine, opening and calculating may take long
-    daemon.until(lambda: sum(r["device"] == "one" for r in daemon.results()) == 7)
-    daemon.until(lambda: daemon.status()["stalled"] == ["camera one hangs"])
-    heard(0.5)
-    assert "WATCHDOG=1" not in heard(2.5)
-    count = len([r for r in daemon.results() if r["device"] == "two"])
-    daemon.until(lambda: len([r for r in daemon.results() if r["device"] == "two"]) > count + 5)
-    assert len([r for r in daemon.results() if r["device"] == "one"]) == 7
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(place := str(tmp_path / "notify.sock"))
+        systemd.settimeout(60)
+        daemon.start("--hang-after", "3", NOTIFY_SOCKET=place, WATCHDOG_USEC="2000000")
+        for wanted in (b"READY=1", b"WATCHDOG=1"):
+            while wanted not in systemd.recv(4096):
+                pass
+        # on a busy machine, opening and calculating may take long
+        daemon.until(lambda: len(times(daemon, "one")) == 7)
+        daemon.until(lambda: daemon.status()["stalled"] == ["camera one hangs"])
+        systemd.setblocking(False)
+        received(systemd)
+        time.sleep(2.5)
+        assert b"WATCHDOG=1" not in received(systemd)
+    count = len(times(daemon, "two"))
+    daemon.until(lambda: len(times(daemon, "two")) > count + 5)
+    assert len(times(daemon, "one")) == 7
     begin = time.monotonic()
     assert daemon.stop() == 0  # the hung thread does not prevent the exit
     assert time.monotonic() - begin < 8.0  # it was waited for, 10 s
@@ -131,54 +167,59 @@ def test_a_disk_that_fails_beneath_the_store_loses_nothing(
     """Input/output errors of writes, and of the flush that a commit depends on."""
     asked = tmp_path / "asked"
     daemon.forker = preloaded
+    measured["thermometers"].append({"name": "air", "driver": "mock", "period_s": 0.1})
     daemon.configure(**measured)
     daemon.start(DISK_ERROR_OF=str(daemon.store), DISK_ERROR_FILE=str(asked))
     daemon.more(4)
     asked.write_text(failing)
-    daemon.until(lambda: "results wait in memory" in daemon.log())
     daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
-    told = daemon.results()[-1]["epoch"]
+    begin, told = time.time(), daemon.results()[-1]["epoch"]
+    daemon.more(5)
+    end = time.time()
     asked.unlink()
     daemon.until(lambda: "can be written again" in daemon.log())
     daemon.until(lambda: daemon.results()[-1]["stored"])
     daemon.kill()  # the store has all epochs
-    numbers, _ = daemon.stored()
-    assert len(numbers) >= told
+    assert len(daemon.stored()[0]) >= told
     assert daemon.log().count("results wait in memory") == 1
     assert "Traceback" not in daemon.log()
+    utcs = [reading.utc for reading in readings_of(daemon, "air")]
+    assert utcs == sorted(utcs)
+    assert any(begin < utc < end for utc in utcs)
 
 
-def test_on_a_read_only_file_system_it_says_so_and_leaves_the_rest_to_the_restart(
-    daemon, measured, small_disk
+def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(
+    daemon, measured, recording, tmp_path
 ):
-    disk = small_disk(8)
-    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
-    daemon.store = disk / "thermocald.db"
-    daemon.run(**measured)
-    assert daemon.wait() == 1
-    assert "error:" in daemon.log()
-    subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
-    daemon.start()
-    daemon.more(3)
-    assert daemon.stop() == 0
-
-
-def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon, measured):
+    """A device that failed is opened again, also without a change."""
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "recording.yaml").write_text("[")
+    air = {"name": "air", "driver": "replay", "recording": "./broken", "loop": True}
+    measured["thermometers"].append(air)
     daemon.configure(**measured)
     good = daemon.config.read_text()
     daemon.start()
     daemon.more(2)
-    daemon.config.write_text(good.replace("period_s", "perriod_s"))
-    daemon.signal(signal.SIGHUP)
+
+    def reload(text: str) -> None:
+        daemon.config.write_text(text)
+        daemon.signal(signal.SIGHUP)
+
+    def air_is(state: str) -> bool:
+        return daemon.status().get("thermometers", {}).get("air", {}).get("device", "") == state
+
+    reload(good.replace("period_s", "perriod_s"))
     daemon.until(lambda: "cannot be reloaded" in daemon.log())
     assert "is 'period_s' meant?" in daemon.log()
     daemon.more(2)
-    daemon.config.write_text(good.replace("name: rpi", "name: other"))
-    daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: daemon.results()[-1]["device"] == "other")
-    daemon.config.write_text(good)
-    daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: daemon.results()[-1]["device"] == "rpi")
+    for text, device in ((good.replace("name: rpi", "name: other"), "other"), (good, "rpi")):
+        reload(text)
+        daemon.until(lambda device=device: daemon.results()[-1]["device"] == device)
+    daemon.until(lambda: air_is("failed"))
+    shutil.copytree(recording, broken, dirs_exist_ok=True)
+    reload(good)
+    daemon.until(lambda: air_is("open"))
     assert daemon.stop() == 0
     with Store.open(daemon.store) as store:
         assert store.examine().damaged == ()
@@ -193,16 +234,7 @@ def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
     daemon, measured, monkeypatch
 ):
     """It went on without any device, and looked healthy."""
-    daemon.configure(**measured)
-    service = Service(load_config(daemon.config), daemon.config, on_turn=lambda _: reload())
-    turns, built = [], []
-
-    def reload():
-        turns.append(True)
-        if len(turns) == 1:
-            daemon.configure(**measured, logging={"level": "error"})
-            service._reload = True
-        return len(turns) > 20
+    built = []
 
     def build(*arguments):
         built.append(True)
@@ -210,44 +242,34 @@ def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
             raise StoreError("its disk is gone")
         return Station(*arguments)
 
+    def reload(service) -> bool:
+        daemon.configure(**measured, logging={"level": "error"})
+        service._reload = len(built) == 1
+        return len(built) > 3
+
     monkeypatch.setattr("thermocald.daemon.service.Station", build)
+    daemon.configure(**measured)
     with pytest.raises(StoreError, match="disk is gone"):
-        service.run()
-
-
-def test_a_reload_opens_a_failed_device_also_without_a_change(daemon, devices, recording, tmp_path):
-    broken = tmp_path / "broken"
-    broken.mkdir()
-    (broken / "recording.yaml").write_text("[")
-    sections = devices()
-    air = {"name": "air", "driver": "replay", "recording": "./broken", "loop": True}
-    sections["thermometers"].append({**air, "period_s": 0.2})
-    daemon.run(**sections)
-
-    def state() -> str:
-        return daemon.status().get("thermometers", {}).get("air", {}).get("device", "")
-
-    daemon.until(lambda: state() == "failed")
-    shutil.rmtree(broken)
-    shutil.copytree(recording, broken)
-    daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: state() == "open")
-    assert daemon.stop() == 0
+        Service(load_config(daemon.config), daemon.config, on_turn=reload).run()
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
-def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, count):
+def test_garbage_frames_are_epochs_with_a_reason_and_kept_as_events(
+    daemon, recording, replayed, tmp_path, count
+):
     rng = np.random.default_rng(1)
     heads = [b"\xff\xd8\xff\xe0", b"\xff\xd8" + b"\xff\xd9", b"\xff\xd8\xff\xdb\x00\x43\xff\xd9"]
     garbage = make_photographs(tmp_path / "garbage", recording, [
         heads[k % 3] + rng.bytes(int(rng.integers(0, 3000))) + b"\xff\xd9" * (k % 2)
         for k in range(1, count + 1)
     ])  # fmt: skip
-    daemon.start("--recording", str(garbage), "--fast", "--store", str(daemon.store), config=False)
+    daemon.run("--epochs", str(count), **replayed(garbage, loop=False), keep="events")
     assert daemon.wait(300) == 0
     numbers, statuses = daemon.stored()
     assert numbers == list(range(1, count + 1))
     assert "ok" not in statuses
+    kept = sorted(int(p.stem) for p in daemon.frames.rglob("*.jpg"))
+    assert kept == numbers
     assert "Traceback" not in daemon.log()
     assert daemon.log().count("its last 20 epochs have no result; ") == 1
     assert daemon.events().count("no_result") == 1

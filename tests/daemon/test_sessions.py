@@ -1,4 +1,4 @@
-"""Sessions of the real daemon through the real command, as processes."""
+"""Sessions through the real command: by the running daemon, and without one by the command."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import json
 import re
 import shutil
 import signal
-from functools import partial
+from contextlib import nullcontext
 
 import pytest
 import yaml
 
 from tests.commands import call
-from thermocald.daemon.control import ask
 from thermocald.daemon.desk import Watch, take_in_the_daemon
 from thermocald.daemon.session import Session
 from thermocald.discovery.experiment import Separation
@@ -21,30 +20,29 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
 SESSION = {"camera": "phone-1", "series": "M7", "start": "cold", "epochs": 8}
+COLD = ("session", "start", "--camera", "phone-1", "--series", "M7", "--start", "cold",
+        "--no-report")  # fmt: skip
 
 
 @pytest.fixture
-def live(daemon, devices):
-    """configured → a running daemon with a camera whose own series is `watch`."""
+def configured(daemon, devices):
+    """Return a call that configures the daemon with a camera whose own series is `watch`."""
+    return lambda **changed: daemon.configure(
+        **{**devices(**{"period_s": 0.3, "name": "phone-1", **changed}), "outputs": []}
+    )
 
-    def start(**configured):
-        sections = devices(**{"period_s": 0.3, "name": "phone-1", **configured})
-        sections["outputs"] = []
-        daemon.run(**sections)
-        daemon.until(lambda: ask(folder, "session status") is not None)
-        return daemon
 
-    folder = daemon.store.with_name(daemon.store.name + ".live")
-    daemon.live = folder
-    daemon.ask = lambda do, **values: ask(folder, do, **values)
-    daemon.session = lambda: ask(folder, "session status")["sessions"].get("phone-1", {})
+@pytest.fixture
+def live(daemon, configured):
+    """Return a call that starts the configured daemon."""
+
+    def start(**changed) -> None:
+        configured(**changed)
+        daemon.start()
+        daemon.until(lambda: daemon.ask("session status") is not None)
+
+    daemon.session = lambda: daemon.ask("session status")["sessions"].get("phone-1", {})
     return start
-
-
-@pytest.fixture
-def command(daemon, spawn):
-    """options → `thermocald session …` in the daemon's folder, running."""
-    return partial(spawn, daemon.folder, "session")
 
 
 def series_of(path) -> dict[str, tuple[str, list[int]]]:
@@ -57,39 +55,80 @@ def series_of(path) -> dict[str, tuple[str, list[int]]]:
         }
 
 
-def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(live, command):
-    daemon = live()
-    daemon.until(lambda: "watch" in series_of(daemon.store))
+def count(daemon, name: str) -> int:
+    """Return how many epochs of a series are stored."""
+    try:
+        return len(series_of(daemon.store).get(name, ("", []))[1])
+    except (ValueError, OSError):  # the store is being created
+        return 0
+
+
+def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(live, daemon):
+    live()
+    daemon.until(lambda: count(daemon, "watch"))
     shutil.rmtree(daemon.live, ignore_errors=True)
-    daemon.until(lambda: ask(daemon.live, "session status") is not None)
-    process = command("start", "--camera", "phone-1", "--series", "M7", "--start", "cold",
-                      "--epochs", "4", "--no-report")  # fmt: skip
+    daemon.until(lambda: daemon.ask("session status") is not None)
+    process = daemon.command(*COLD, "--epochs", "4")
     told = process.said()
     assert process.returncode == 0, told
     assert "taken by the daemon" in told
     assert "48 targets" in told
-    stored = series_of(daemon.store)
-    assert stored["M7"] == ("cold", list(range(1, 5)))
+    assert series_of(daemon.store)["M7"] == ("cold", [1, 2, 3, 4])
     recording = read_recording(daemon.folder / "phone-1-M7")
     assert recording.head.extra["start"] == "cold"
     assert recording.head.extra["device"]["serial"] == "mock-1"
     assert recording.head.extra["device"]["thermometers"]["housing"]["serial"] == "mock-0"
     assert len(recording.epochs) == 4
     # the camera is back at its own series, which lacks only the time of the session
-    count = len(stored["watch"][1])
-    daemon.until(lambda: len(series_of(daemon.store)["watch"][1]) > count + 1)
+    had = count(daemon, "watch")
+    daemon.until(lambda: count(daemon, "watch") > had + 1)
     assert daemon.stop() == 0
     numbers = series_of(daemon.store)["watch"][1]
     assert numbers == list(range(1, len(numbers) + 1))
-    assert [e for e in daemon.events() if e.startswith("session")] == [
-        "session_begun", "session_ended"
-    ]  # fmt: skip
+    sessions = [event for event in daemon.events() if event.startswith("session")]
+    assert sessions == ["session_begun", "session_ended"]
 
 
-def test_a_series_begins_with_a_new_observation(live):
+def test_without_a_daemon_it_is_checked_taken_interrupted_resumed_and_archived(configured, daemon):
+    configured()
+    daemon.process = daemon.command(*COLD, "--epochs", "5")
+    daemon.until(lambda: count(daemon, "M7") >= 2)
+    daemon.kill()
+    had = count(daemon, "M7")
+    told = daemon.command(*COLD, "--epochs", "5").said()
+    assert f"has {had} epochs; {5 - had} are still to be taken" in told
+    assert "48 targets" in told
+    recording = read_recording(daemon.folder / "phone-1-M7")
+    assert [epoch.number for epoch in recording.epochs] == list(range(1, 6))
+    assert series_of(daemon.store) == {"M7": ("cold", [1, 2, 3, 4, 5])}
+
+
+@pytest.mark.slow
+def test_it_ends_with_the_report(configured, daemon, tmp_path):
+    configured()
+    daemon.command("session", "start", "--epochs", "30", "--series", "M1").said(200)
+    assert "<svg" in (tmp_path / "phone-1-M1.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("device", "faults"),
+    [("camera phone-1", {"camera": [{"kind": "timeout", "at": 1}]}),
+     ("thermometer housing", {"thermometer": [{"kind": "timeout", "at": 1, "count": 100}]})],
+)  # fmt: skip
+def test_a_device_that_gives_nothing_is_told_before_it_begins(configured, daemon, device, faults):
+    configured(exposure_s=0.01, **faults)
+    process = daemon.command(*COLD, "--epochs", "5")
+    told = process.said()
+    assert process.returncode == 3
+    assert f"error: {device}: " in told
+    assert "no answer" in told
+    assert series_of(daemon.store) == {}
+
+
+def test_a_series_begins_with_a_new_observation(live, daemon):
     """Regression: a frozen camera's first epoch was a repeated frame of the series before."""
-    daemon = live(camera=[{"kind": "stuck", "at": 3, "count": 500}])
-    daemon.until(lambda: len(series_of(daemon.store).get("watch", ("", []))[1]) > 3)
+    live(camera=[{"kind": "stuck", "at": 3, "count": 500}])
+    daemon.until(lambda: count(daemon, "watch") > 3)
     daemon.ask("session start", session={**SESSION, "epochs": 3})
     daemon.until(lambda: daemon.session().get("state") == "done")
     assert daemon.stop() == 0
@@ -98,66 +137,42 @@ def test_a_series_begins_with_a_new_observation(live):
     assert found["status"].tolist() == ["ok", "repeated_frame", "repeated_frame"]
 
 
-def test_a_daemon_that_is_killed_goes_on_with_the_session(live):
-    daemon = live()
-    daemon.ask("session start", session={**SESSION, "epochs": 5})
-    daemon.until(lambda: daemon.session().get("last", {}).get("epoch", 0) >= 1)
-    daemon.kill()
-    had = len(series_of(daemon.store)["M7"][1])
-    assert 1 <= had < 5
-    daemon.start()
-    daemon.until(lambda: daemon.ask("session status") is not None)
-    daemon.until(lambda: daemon.session()["state"] == "done")
-    assert daemon.stop() == 0
-    assert series_of(daemon.store)["M7"] == ("cold", list(range(1, 6)))
-
-
-@pytest.mark.slow
-def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(live, command):
-    daemon = live(series=None, camera=[{"kind": "unplugged", "at_s": 2.0, "for_s": 4.0}])
-    process = command("start", "--camera", "phone-1", "--series", "M7", "--epochs", "12",
-                      "--no-report", "--no-check")  # fmt: skip
-    daemon.until(lambda: "paused: " in process.printed())
-    daemon.until(lambda: "the camera is back" in process.printed())
-    daemon.kill()
-    daemon.until(lambda: "the daemon does not answer" in process.printed(), alive=False)
-    daemon.start()
+@pytest.mark.parametrize("running", [True, False])
+def test_it_pauses_while_the_phone_is_away_and_survives_a_killed_daemon(
+    live, configured, daemon, running
+):
+    gone = {"series": None, "camera": [{"kind": "unplugged", "at_s": 2.0, "for_s": 2.0}]}
+    live(**gone) if running else configured(**gone)
+    process = daemon.command(*COLD, "--epochs", "12", "--no-check")
+    if running:
+        daemon.until(lambda: "the camera is back" in process.printed())
+        daemon.kill()
+        daemon.until(lambda: "the daemon does not answer" in process.printed(), alive=False)
+        daemon.start()
     told = process.said()
     assert process.returncode == 0, told
-    assert len(read_recording(daemon.folder / "phone-1-M7").epochs) == 12
-
-
-def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
-    """A phone must not be warmed by its own frames before a cold start."""
-    live(series=None)
-    daemon.until(lambda: daemon.status() and daemon.status()["cameras"]["phone-1"]["ticks"] >= 2)
-    assert daemon.status()["cameras"]["phone-1"]["device"] == "closed"
-    daemon.ask("session start", session={**SESSION, "epochs": 3})
-    daemon.until(lambda: daemon.session()["state"] == "done")
-    assert len(daemon.session()["found"]) >= 2
-    daemon.until(lambda: daemon.status()["cameras"]["phone-1"]["device"] == "closed")
-    assert daemon.stop() == 0
-    assert series_of(daemon.store) == {"M7": ("cold", [1, 2, 3])}
+    assert "paused: " in told
+    assert "the camera is back" in told
+    assert series_of(daemon.store) == {"M7": ("cold", list(range(1, 13)))}
 
 
 @pytest.mark.slow
-def test_status_and_stop(live, command, daemon):
+def test_status_and_stop(live, daemon):
     live()
-    process = command("start", "--series", "M7", "--start", "warm", "--epochs", "1000", "--no-wait")
-    told = process.said()
-    assert process.returncode == 0, told
+    daemon.command(
+        "session", "start", "--series", "M7", "--start", "warm", "--epochs", "1000", "--no-wait"
+    ).said()
     daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
     out = call("session", "status", "--json", "-", folder=daemon.folder).stdout
     one = json.loads(out)["sessions"]["phone-1"]
     assert (one["series"], one["start"], one["state"]) == ("M7", "warm", "running")
     line = call("session", "status", folder=daemon.folder).stdout
     assert re.fullmatch(r"phone-1/M7, warm: \d+ of 1000 epochs, running\n", line)
-    assert "of 1000 epochs, stopped" in command("stop").said()
+    assert "of 1000 epochs, stopped" in daemon.command("session", "stop").said()
     taken = daemon.session()["taken"]
-    assert daemon.session()["state"] == "stopped"
     # it may be continued, but not as another series
     with pytest.raises(UsageError, match="begun with --start 'warm'"):
-        daemon.ask("session start", session={**SESSION, "start": "cold"})
+        daemon.ask("session start", session=SESSION)
     again = daemon.ask("session start", session={**SESSION, "start": "", "epochs": taken + 2})
     assert again["session"]["state"] == "checking"
     daemon.until(lambda: daemon.session()["state"] == "done")
@@ -167,39 +182,46 @@ def test_status_and_stop(live, command, daemon):
 
 def test_what_cannot_be_taken_is_refused_with_the_reason(live, daemon):
     live()
+    hot = [{"seconds": 10.0, "hold_c": None}]
     for wrong, error, words in [
         ({"camera": "nobody"}, UsageError, "there are: phone-1"),
         ({"series": "watch"}, UsageError, "takes series 'watch' all the time"),
-        ({"programme": [{"seconds": 10.0, "hold_c": None}]}, UsageError, "no output .* heats"),
+        ({"programme": hot}, UsageError, "no output .* heats"),
+        ({}, None, ""),
+        ({"series": "M8"}, DataError, "taking series 'M7' already"),
     ]:
-        with pytest.raises(error, match=words):
+        with pytest.raises(error, match=words) if error else nullcontext():
             daemon.ask("session start", session={**SESSION, **wrong})
+    daemon.ask("session stop", camera="phone-1")
     with pytest.raises(DataError, match="has no session"):
         daemon.ask("session stop", camera="phone-1")
-    daemon.ask("session start", session=SESSION)
-    with pytest.raises(DataError, match="taking series 'M7' already"):
-        daemon.ask("session start", session={**SESSION, "series": "M8"})
     assert daemon.stop() == 0
 
 
-@pytest.mark.parametrize("what", ["another field", "thermometer housing"])
-def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon, what):
-    """The camera sees another test field than the configured one; a thermometer is dead."""
-    wrong = {"thermometer": [{"kind": "timeout", "at": 1, "count": 10_000}]}
-    if what == "another field":
-        other = daemon.folder / "other.csv"
-        other.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
-            f"t{k},{100 * (k % 4)},{100 * (k // 4)},{10 * k},10,0.1,0.1,0.1\n" for k in range(12)
-        ))  # fmt: skip
+@pytest.mark.parametrize("what", ["test field", "thermometer housing", ""])
+def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon, recording, what):
+    """The camera sees another test field than the configured one; a thermometer is dead. Before
+    and after a session the camera rests: its frames would warm a phone before a cold start.
+    """
+    wrong = {}
+    if what == "test field":
         sensor = {"width_px": 820, "height_px": 616, "pixel_pitch_mm": 0.00448}
-        wrong, what = {"sensor": sensor, "testfield": str(other)}, "test field"
+        wrong = {"sensor": sensor, "testfield": str(recording / "testfield.csv")}
+    elif what:
+        wrong = {"thermometer": [{"kind": "timeout", "at": 1, "count": 10_000}]}
+
+    def camera(key: str):
+        return daemon.status().get("cameras", {}).get("phone-1", {}).get(key, 0)
+
     live(series=None, **wrong)
-    daemon.ask("session start", session=SESSION)
-    daemon.until(lambda: daemon.session()["state"] == "refused")
-    assert "the check failed" in daemon.session()["why"]
-    assert what in daemon.session()["why"]
+    daemon.until(lambda: camera("ticks") >= 2)
+    assert camera("device") == "closed"
+    daemon.ask("session start", session={**SESSION, "epochs": 3})
+    daemon.until(lambda: daemon.session()["state"] == ("refused" if what else "done"))
+    assert re.search(f"the check failed: .*{what}" if what else "all 3", daemon.session()["why"])
+    daemon.until(lambda: camera("device") == "closed")
     assert daemon.stop() == 0
-    assert series_of(daemon.store) == {}
+    assert series_of(daemon.store) == ({} if what else {"M7": ("cold", [1, 2, 3])})
 
 
 def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemon, devices):
@@ -211,17 +233,15 @@ def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemo
                             "programme": steps}]  # fmt: skip
     daemon.configure(**sections)
     daemon.start(GPIOZERO_PIN_FACTORY="mock")
-    folder = daemon.store.with_name(daemon.store.name + ".live")
-    daemon.until(lambda: ask(folder, "session status") is not None)
+    daemon.until(lambda: daemon.ask("session status") is not None)
     hot = [{"seconds": 10.0, "hold_c": 80.0}]
     with pytest.raises(UsageError, match="hold_c"):
-        ask(folder, "session start", session={**SESSION, "programme": hot})
-    started = ask(folder, "session start", session={**SESSION, "programme": steps, "epochs": 200})
-    assert started["session"]["state"] == "checking"
+        daemon.ask("session start", session={**SESSION, "programme": hot})
+    daemon.ask("session start", session={**SESSION, "programme": steps, "epochs": 200})
     daemon.until(lambda: daemon.status()["outputs"]["lamp"]["device"] == "failed")
-    ask(folder, "session stop", camera="phone-1")
+    daemon.ask("session stop", camera="phone-1")
     with pytest.raises(DataError, match=r"lamp: .* reached the limit"):
-        ask(folder, "session start", session={**SESSION, "series": "M8", "programme": steps})
+        daemon.ask("session start", session={**SESSION, "series": "M8", "programme": steps})
     daemon.until(lambda: "reached the limit" in str(daemon.status()["warnings"]))
     assert daemon.stop() == 0
     assert daemon.events().count("device_failed") == 1
@@ -232,46 +252,36 @@ def test_a_session_in_the_daemon_ends_when_the_effects_are_separated(live, daemo
     """The command watches, the daemon takes the epochs; see also `test_session_separate`."""
     live()
     session = Session.model_validate({**SESSION, "epochs": 4000, "check": False})
-    said: list[str] = []
-    watch = Watch(daemon.store, session, ("creep", "slip"), None, said.append)
+    watch = Watch(daemon.store, session, ("creep", "slip"), None, print)
     watch._compare = lambda: Separation("creep", "slip", 55.0, 14.0, True)
-    enough, look = 6, watch.look
-    watch.look = lambda taken: look(taken + 40) if taken >= enough else False
-    take_in_the_daemon(daemon.live, session, True, said.append, watch)
+    look = watch.look
+    watch.look = lambda taken: look(taken + 40) if taken >= 6 else False
+    take_in_the_daemon(daemon.live, session, True, print, watch)
     watch.close()
     daemon.until(lambda: daemon.session()["state"] == "stopped")
-    assert enough <= daemon.session()["taken"] < 100
+    assert 6 <= daemon.session()["taken"] < 100
     assert watch.ended
     assert daemon.stop() == 0
 
 
-def reload(daemon, **changes) -> None:
-    """Change the camera's section of the configuration while a session runs."""
+@pytest.mark.parametrize(
+    ("changed", "state", "why"),
+    [pytest.param({"seed": 2}, "done", "all 12 epochs", marks=pytest.mark.slow),
+     ({"name": "phone-2"}, "stopped", "there are: phone-2")],
+)  # fmt: skip
+def test_reload_leaves_a_session_alone_whose_camera_stays(live, daemon, changed, state, why):
+    """Of a session whose camera is gone it was said "0 of 40 epochs, stopped"."""
+    live()
     daemon.ask("session start", session={**SESSION, "epochs": 12, "check": False})
     daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
     document = yaml.safe_load(daemon.config.read_text())
-    document["cameras"][0] |= changes
+    document["cameras"][0] |= changed
     daemon.config.write_text(yaml.safe_dump(document))
     daemon.signal(signal.SIGHUP)
-
-
-@pytest.mark.slow
-def test_reload_leaves_a_session_alone(live, daemon):
-    live()
-    reload(daemon, seed=2)
-    daemon.until(lambda: daemon.session().get("state") == "done")
-    assert "the configuration was read again" in daemon.log()
-    assert daemon.stop() == 0
-    assert series_of(daemon.store)["M7"][1] == list(range(1, 13))
-
-
-def test_a_session_whose_camera_is_gone_has_the_epochs_that_it_took(live, daemon):
-    """It was "0 of 40 epochs, stopped"."""
-    live()
-    reload(daemon, name="phone-2")
-    daemon.until(lambda: daemon.session().get("state") == "stopped")
+    daemon.until(lambda: daemon.session().get("state") == state)
     session = daemon.session()
-    assert "there are: phone-2" in session["why"]
+    assert why in session["why"]
+    assert "the configuration was read again" in daemon.log()
     assert daemon.stop() == 0
     assert series_of(daemon.store)["M7"][1] == list(range(1, session["taken"] + 1))
 

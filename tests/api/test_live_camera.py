@@ -129,21 +129,3 @@ def test_another_thermometer_outside_its_range_widens_too(camera):
     with pytest.raises(UsageError, match=r"of board_temperature is 100\.0 K outside"):
         two.at(35.0, channels={"board_temperature": high + 100.0})
     assert len(two.plot().axes) == 3  # which takes all thermometers to be as warm
-
-
-def test_what_is_wrong_is_said():
-    live = tc.ThermalCamera(thermal_model()).live((1640, 1232))
-    with pytest.raises(UsageError, match="the frame is a list: give an array"):
-        live.correct([[1, 2], [3, 4]])
-    with pytest.raises(UsageError, match="no reading yet"):
-        live.correct(np.zeros((1232, 1640), np.uint8))
-    live.update(0.0, 30.0)
-    with pytest.raises(UsageError, match="not later than the last reading"):
-        live.update(0.0, 30.0)
-    with pytest.raises(UsageError, match=r"live\(size=\(640, 480\)\)"):
-        live.correct(np.zeros((480, 640), np.uint8))
-    with pytest.raises(UsageError, match="frame of bool cannot be resampled"):
-        live.correct(np.zeros((1232, 1640), bool))
-    with pytest.raises(UsageError, match="outside"):
-        live.update(1.0, 150.0)
-    assert live.update(2.0, float("nan")).temperature == 30.0

@@ -30,9 +30,10 @@ epochs: 90
 interval: 20.0
 ambient: 23.0
 sources:
-  housing: [{from: 0, to: 100, value: 0}, {from: 100, to: 900, value: 10}]
-  board: [{from: 0, to: 350, value: 0.5}, {from: 350, to: 800, value: 3}, {from: 1200, to: 1800,
-          value: 4}]
+  housing: [{from: 0, to: 100, value: 0}, {from: 100, to: 900, value: 10},
+            {from: 900, to: 1800, value: 0}]
+  board: [{from: 0, to: 350, value: 0.5}, {from: 350, to: 800, value: 3},
+          {from: 800, to: 1200, value: 0.8}, {from: 1200, to: 1800, value: 4}]
 """
 
 

@@ -29,15 +29,7 @@ def test_a_printed_field_is_not_overwritten(tmp_path):
     assert (folder / "testfield.csv").read_bytes() != before
 
 
-@pytest.mark.parametrize("paper", [(), ("--paper", "A4")])
-def test_check_says_before_printing_that_a_series_gets_a_result(tmp_path, paper):
-    """By the same bounds as the adjustment's, on what `print` would draw."""
-    result = succeed("testfield", "check", *paper, "--json", tmp_path / "found.json")
-    assert "NOT ENOUGH" not in result.stdout
-    assert json.loads((tmp_path / "found.json").read_text())["calibrates"]
-
-
-def test_check_says_what_a_flat_field_is_good_for(tmp_path):
+def test_check_says_before_printing_what_a_flat_field_is_good_for(tmp_path):
     result = succeed("testfield", "check", "--flat", "--json", tmp_path / "found.json")
     told = " ".join(result.stdout.split())
     assert told.startswith("NOT ENOUGH: a series of a fixed camera gets no result")
@@ -45,6 +37,7 @@ def test_check_says_what_a_flat_field_is_good_for(tmp_path):
     assert "the principal distance is not determined" in told
     found = json.loads((tmp_path / "found.json").read_text())
     assert not found["calibrates"]
+    assert document("testfield", "check")["calibrates"]
     assert any("correlate at" in reason for reason in found["weak"])
 
 
@@ -105,9 +98,11 @@ def test_survey_with_a_known_camera_held(sheet, tmp_path):
     assert (camera["free"], camera["sd_c"], camera["c"]) == ([], 0.0, model.interior.c)
     # without a nominal field: the coded targets alone
     assert all(row["target"].startswith("R") for row in found["targets"])
+    command = ("testfield", "survey", folder / "photos", "--out", tmp_path / "s.csv")
     with pytest.raises(GeometryError, match="nowhere"):
-        invoke("testfield", "survey", folder / "photos", "--scale", a, "nowhere", 9, "--out",
-               tmp_path / "s.csv")  # fmt: skip
+        invoke(*command, "--scale", a, "nowhere", 9)
+    with pytest.raises(GeometryError, match="are they in mm, and between these targets"):
+        invoke(*command, "--scale", "R65", "R71", 100, "--field", folder / "testfield.csv")
 
 
 def test_a_turned_camera_does_not_turn_its_picture(tmp_path):

@@ -90,7 +90,7 @@ def test_a_model_is_valid_where_frames_were_taken(misfits, tmp_path):
     """Its range began with a log an hour before the first frame, 15 K lower."""
     shutil.copytree(misfits / "M3", tmp_path / "M1")
     columns = ("temperature_time", "temperature", "board_temperature")
-    taken = [[float(row[k]) for k in columns] for row in read_rows(tmp_path / "M3" / "epochs.csv")]
+    taken = [[float(row[k]) for k in columns] for row in read_rows(tmp_path / "M1" / "epochs.csv")]
     before = [[taken[0][0] - 30.0 * k, 5.0, 5.0] for k in range(20, 0, -1)]
     write_table(tmp_path / "M1" / "readings.csv", ("time", *columns[1:]), before + taken)
     succeed("fit", tmp_path / "M1", "--output", tmp_path / "m.yaml")

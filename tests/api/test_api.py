@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from tests.commands import finish
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
 from thermocald.discovery.plan import Plan
@@ -78,8 +77,6 @@ def test_a_store_and_its_recording_are_the_same_series(inside, short):
     np.testing.assert_allclose(a.values, b.values, rtol=1e-6)
     with pytest.raises(StoreError, match=r"camera/series in this store: rpi-v2\.1/M1"):
         tc.open("thermocald.db", "M7")
-    with pytest.raises(StoreError, match="does not exist"):
-        tc.open("nowhere")
     with pytest.raises(StoreError, match="is no store; give a recording's folder or a store"):
         tc.open("M1/epochs.csv")
 
@@ -109,13 +106,6 @@ def test_epochs_are_columns_with_covariance(epochs):
         _ = epochs.focal
 
 
-def test_epochs_as_csv_are_the_export(short, world, tmp_path):
-    epochs = short.calibrate()
-    epochs.to_csv(tmp_path / "ours.csv")
-    finish("export", "short", "-o", tmp_path / "theirs.csv", folder=world)
-    assert (tmp_path / "ours.csv").read_text() == (tmp_path / "theirs.csv").read_text()
-
-
 def test_bands_of_drawings_hold_95_percent(epochs, camera):
     bars = epochs.plot().axes[0].collections[0].get_segments()
     drawn = np.array([bar[1, 1] - bar[0, 1] for bar in bars])
@@ -126,15 +116,6 @@ def test_bands_of_drawings_hold_95_percent(epochs, camera):
     cold = [float(outline[:, 0].min())]
     since_T0 = camera.along([0.0], cold, relative_to=camera.model.T0)  # the level's sd cancels
     np.testing.assert_allclose(np.ptp(first), 2 * 1.96 * 1e3 * since_T0.sd[0, 1], rtol=1e-6)
-
-
-def test_a_drawn_distortion_is_zero_at_the_principal_point(camera):
-    now = camera.at(35.0)
-    arrows = now.plot().axes[0].collections[0]
-    shift, pitch = np.hypot(arrows.U, arrows.V), now.sensor.pixel_pitch
-    middle = now.sensor.centre + np.array([1, -1]) * now.values[1:3] / pitch
-    near = np.argmin(np.linalg.norm(arrows.XY - middle, axis=1))
-    assert shift[near] < 0.05 < 5.0 < shift.max()
 
 
 def test_epochs_as_a_dataset_written_and_read(epochs, tmp_path):

@@ -4,37 +4,23 @@ from __future__ import annotations
 
 from concurrent.futures import wait
 
-import gpiozero
 import pytest
 import yaml
-from gpiozero.pins.mock import MockFactory
 
 import thermocald as tc
 from tests.commands import answer, finish
-from thermocald.config import parse_config
-from thermocald.daemon.desk import Watch, take_on_the_desk
+from thermocald.daemon.desk import Watch
 from thermocald.daemon.plan import mock_config
 from thermocald.daemon.session import Session
-from thermocald.discovery.experiment import Separation
-from thermocald.store.database.store import Store
 
 PIN, LIMIT_C = 17, 45.0
 
 
 @pytest.fixture
-def pin(monkeypatch):
-    """The relay's pin, of gpiozero's mock."""
-    monkeypatch.setenv("GPIOZERO_PIN_FACTORY", "mock")
-    factory = MockFactory()
-    monkeypatch.setattr(gpiozero.Device, "pin_factory", factory)
-    yield factory.pin(PIN)
-    factory.close()
-
-
-@pytest.fixture
-def configure(tmp_path, monkeypatch, pin):
+def configure(tmp_path, monkeypatch):
     """Write config.yaml: the mock camera, a thermometer and a relay that heats."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GPIOZERO_PIN_FACTORY", "mock")
 
     def write(**changes):
         document = mock_config().model_dump(mode="json", by_alias=True)
@@ -45,7 +31,6 @@ def configure(tmp_path, monkeypatch, pin):
         }]  # fmt: skip
         document["cameras"][0]["period_s"] = 0.4
         (tmp_path / "config.yaml").write_text(yaml.safe_dump(document | changes))
-        return parse_config(document | changes, tmp_path / "config.yaml")
 
     return write
 
@@ -79,29 +64,6 @@ def test_what_cannot_be_planned_is_said(configure, arguments, said):
     result = run("creep,slip", *arguments.split())
     assert result.exit_code != 0
     assert said in str(result.exception or result.output)
-
-
-@pytest.mark.slow
-def test_the_session_heats_and_ends_when_they_are_separated(configure, pin, monkeypatch):
-    config, heated = configure(), []
-    camera = config.cameras[0].name
-    session = Session(
-        camera=camera, series="M1", epochs=60, check=False,
-        programme=[{"seconds": 600.0, "hold_c": 44.0}],
-    )  # fmt: skip
-    monkeypatch.setattr("thermocald.daemon.desk._FEWEST", 4)
-    watch = Watch(config.store.path, session, ("creep", "slip"), None, print)
-
-    def compare():
-        heated.append(pin.state)
-        return Separation("creep", "slip", 55.0, 14.0, True)
-
-    monkeypatch.setattr(watch, "_compare", compare)
-    take_on_the_desk(config, session, print, watch)
-    watch.close()
-    with Store.open(config.store.path) as store:
-        assert 4 <= store.last_epoch(store.find_series(camera, "M1")) < 60
-    assert (heated, pin.state, watch.ended) == ([1], 0, True)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import socket
@@ -12,6 +13,7 @@ from contextlib import closing, suppress
 import pytest
 
 from tests.commands import call, every_command, refuse
+from thermocald import cli
 from thermocald.cli import commands
 
 LOG = "--log M3/epochs.csv --model model.yaml"
@@ -194,3 +196,21 @@ def test_every_option_that_says_that_it_writes_is_looked_at():
         for one in command.params:
             if re.match(r"(Also )?[Ww]rite|The .* to write", getattr(one, "help", None) or ""):
                 assert {one.name, f"{name} {one.name}"} & set(commands._OUTPUTS)
+
+
+@pytest.mark.parametrize(
+    ("is_open", "why"), [(False, "read: Permission denied"), (True, "written")]
+)
+def test_an_input_in_a_closed_folder_cannot_be_read(monkeypatch, is_open, why):
+    """The tests may run as root, to whom no folder is closed."""
+
+    def denied(*_):
+        raise PermissionError(13, "Permission denied", "closed/recording.yaml")
+
+    monkeypatch.setattr(cli, "application", denied)
+    monkeypatch.setattr(cli.os, "access", lambda *_: is_open)
+    monkeypatch.setattr(cli.sys, "stdout", io.StringIO())  # will be closed
+    monkeypatch.setattr(cli.sys, "stderr", io.StringIO())
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    assert f"error: closed/recording.yaml: cannot be {why}" in cli.sys.stderr.getvalue()

@@ -62,8 +62,10 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(misfits, tmp_
             one["thermometer_sd_K"] = noise
         (tmp_path / "cam.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
         given = ("--log", misfits / "M3", "--model", tmp_path / "cam.yaml")
-        _, row = succeed("correct", tmp_path / "points.csv", *given).stdout.splitlines()
-        sds.append(float(row.split(",")[5]))
+        out = tmp_path / "out.csv"
+        done = succeed("correct", tmp_path / "points.csv", *given, "--out", out)
+        assert "1 point corrected" in done.stdout
+        sds.append(float(read_rows(out)[0]["sd_x"]))
     assert sds[1] > 5 * sds[0]
 
 

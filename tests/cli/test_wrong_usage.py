@@ -90,6 +90,7 @@ ONE_LINE = [
     (f"testfield survey photos {SCALE} --hold-camera", "needs --camera"),
     ("testfield survey photos --distances d.csv -o s.csv", "d.csv, line 3, column length"),
     ("calibrate photos --testfield M1/testfield.csv --camera colmap.txt", "--pixel-pitch"),
+    ("calibrate photos --testfield M1/testfield.csv --pixel-pitch 0.001", "no photograph has a"),
     ("predict --model model.yaml", "give one of"),
     ("predict --model model.yaml --temperature 30 --channel board", "write NAME=°C"),
     ("predict --model model.yaml --temperature 305", "if it is in kelvin, convert it"),

@@ -50,6 +50,13 @@ def finish(*arguments: object, folder: Path | None = None) -> subprocess.Complet
     return done
 
 
+def refuse(*arguments: object, status: int = 2, folder: Path | None = None) -> str:
+    """Return what a command that has to end with this status says, as one line."""
+    done = call(*arguments, folder=folder)
+    assert done.returncode == status, done.stderr
+    return " ".join(done.stderr.split())
+
+
 def document(*arguments: object, folder: Path | None = None) -> Any:
     """Return the JSON document of a command that has to end well, all of its standard output."""
     return json.loads(finish(*arguments, "--json", "-", folder=folder).stdout)

@@ -2,102 +2,57 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
+import os
 import shutil
-import subprocess
-import sys
 
 import cv2
 import pytest
 
-import thermocald as tc
-from tests.commands import call as run
-from tests.commands import document, finish
-from tests.pictures import write_markers
+from tests.commands import call, document, finish, refuse
+from tests.pictures import FOCAL, save_photograph, write_markers
 from tests.recordings import read_rows, write_rows
+from tests.store.small import change, create_small_series, small_epoch, small_result
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.store.database.store import Store
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    """Twenty-four epochs of a warming camera."""
-    folder = tmp_path_factory.mktemp("recording") / "M1"
-    tc.simulate("rpi-v2.1-heating", seed=1, epochs=24, out=folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def store(recording):
-    """A store of its epochs."""
-    path = recording.with_name("t.db")
-    finish("replay", recording, "--store", path)
-    return path
-
-
-def test_a_store_gives_what_is_stored(recording, store):
-    """The epochs are exported as they were adjusted, as on the dashboard: not adjusted again."""
-    from_store = run("export", store, "--format", "csv")
-    direct = run("export", recording, "--format", "csv")
-    assert from_store.returncode == direct.returncode == 0
-    a, b = (list(csv.DictReader(io.StringIO(d.stdout))) for d in (from_store, direct))
-    assert len(a) == len(b) == 24
-    assert [r["status"] for r in a] == [r["status"] for r in b] == ["ok"] * 24
-    with Store.open(store) as opened:
-        kept = opened.series_columns(opened.find_series(), ["c", "sd_c", "Z0", "sigma0"])
-    for name, column in kept.items():
-        assert [float(row[name]) for row in a] == column.tolist()
-    for mine, theirs in zip(a, b, strict=True):
-        assert abs(float(mine["c"]) - float(theirs["c"])) < 4 * float(mine["sd_c"])
-    assert a[0]["sd_C1"] == ""  # held fixed
-    refused = run("export", store, "--free", "c")
-    assert (refused.returncode, "stored epochs are not adj" in refused.stderr) == (2, True)
-
-
-def test_an_interrupted_replay_goes_on(recording, tmp_path):
+def test_an_interrupted_replay_goes_on(world, tmp_path):
     store = tmp_path / "t.db"
-    half = shutil.copytree(recording, tmp_path / "half")
+    half = shutil.copytree(world / "short", tmp_path / "half")
     for name in ("epochs.csv", "observations.csv"):
         rows = read_rows(half / name)
         write_rows(half / name, [row for row in rows if int(row["epoch"]) <= 12])
-    finish("replay", half, "--store", store)
-    assert document("check", store)["series"][0]["last_epoch"] == 12
-    finish("replay", recording, "--store", store)
-    assert document("check", store)["series"][0]["last_epoch"] == 24
+    for recording, last in ((half, 12), (world / "short", 24)):
+        finish("replay", recording, "--store", store)
+        assert document("check", store)["series"][0]["last_epoch"] == last
 
 
 @pytest.mark.parametrize("path", ["/proc/self/status", "/proc/1", "/sys", "/dev/null"])
 def test_the_system_s_files_are_nothing_to_check(path):
-    done = run("check", path)
-    assert done.returncode == 1
-    assert done.stderr.strip() == (
-        f"error: {path}: belongs to the system; give a recording, config.yaml or store"
-    )
+    said = f"error: {path}: belongs to the system; give a recording, config.yaml or store"
+    assert refuse("check", path, status=1) == said
 
 
 def test_a_store_below_proc_is_not_sound(tmp_path):
     (tmp_path / "config.yaml").write_text(
         "store: {path: /proc/self/t.db}\nthermometers: [{name: a, driver: mock}]\n"
     )
-    done = run("check", tmp_path / "config.yaml")
-    assert done.returncode == 2
-    assert "store.path: /proc/self/t.db: nothing can be stored there" in done.stderr
+    said = refuse("check", tmp_path / "config.yaml")
+    assert "store.path: /proc/self/t.db: nothing can be stored there" in said
 
 
-def test_export_of_several_series_names_the_option(recording, store, tmp_path):
-    other = tmp_path / "M2"
-    shutil.copytree(recording, other)
+def test_export_of_several_series_names_the_option(world, tmp_path):
+    other, store = shutil.copytree(world / "short", tmp_path / "M2"), tmp_path / "t.db"
     head = (other / "recording.yaml").read_text()
     (other / "recording.yaml").write_text(head.replace("series: M1", "series: M2"))
-    shutil.copy(store, tmp_path / "t.db")
-    finish("replay", other, "--store", tmp_path / "t.db")
-    done = run("export", tmp_path / "t.db")
-    assert done.returncode == 1
-    assert "several series fit" in done.stderr
-    assert "export selects one with --series CAMERA/SERIES" in done.stderr
-    finish("export", tmp_path / "t.db", "--series", "M2")
+    shutil.copy(world / "thermocald.db", store)
+    finish("replay", other, "--store", store)
+    said = refuse("export", store, status=1)
+    assert "several series fit" in said
+    assert "export selects one with --series CAMERA/SERIES" in said
+    finish("export", store, "--series", "M2")
+    assert "stored epochs are not adj" in refuse("export", store, "--series", "M2", "--free", "c")
 
 
 def test_photographs_of_markers_give_the_camera(tmp_path):
@@ -107,46 +62,51 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     images = [tmp_path / f"{k}.png" for k in range(3)]
     # the folder, and its pixel pitch by option; files for the next command and for people
     out, page = tmp_path / "found.json", tmp_path / "page.html"
-    done = finish("calibrate", tmp_path, "--testfield", tmp_path / "field.csv", "--pixel-pitch",
-               sensor.pixel_pitch, "--camera-out", out, "--report", page)  # fmt: skip
-    written = json.loads(out.read_text())
-    c, sd = written["interior"]["c"], written["interior"]["sd_c"]
-    assert abs(c - model.interior.c) < 4 * sd
+    field = ("--testfield", tmp_path / "field.csv")
+    done = finish("calibrate", tmp_path, *field, "--pixel-pitch", sensor.pixel_pitch,
+                  "--camera-out", out, "--report", page)  # fmt: skip
+    interior = json.loads(out.read_text())["interior"]
+    for name in ("c", "x0", "y0"):
+        assert abs(interior[name] - getattr(model.interior, name)) < 4 * interior[f"sd_{name}"]
     assert f"written: {out}" in done.stdout.replace("\n", "")
     for words in ("Residuals and coverage", "Made on", "3 of 3 photographs"):
         assert words in page.read_text(encoding="utf-8")
-    field = ("--testfield", tmp_path / "field.csv")
     held = document("calibrate", images[0], *field, "--camera", out, "--free", "none")
-    assert held["interior"]["c"] == c
+    assert held["interior"]["c"] == interior["c"]
 
     # a copy of a photograph adds no information, and neither does another encoding of it
-    (tmp_path / "camera.yaml").write_text(
-        f"name: mock\nwidth: {sensor.width}\nheight: {sensor.height}\n"
-        f"pixel_pitch: {sensor.pixel_pitch}\n"
-    )
-    copy = tmp_path / "copy.png"
-    copy.write_bytes(images[0].read_bytes())
-    smaller = tmp_path / "smaller.jpg"
-    cv2.imwrite(str(smaller), cv2.imread(str(images[1]), 0), [cv2.IMWRITE_JPEG_QUALITY, 95])
-    (tmp_path / "broken.jpg").write_bytes(b"no image")
-    (tmp_path / "empty.jpg").write_bytes(b"")
-    added = (copy, smaller, tmp_path / "broken.jpg", tmp_path / "empty.jpg")
-    camera = ("--camera", tmp_path / "camera.yaml")
-    result = document("calibrate", *images, *added, *field, *camera)
-    assert result["status"] == "ok"
-    assert [p["status"] for p in result["photographs"][:3]] == ["ok"] * 3
+    camera = tmp_path / "camera.yaml"
+    camera.write_text("name: mock\nwidth: 1640\nheight: 1232\npixel_pitch: 0.00224\n")
+    added = [tmp_path / name for name in ("copy.png", "smaller.jpg", "broken.jpg", "empty.jpg")]
+    added[0].write_bytes(images[0].read_bytes())
+    picture = cv2.imread(str(images[1]), 0)
+    cv2.imwrite(str(added[1]), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    added[2].write_bytes(b"no image")
+    added[3].write_bytes(b"")
+    result = document("calibrate", *images, *added, *field, "--camera", camera)
     for name in ("c", "x0", "y0"):
-        found, sd = result["interior"][name], result["interior"][f"sd_{name}"]
-        assert abs(found - getattr(model.interior, name)) < 4 * sd
-        assert found == written["interior"][name]
-        assert sd == written["interior"][f"sd_{name}"]
+        assert result["interior"][name] == interior[name]
+        assert result["interior"][f"sd_{name}"] == interior[f"sd_{name}"]
     assert len(result["correlations"]["matrix"]) == 8
-    assert result["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
-    again, broken, empty = result["photographs"][4:]
+    *measured, copy, again, broken, empty = result["photographs"]
+    assert [p["status"] for p in measured] == ["ok"] * 3
+    assert copy["reason"] == f"is a copy of {images[0].name}"
     assert again["status"] == broken["status"] == empty["status"] == "bad_image"
-    assert "0 bytes" in empty["reason"]
     assert again["reason"].startswith(f"shows the view of {images[1].name}, with the same errors")
     assert broken["reason"].startswith("is not an image")
+    assert "0 bytes" in empty["reason"]
+
+    # EXIF states another focal length, unless the camera file states the principal distance
+    folder = tmp_path / "zoomed"
+    folder.mkdir()
+    for image in images:
+        grey = cv2.imread(str(image), 0)
+        save_photograph(folder / f"{image.stem}.jpg", {FOCAL: 6.08}, grey, quality=95)
+    said = finish("calibrate", folder, *field).stdout
+    assert "pixel pitch is not known" in " ".join(said.split())
+    doubted = document("calibrate", folder, *field, "--pixel-pitch", sensor.pixel_pitch)
+    assert "the principal distance is" in doubted["doubts"][0]
+    assert document("calibrate", folder, *field, "--camera", out)["doubts"] == []
 
 
 @pytest.mark.slow
@@ -168,22 +128,56 @@ def test_the_demo_ends_with_the_hidden_effect(tmp_path):
     assert gap["after"]["chi2_reduced"] < 1.1 < gap["before"]["chi2_reduced"]
 
 
-def test_what_only_some_commands_need_is_imported_by_those():
-    """OpenCV, SciPy and Matplotlib are half of the page's memory and of a command's start; SciPy's
-    optimiser is 20 MB, and a camera as it is predicted, at a gauge, and in its series is without.
-    """
-    program = (
-        "import sys, thermocald.cli, thermocald.output.dashboard.application\n"
-        "thermocald.cli.application()\n"
-        "print(*sorted({'cv2', 'matplotlib', 'plotly', 'scipy'} & set(sys.modules)))\n"
-        "import thermocald as tc, thermocald.daemon.plan\n"
-        "import thermocald.analysis.thermal.gauge, thermocald.analysis.thermal.correction\n"
-        "import thermocald.analysis.online.running_series\n"
-        "import thermocald.analysis.series.adjusted\n"
-        "tc.load_camera\n"
-        "heavy = ('scipy.optimize', 'scipy.stats', 'scipy.spatial', 'scipy.integrate')\n"
-        "print(*sorted(set(heavy) & set(sys.modules)))"
-    )
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+@pytest.fixture
+def store_path(tmp_path):
+    path = tmp_path / "s.db"
+    with Store.open(path, "append", durable=False) as store:
+        series = create_small_series(store)
+        for k in (1, 2, 5):
+            store.append(series, small_epoch(k), small_result(k))
+    return path
+
+
+def test_a_backup_is_made_beside_a_writer_verified_and_old_ones_go(store_path, tmp_path):
+    folder = tmp_path / "backups"
+    folder.mkdir()
+    for name in ("s-20200101T000000Z.db", "s-20210101T000000Z.db", "s-mine.db"):
+        (folder / name).write_bytes(b"older, or not ours to delete")
+    with Store.open(store_path, "append") as writer:
+        series = writer.find_series()
+        writer.append(series, small_epoch(6))  # in the -wal file
+        done = document("backup", store_path, folder, "--keep", "2")
+    assert done["epochs"] == 4
+    assert [p.rsplit("/", 1)[1] for p in done["deleted"]] == ["s-20200101T000000Z.db"]
+    assert len(list(folder.glob("*.db"))) == 3
+    with Store.open(folder / done["backup"].rsplit("/", 1)[1], "append") as restored:
+        assert restored.last_epoch(restored.find_series()) == 6
+        assert restored._db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def test_a_folder_is_made_for_the_store_of_a_configuration(store_path, tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text(f"thermometers: [{{name: t, driver: mock}}]\nstore: {{path: {store_path}}}\n")
+    finish("backup", "--config", config, f"{tmp_path}/backups/", "--keep", "2")
+    assert len(list((tmp_path / "backups").glob("s-*Z.db"))) == 1
+
+
+def test_a_damaged_store_is_not_backed_up_and_check_names_the_place(store_path, tmp_path):
+    change(store_path, "UPDATE epoch SET c = c * 1.0001 WHERE number = 2")
+    for to in ("new/", "new/copy.db"):
+        assert "epoch 2" in refuse("backup", store_path, f"{tmp_path}/{to}", status=1)
+        assert list((tmp_path / "new").iterdir()) == []
+    done = call("check", store_path)
+    assert done.returncode == 1
+    assert "damaged: rpi/M1, epoch 2" in done.stdout
+    assert "rpi/M1: epochs 3 to 4 are missing (2)" in done.stdout
+
+
+def test_a_backup_is_never_written_over(store_path, tmp_path):
+    (tmp_path / "there.db").write_text("mine")
+    assert call("backup", store_path, tmp_path / "there.db").returncode == 1
+    assert (tmp_path / "there.db").read_text() == "mine"
+    assert call("backup", store_path, tmp_path / "away/there.db").returncode == 2
+    os.mkfifo(tmp_path / "pipe")
+    assert call("backup", store_path, tmp_path / "pipe").returncode == 1
+    assert (tmp_path / "pipe").is_fifo()

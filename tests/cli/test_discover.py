@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 
 import numpy as np
 import pytest
@@ -12,39 +11,25 @@ import yaml
 import thermocald as tc
 from tests.blind.case import Case
 from tests.blind.generator import generate, write
-from tests.commands import document, succeed
+from tests.cli.conftest import changed
+from tests.commands import document, invoke, succeed
+from tests.golden.workshop import PROGRAMME
 from thermocald.errors import DataError, UsageError
-
-PROGRAMME = """
-format: thermocald-programme/1
-name: one lamp cycle
-series: M1
-epochs: 50
-interval: 20.0
-ambient: 22.0
-sources:
-  housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 500, value: 6.0},
-            {from: 500, to: 1100, value: 0}]
-"""
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("blind")
-    series, _ = generate(Case(("thermal_lag",), 0.2, 31, epochs=60))
-    for s in series:
+    for s in generate(Case(("thermal_lag",), 0.2, 31, epochs=60))[0]:
         write(s, folder / s.name)
     return folder
-
-
-discover = partial(succeed, "discover")
 
 
 @pytest.fixture(scope="module")
 def found(recordings):
     """The result of M1 verified on M2, with model.yaml and report.html beside the recordings."""
-    return discover(
-        recordings / "M1", "--verify", recordings / "M2", "--json", "-", "--model-out",
+    return succeed(
+        "discover", recordings / "M1", "--verify", recordings / "M2", "--json", "-", "--model-out",
         recordings / "model.yaml", "--report", recordings / "report.html",
     )  # fmt: skip
 
@@ -52,19 +37,13 @@ def found(recordings):
 def test_everything_is_written(recordings, found):
     model, report = recordings / "model.yaml", recordings / "report.html"
     told = json.loads(found.stdout)
-    assert told["verdict"] == "effects_found"
     assert [e["effect"] for e in told["effects"]] == ["thermal_lag"]
     assert told["model"] == str(model)
-    assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
     page = report.read_text().replace("\u00a0", " ")
     assert page.count("<figure") == 5
-    assert "Could noise do this?" in page
-    assert "≤ 1/120" in page
-    assert "UTC, 60 epochs." in page
+    for words in ("Could noise do this?", "≤ 1/120", "UTC, 60 epochs."):
+        assert words in page
     assert "&lt;" not in page  # no object's repr in place of its text
-    assert "http://" not in page.replace("http://www.w3.org", "").replace(
-        "http://purl.org", ""
-    ).replace("http://creativecommons.org", "")
     assert told["effects"][0]["statement"][1:] in page
     stages = (
         "reading", "looking for targets", "measuring noise", "without a further effect",
@@ -86,24 +65,11 @@ def test_with_the_model_found_nothing_is_missing(recordings, found):
 
 
 def test_another_camera_is_refused(recordings, tmp_path):
-    other = ["nexus5", "rpi-v2.1", "galaxy-s8"]
-    own = yaml.safe_load((recordings / "M1" / "recording.yaml").read_text())["camera"]["name"]
-    other.remove(own)
-    series, _ = generate(Case((), 0.1, 3, epochs=30, camera=other[0], with_m2=False))
-    write(series[0], tmp_path / "M2")
+    changed(recordings / "M2", tmp_path / "M2", {"name": "another"})
     with pytest.raises(UsageError, match="M1 is missing"):
-        discover()
+        invoke("discover")
     with pytest.raises(DataError, match="another camera"):
-        discover(recordings / "M1", "--verify", tmp_path / "M2")
-
-
-@pytest.mark.slow
-def test_plan(tmp_path):
-    series, _ = generate(Case((), 0.1, 33, epochs=90, with_m2=False))
-    write(series[0], tmp_path / "quiet")
-    power = document("discover", "--plan", tmp_path / "quiet", "--strength", "0.2")["power"]
-    assert power["nonlinear_expansion"] == power["creep"] == 1.0
-    assert len(power) >= 15
+        invoke("discover", recordings / "M1", "--verify", tmp_path / "M2")
 
 
 @pytest.mark.slow
@@ -126,26 +92,9 @@ def test_plan_of_a_programme(recordings, found, tmp_path):
 
 
 @pytest.mark.slow
-def test_frames_are_measured_first(tmp_path):
-    from dataclasses import replace
-
-    from thermocald.physics.presets import preset_simulation
-
-    simulation = preset_simulation("rpi-v2.1-heating", 3)
-    programme = replace(simulation.programme, epochs=22, interval=60.0)
-    replace(simulation, programme=programme).write(tmp_path / "M1", with_frames=True)
-
-    result = discover(tmp_path / "M1", "--json", "-")
-
-    assert "measuring the 22 frames" in result.stderr
-    assert json.loads(result.stdout)["gap"]["fit"]["before"]["rms_px"] < 1.0
-
-
-@pytest.mark.slow
 def test_an_unexplained_misfit_is_bridged_in_the_model(tmp_path):
     series, _ = generate(Case(("outside",), 0.3, 34, epochs=60, with_m2=False))
     write(series[0], tmp_path / "M1")
-
     found = document("discover", tmp_path / "M1", "--model-out", tmp_path / "m.yaml")
     (entry,) = found["effects"]
     assert entry["effect"] == "unnamed"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 
@@ -10,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.commands import call as run
 from tests.commands import document, finish
-from tests.golden.workshop import walls
+from tests.recordings import read_rows
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -42,13 +40,6 @@ def test_fixed_cameras(shared, camera, exterior):
     assert [p["name"] for p in found["parameters"]] == ["c", "x0", "y0"]
 
 
-def test_without_a_camera_tags_on_walls_give_nothing(shared, tmp_path):
-    walls(tmp_path)
-    done = run("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv")
-    assert done.returncode == 1
-    assert "error: no photograph has a result" in done.stderr
-
-
 def test_a_hand_held_board_is_called_weak(shared):
     """Residuals are sub-pixel, all views within some degrees of frontal."""
     folder = shared / "data" / "charuco"
@@ -56,12 +47,9 @@ def test_a_hand_held_board_is_called_weak(shared):
         (12, 8), 15.5864, 12.1227, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
     )
     detector = cv2.aruco.CharucoDetector(board)
-    with (folder / "targets.csv").open() as source:
-        rows = list(csv.DictReader(source))
-    field = TestField.build(
-        [r["charuco_corner_id"] for r in rows],
-        [[float(r[k]) for k in ("X_mm", "Y_mm", "Z_mm")] for r in rows],
-    )
+    rows = read_rows(folder / "targets.csv")
+    points = [[float(row[k]) for k in ("X_mm", "Y_mm", "Z_mm")] for row in rows]
+    field = TestField.build([row["charuco_corner_id"] for row in rows], points)
     video = cv2.VideoCapture(str(folder / "testcalibration.mp4"))
     measured = []
     for _ in range(3):
@@ -93,16 +81,14 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     others = {
         "a_turned": cv2.rotate(images["f090.jpg"], cv2.ROTATE_90_CLOCKWISE),
         "b_upside_down": cv2.rotate(images["f090.jpg"], cv2.ROTATE_180),
-        "c_cut": cut,
-        "d_rolling_shutter": bent,
-        "e_nothing": np.full((720, 1280), 128, np.uint8),
-    }
+        "c_cut": cut, "d_rolling_shutter": bent, "e_nothing": np.full((720, 1280), 128, np.uint8),
+    }  # fmt: skip
     for name, image in others.items():
         cv2.imwrite(str(folder / f"{name}.jpg"), image)
     (folder / "f_text.jpg").write_text("no image")
     (folder / "._f090.jpg").write_text("of macOS")
     board = tmp_path / "board.csv"
-    run("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
+    finish("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
     report = tmp_path / "report.html"
     paths = ("--testfield", board, "--report", report)
     found = document("calibrate", folder, *paths, "--pixel-pitch", 0.003)

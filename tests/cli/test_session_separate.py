@@ -2,48 +2,46 @@
 
 from __future__ import annotations
 
+from concurrent.futures import wait
+
 import pytest
 import yaml
 
-from tests.commands import answer
-from thermocald.config import parse_config
-from thermocald.daemon.desk import Watch, take_on_the_desk
+import thermocald as tc
+from tests.commands import answer, finish
+from thermocald.daemon.desk import Watch
 from thermocald.daemon.plan import mock_config
 from thermocald.daemon.session import Session
-from thermocald.discovery.experiment import Separation
-from thermocald.store.database.store import Store
 
 PIN, LIMIT_C = 17, 45.0
 
 
-def heated(folder, period_s):
-    """The configuration of the mock camera, a thermometer and a relay that heats."""
-    document = mock_config().model_dump(mode="json", by_alias=True)
-    document["store"]["path"] = str(folder / "t.db")
-    document["outputs"] = [{
-        "name": "lamp", "driver": "relay", "pin": PIN, "limit_c": LIMIT_C,
-        "programme": [{"seconds": 1, "hold_c": None}],
-    }]  # fmt: skip
-    document["cameras"][0]["period_s"] = period_s
-    return document
-
-
 @pytest.fixture
-def config(tmp_path, monkeypatch):
-    """Run it on mock pins, with epochs as fast as possible."""
-    monkeypatch.setenv("GPIOZERO_PIN_FACTORY", "mock")
+def configure(tmp_path, monkeypatch):
+    """Write config.yaml: the mock camera, a thermometer and a relay that heats."""
     monkeypatch.chdir(tmp_path)
-    document = heated(tmp_path, 0.4)
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
-    return parse_config(document, tmp_path / "config.yaml")
+    monkeypatch.setenv("GPIOZERO_PIN_FACTORY", "mock")
+
+    def write(**changes):
+        document = mock_config().model_dump(mode="json", by_alias=True)
+        document["store"]["path"] = str(tmp_path / "t.db")
+        document["outputs"] = [{
+            "name": "lamp", "driver": "relay", "pin": PIN, "limit_c": LIMIT_C,
+            "programme": [{"seconds": 1, "hold_c": None}],
+        }]  # fmt: skip
+        document["cameras"][0]["period_s"] = 0.4
+        (tmp_path / "config.yaml").write_text(yaml.safe_dump(document | changes))
+
+    return write
 
 
 def run(*arguments):
-    return answer("session", "start", "--epochs", 4500, *arguments)
+    return answer("session", "start", "--epochs", 4500, "--until-separated", *arguments)
 
 
-def test_a_dry_run_prints_a_programme_that_a_session_takes(config, tmp_path):
-    result = run("--until-separated", "permanent_set,self_heating", "--dry-run", "--max-rate", "2")
+def test_a_dry_run_prints_a_programme_that_a_session_takes(configure, tmp_path):
+    configure()
+    result = run("permanent_set,self_heating", "--dry-run", "--max-rate", "2")
     assert result.exit_code == 0, result.output
     steps = yaml.safe_load(result.stdout)["programme"]
     session = Session(camera="mock", series="M1", epochs=5, programme=[
@@ -56,55 +54,30 @@ def test_a_dry_run_prints_a_programme_that_a_session_takes(config, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--until-separated", "creep"], "give two different effects"),
-        (["--dry-run"], "--dry-run needs --until-separated"),
-        (["--until-separated", "creep,slip", "--max-temperature", "23"],
-         "0.5 K of warming above 22.0 °C; 5 K"),
-        (["--until-separated", "creep,slip", "--epochs", "50"],
-         "50 epochs of 0.4 s are 0 min; heat needs 15 min"),
+        ("--max-temperature 23", "0.5 K of warming above 22.0 °C; 5 K"),
+        ("--epochs 50", "50 epochs of 0.4 s are 0 min; heat needs 15 min"),
+        ("--dry-run", "no output of the configuration heats"),
     ],
-)  # fmt: skip
-def test_wrong_usage_is_said(config, arguments, said):
-    result = run(*arguments)
+)
+def test_what_cannot_be_planned_is_said(configure, arguments, said):
+    configure(**({"outputs": []} if arguments == "--dry-run" else {}))
+    result = run("creep,slip", *arguments.split())
     assert result.exit_code != 0
     assert said in str(result.exception or result.output)
 
 
-def test_without_a_heater_there_is_nothing_to_plan(config, tmp_path):
-    document = yaml.safe_load((tmp_path / "config.yaml").read_text())
-    document["outputs"] = []
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
-    result = run("--until-separated", "creep,slip", "--dry-run")
-    assert "no output of the configuration heats" in str(result.exception or result.output)
-
-
 @pytest.mark.slow
-def test_the_session_heats_and_ends_when_they_are_separated(config, tmp_path, monkeypatch):
-    from gpiozero import Device
-
-    camera = config.cameras[0].name
-    session = Session(
-        camera=camera, series="M1", epochs=60, check=False,
-        programme=[{"seconds": 600.0, "hold_c": 44.0}],
-    )  # fmt: skip
-    seen, heated = [], []
-    monkeypatch.setattr("thermocald.daemon.desk._FEWEST", 4)
-    watch = Watch(config.store.path, session, ("creep", "slip"), None, print)
-
-    def compared():
-        with Store.open(config.store.path) as store:
-            seen.append(store.last_epoch(store.find_series(camera, "M1")))
-        heated.append(Device.pin_factory.pin(17).state)
-        return Separation("creep", "slip", 55.0, 14.0, True)
-
-    monkeypatch.setattr(watch, "_compare", compared)
-    take_on_the_desk(config, session, print, watch)
+def test_a_watch_ends_a_session_when_the_stored_epochs_separate_the_effects(tmp_path):
+    """Only the program itself compares the effects."""
+    true = {"permanent_set": {"c": 1e-5, "x0": 6e-5, "y0": 4e-5}}
+    tc.simulate("rpi-v2.1-heating", effects=true, own_effects=False, out=tmp_path / "M1")
+    finish("replay", tmp_path / "M1", "--store", tmp_path / "t.db")
+    session = Session(camera="rpi-v2.1", series="M1", epochs=150, check=False)
+    said = []
+    watch = Watch(tmp_path / "t.db", session, ("creep", "permanent_set"), None, said.append)
+    watch.look(150)
+    wait([watch._pending])
+    assert watch.look(150)
     watch.close()
-
-    with Store.open(config.store.path) as store:
-        taken = store.last_epoch(store.find_series(camera, "M1"))
-    assert seen
-    assert 4 <= taken < 60
-    assert heated == [1]
-    assert Device.pin_factory.pin(17).state == 0
-    assert watch.ended
+    assert watch.found.better == "permanent_set"
+    assert "creep is excluded" in " ".join(said)

@@ -1,4 +1,4 @@
-"""`status` and `top`: readable at 80 columns and in a pipe; `q` leaves `top`."""
+"""`status` and `top` at 80 columns and in a pipe, and other texts; `q` leaves `top`."""
 
 from __future__ import annotations
 
@@ -10,46 +10,46 @@ import termios
 
 import pytest
 
+from tests.commands import succeed
 from thermocald.analysis.online.observer import Equilibrium
-from thermocald.cli import run
+from thermocald.cli import common, run
 from thermocald.cli.run import WIDTH, status_lines
+from thermocald.daemon.desk import Follower
 from thermocald.daemon.live_state import status_warnings
+from thermocald.daemon.session import Session
+from thermocald.errors import ThermocaldError, UsageError
+from thermocald.numbers import duration
 
 LONG = "/srv/recordings/2026/under-the-old-bridge/second-arch/thermocald-left-bank.db"
+PROBE = "/sys/bus/w1/devices/28-000000bfe244/temperature"
+DRIFTING = Equilibrium("drifting", 1.1085, 0.0014757, 754.0, 0.4).sentence
+LAST = {
+    "epoch": 12345, "temperature": 27.4375, "status": "ok", "sigma0": 1.179,
+    "c": 3.040494087, "x0": 0.010896880, "y0": -0.0187439, "sd_c": 0.0003011,
+    "sd_x0": 0.00050576, "sd_y0": 0.00049938, "drift_c_px": 0.3755, "sd_drift_c_px": 0.325,
+    "online": {"sentence": DRIFTING,
+               "orientation": "the mount moves by 0.032 px about one orientation (101 epochs)"},
+}  # fmt: skip
+FEW = {"status": "too_few", "reason": f"only 3 targets are found in the frame {LONG}/17.jpg"}
+CAMERA = {
+    "series": "watch", "device": "open", "lost": 0, "skipped": 2, "late_p99_s": 0.0431, "why": "",
+    "deferred": 0, "caught_up": 0,
+}  # fmt: skip
+FULL = {"state": "waiting", "why": f"{LONG}: disk is full", "waiting": 3, "lost": 0}
 
 
-def camera(**changes):
-    last = {
-        "epoch": 12345, "temperature": 27.4375, "status": "ok", "sigma0": 1.179,
-        "c": 3.040494087, "x0": 0.010896880, "y0": -0.0187439, "sd_c": 0.0003011,
-        "sd_x0": 0.00050576, "sd_y0": 0.00049938, "drift_c_px": 0.3755, "sd_drift_c_px": 0.325,
-        "drift_x0_px": -0.8287, "sd_drift_x0_px": 0.5458,
-        "online": {"sentence": Equilibrium("drifting", 1.1085, 0.0014757, 754.0, 0.4).sentence,
-                   "orientation": "the mount moves by 0.032 px about one orientation (101 epochs)"},
-        **changes,
-    }  # fmt: skip
-    return {
-        "series": "watch", "device": "open", "last": last, "lost": 0, "skipped": 2,
-        "late_p99_s": 0.0431, "why": "", "deferred": 0, "caught_up": 0,
-    }  # fmt: skip
-
-
-def document(**changes):
-    gone = camera(status="too_few", reason=f"only 3 targets are found in the frame {LONG}/17.jpg")
+def document(store=FULL):
+    gone = {"device": "waiting", "last": {}, "faults": 1, "why": f"{PROBE} is gone since 12:04"}
     status = {
         "version": "0.1.0", "pid": 30190, "utc": 1e9 + 95.0, "started": 1e9, "age_s": 0.4,
         "stalled": [], "sessions": {}, "clock": {"trusted": False}, "frames": {"paused": ""},
-        "store": {"state": "waiting", "why": f"{LONG}: database or disk is full", "waiting": 3,
-                  "lost": 0},
-        "cameras": {"pi-under-the-bridge": camera(), "a-phone-with-a-long-name": gone},
+        "cameras": {"pi-under-the-bridge": CAMERA | {"last": LAST},
+                    "a-phone-with-a-long-name": CAMERA | {"last": LAST | FEW}},
         "thermometers": {
             "housing": {"device": "open", "last": {"temperature": 27.5}, "faults": 0, "why": ""},
-            "second-arch-downstream": {
-                "device": "waiting", "last": {}, "faults": 1,
-                "why": "/sys/bus/w1/devices/28-000000bfe244/temperature is gone since 12:04",
-            },
+            "second-arch-downstream": gone,
         },
-        "outputs": {}, **changes,
+        "store": store, "outputs": {},
     }  # fmt: skip
     return status | {"warnings": status_warnings(status)}
 
@@ -59,7 +59,7 @@ def test_status_fits_into_80_columns_and_breaks_no_path():
     assert all(len(line) <= WIDTH for line in lines if "/" not in line)
     text = "\n".join(lines)
     assert LONG in text
-    assert "/sys/bus/w1/devices/28-000000bfe244/temperature" in text
+    assert PROBE in text
     assert "…" not in text
     assert "pi-under-the-bridge/watch: open, epoch 12345 at 27.44 °C" in lines
     assert "  c  3.04049 ± 0.00030 mm         moved 0.38 ± 0.33 px since the start" in lines
@@ -69,11 +69,7 @@ def test_status_fits_into_80_columns_and_breaks_no_path():
     # a drift has the digits of its sd: it was `1.11 ± 0.00 px/min`, `ready in about 13 ± 0 min`
     assert "drifting 1.1085 ± 0.0015 px/min, ready in about 12.5667 ± 0.0067 min" in text
     assert Equilibrium("ready", 0.0123, 0.0041).sentence == "ready: 0.0123 ± 0.0041 px/min"
-
-
-def test_a_disk_nearly_full_is_told_in_words():
-    """It was `store: results_only:  (0 epochs wait)`."""
-    little = document(store={"state": "results_only", "why": "", "waiting": 0, "lost": 0})
+    little = document({"state": "results_only", "why": "", "waiting": 0, "lost": 0})
     assert "! store: its disk is nearly full: results are stored" in "\n".join(status_lines(little))
 
 
@@ -81,11 +77,10 @@ def test_a_disk_nearly_full_is_told_in_words():
 def terminal(monkeypatch):
     """A keyboard: what is written to it is typed."""
     master, slave = pty.openpty()
-    with os.fdopen(slave, "rb", buffering=0, closefd=False) as stdin:
+    with os.fdopen(slave, "rb", buffering=0) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
         yield master, slave
     os.close(master)
-    os.close(slave)
 
 
 def test_q_leaves_top_and_the_terminal_is_as_before(terminal, monkeypatch):
@@ -110,18 +105,47 @@ def test_q_leaves_top_and_the_terminal_is_as_before(terminal, monkeypatch):
 
 
 def test_top_in_a_pipe_writes_lines_until_it_ends(monkeypatch, capsys):
-    left = iter([document(), document()])
-
-    def read(*_):
-        try:
-            return next(left)
-        except StopIteration:
-            raise KeyboardInterrupt from None
-
-    monkeypatch.setattr(run, "read_status", read)
+    left = [document(), document()]
+    monkeypatch.setattr(run, "read_status", lambda *_: left.pop())
     monkeypatch.delenv("FORCE_COLOR", raising=False)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(IndexError):
         run.top(interval=0.01)
     said = capsys.readouterr().out
     assert said.count("thermocald 0.1.0, pid 30190") == 2
     assert "\x1b" not in said
+
+
+def test_durations_are_as_a_person_says_them():
+    """Wrong forms were `in 1 minutes` and `for 0.0 h`."""
+    said = [duration(seconds) for seconds in (0, 1, 42, 89, 1500, 7200, 12 * 86400)]
+    assert said == [
+        "0 seconds", "1 second", "42 seconds", "1 minute", "25 minutes", "2.0 hours", "12 days"
+    ]  # fmt: skip
+
+
+def test_the_line_of_a_session_stays_one_line(monkeypatch):
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", terminal)
+    monkeypatch.setenv("COLUMNS", "80")
+    one = {"found": [], "last": LAST, "state": "running", "why": "", "taken": 1}
+    Follower(Session(camera="a", series="M1", epochs=150), print).follow(one)
+    line = terminal.getvalue().removeprefix("\r\x1b[K")
+    assert len(line) == 79
+    assert "c 3.04049 ± 0.00030 mm" in line
+
+
+def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path):
+    places = (tmp_path / "config.yaml", tmp_path / "etc.yaml")
+    monkeypatch.setattr(common, "CONFIG_PLACES", places)
+    for command, given in (
+        ("status", ".* --store FILE"), ("run", "one of --config FILE, --mock"),
+        ("session status", "--config FILE$"), ("session start", "--config FILE, or --mock$"),
+    ):  # fmt: skip
+        neither = rf"neither \./config\.yaml nor /etc/thermocald/config\.yaml; give {given}"
+        with pytest.raises(UsageError, match=neither):
+            succeed(*command.split())
+    for place, store in ((places[1], "there.db"), (places[0], "here.db")):
+        place.write_text(f"store: {{path: {store}}}\nthermometers: [{{name: h, driver: mock}}]\n")
+        with pytest.raises(ThermocaldError, match=f"no daemon runs for .*/{store}"):
+            succeed("status")

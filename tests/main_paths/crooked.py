@@ -82,41 +82,40 @@ def head_of(name: str, camera: str, size: tuple[int, int], pitch: float) -> dict
     }  # fmt: skip
 
 
-KINDS = ("surveyed", "badly_surveyed", "knocked", "trembling")
+# rows of targets; errors of the survey, mm, as they are and as stated; constant error of images, px
+KINDS = {
+    "surveyed": (11, 0.002, 0.002, 0.04),
+    "badly_surveyed": (7, 0.4, 0.15, 0.01),
+    "knocked": (7, 0.02, 0.02, 0.01),
+    "trembling": (7, 0.02, 0.02, 0.01),
+}
 
 
 def write(folder: Path, kind: str, seed: int, epochs: int = 70) -> dict[str, np.ndarray]:
     """Write a recording of one kind; return the true c, x0, y0 (epochs,) mm.
 
-    surveyed: to 2 µm, but each target's image has a constant error of 0.04 px, like edges of
-    prints; badly_surveyed: errors of 0.4 mm instead of the stated 0.15 mm, boards hidden at times;
-    knocked: the camera is turned by 0.03° at two thirds, two targets wander; trembling: the mount
-    moves by 0.06 px, mostly slowly.
+    surveyed: each target's image has a constant error, like edges of prints; badly_surveyed: boards
+    are hidden at times; knocked: the camera is turned by 0.03° at two thirds, two targets wander;
+    trembling: the mount moves by 0.06 px, mostly slowly.
     """
-    rng = np.random.default_rng([seed, KINDS.index(kind)])
-    field = corner(11 if kind == "surveyed" else 7, rng, crooked_mm=3.0)
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    rows, wrong_mm, stated_mm, bias_px = KINDS[kind]
+    field = corner(rows, rng, crooked_mm=3.0)
     targets = len(field)
-    stated = np.full(3, {"surveyed": 0.002, "badly_surveyed": 0.15}.get(kind, 0.02))
-    wrong = {"surveyed": 0.002, "badly_surveyed": 0.4}.get(kind, 0.02)
-    known = field + rng.normal(0, wrong, field.shape)
-    bias = rng.normal(0, 0.04 if kind == "surveyed" else 0.01, (targets, 2))
-    pose = pose_before(1500.0)
+    known = field + rng.normal(0, wrong_mm, field.shape)
+    bias = rng.normal(0, bias_px, (targets, 2))
     time = 1.7e9 + 10.0 * np.arange(epochs)
-    warm = 1 - np.exp(-np.arange(epochs) / (epochs / 4))
-    temperature = 24.0 + 9.0 * warm
-    truth = {
-        "c": CAMERA["c"] + 0.4e-3 * (temperature - 24),
-        "x0": CAMERA["x0"] + 0.35e-3 * (temperature - 24),
-        "y0": CAMERA["y0"] - 0.2e-3 * (temperature - 24),
-    }
-    tremble = np.zeros((epochs, 2))
+    temperature = 33.0 - 9.0 * np.exp(-np.arange(epochs) / (epochs / 4))
+    truth = interior_at(temperature, CAMERA["x0"], CAMERA["y0"])
+    pose = np.tile(pose_before(1500.0), (epochs, 1))
     if kind == "trembling":
         angle = 0.06 * PITCH / CAMERA["c"]
-        tremble = angle * np.column_stack(
+        pose[:, :2] += angle * np.column_stack(
             [0.9 * smooth(rng, epochs, 15.0) + 0.4 * rng.normal(size=epochs) for _ in range(2)]
         )
     wander = np.zeros((epochs, targets, 2))
     if kind == "knocked":
+        pose[2 * epochs // 3 :, 0] += np.deg2rad(0.03)
         for t in rng.choice(targets, 2, replace=False):
             wander[:, t, :] = 0.3 * np.column_stack([smooth(rng, epochs, 25.0) for _ in range(2)])
     board = np.arange(targets) // 7
@@ -127,22 +126,25 @@ def write(folder: Path, kind: str, seed: int, epochs: int = 70) -> dict[str, np.
                 hidden[first : first + rng.integers(3, 12), board == b] = True
     heads, observations = [], []
     for e in range(epochs):
-        moved = pose.copy()
-        moved[:2] += tremble[e]
-        if kind == "knocked" and e >= 2 * epochs // 3:
-            moved[0] += np.deg2rad(0.03)
         read = np.round((temperature[e] + rng.normal(0, 0.03)) / 0.0625) * 0.0625
         heads.append([e + 1, f"{time[e]:.3f}", f"{time[e]:.3f}", read, ""])
-        image = project(field, moved, *(truth[p][e] for p in ("c", "x0", "y0")))
+        image = project(field, pose[e], *(values[e] for values in truth.values()))
         image += bias + wander[e] + rng.normal(0, NOISE_PX, (targets, 2))
         inside = ((image > 5) & (image < np.array(SIZE) - 6)).all(axis=1)
         for t in np.flatnonzero(inside & ~hidden[e]):
             u, v = image[t]
             observations.append([e + 1, f"t{t}", f"{u:.4f}", f"{v:.4f}", NOISE_PX, NOISE_PX])
-    rows = [[f"t{t}", *(f"{v:.5f}" for v in known[t]), 20.0, *stated] for t in range(targets)]
+    sds = [stated_mm] * 3
+    field_rows = [[f"t{t}", *(f"{v:.5f}" for v in known[t]), 20.0, *sds] for t in range(targets)]
     head = head_of(f"{kind}-{seed}", f"crooked-{kind}", SIZE, PITCH)
-    write_recording(folder, head, heads, observations, rows)
+    write_recording(folder, head, heads, observations, field_rows)
     return truth
+
+
+def interior_at(temperature: np.ndarray, x0: float, y0: float) -> dict[str, np.ndarray]:
+    """Return the true c, x0, y0, mm, of a camera with these x0 and y0 at 24 °C."""
+    warm = temperature - 24.0
+    return {"c": 3.04 + 0.4e-3 * warm, "x0": x0 + 0.35e-3 * warm, "y0": y0 - 0.2e-3 * warm}
 
 
 def write_frames(folder: Path, epochs: int, seed: int) -> dict[str, np.ndarray]:
@@ -158,21 +160,15 @@ def write_frames(folder: Path, epochs: int, seed: int) -> dict[str, np.ndarray]:
     scene = Scene(sensor, field)
     known = replace(field, points=field.points + rng.normal(0, 0.002, field.points.shape))
     temperature = 24.0 + 0.5 * np.arange(epochs)
-    truth = {
-        "c": 3.04 + 0.4e-3 * (temperature - 24),
-        "x0": 0.012 + 0.35e-3 * (temperature - 24),
-        "y0": -0.021 - 0.2e-3 * (temperature - 24),
-    }
+    truth = interior_at(temperature, 0.012, -0.021)
     (folder / "frames").mkdir(parents=True)
     heads = []
     for e in range(epochs):
         iop = np.zeros(10)
-        iop[:3] = truth["c"][e], truth["x0"][e], truth["y0"][e]
-        iop[3] = CAMERA["A1"]
-        name = f"frames/{e + 1:04}.jpg"
+        iop[:4] = *(values[e] for values in truth.values()), CAMERA["A1"]
+        name, time = f"frames/{e + 1:04}.jpg", 1.7e9 + 10.0 * e
         picture = scene.render(iop, view, None, [seed, e])
         cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
-        time = 1.7e9 + 10.0 * e
         heads.append([e + 1, time, time, f"{temperature[e]:.3f}", name])
     head = head_of(f"frames-{seed}", "bent", (sensor.width, sensor.height), sensor.pixel_pitch)
     head["temperatures"] = {"temperature": {"unit": "degC"}}  # without a stated resolution

@@ -6,21 +6,21 @@ is that of a user with a folder of photographs and a logger.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 import thermocald as tc
 from tests.commands import call
 from tests.main_paths import crooked
 from tests.marks import mostly_slow
+from tests.pictures import FOCAL, MODEL, TAKEN, save_photograph
 from tests.recordings import read_rows, write_rows
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
@@ -33,6 +33,11 @@ def run(*arguments: object, status: int = 0):
     assert done.returncode == status, done.stderr
     assert "Warning:" not in done.stderr
     return done
+
+
+def result(*arguments: object):
+    """Return the JSON document of a command."""
+    return json.loads(run(*arguments, "--json", "-").stdout)
 
 
 def with_temperature(recording: Path, out: Path, first: int, last: int) -> Path:
@@ -54,15 +59,11 @@ def with_temperature(recording: Path, out: Path, first: int, last: int) -> Path:
 def test_without_a_temperature(shared, tmp_path, camera):
     """Commands that need a thermometer end with a one-line error; the others give results."""
     recording = shared / "data" / camera
-    checked = run("check", recording)
-    assert "101" in checked.stdout
-    replayed = json.loads(run("replay", recording, "--json", "-").stdout)
-    assert replayed["ok"] >= 100
+    assert "101" in run("check", recording).stdout
+    assert result("replay", recording)["ok"] >= 100
     for command in (("fit", recording, "-o", tmp_path / "m.yaml"), ("discover", recording)):
         refused = run(*command, status=1)
-        last = refused.stderr.strip().splitlines()[-1]
-        assert last.startswith("error: ")
-        assert "temperature" in last
+        assert re.search(r"\nerror: .*temperature.*\n$", f"\n{refused.stderr}")
         assert refused.stdout == ""
     assert not (tmp_path / "m.yaml").exists()
 
@@ -72,17 +73,15 @@ def test_a_recording_without_thermal_effects(shared, tmp_path, camera):
     """No drift, no rate and no effect are found."""
     m1 = with_temperature(shared / "data" / camera, tmp_path / "M1", 0, 50)
     m2 = with_temperature(shared / "data" / camera, tmp_path / "M2", 50, 101)
-    study = json.loads(run("study", m1, m2, "--sets", 2000, "--json", "-").stdout)
+    study = result("study", m1, m2, "--sets", 2000)
     assert [len(camera["series"]) for camera in study["cameras"]] == [2]
-    found = json.loads(run("discover", m1, "--verify", m2, "--json", "-").stdout)
+    found = result("discover", m1, "--verify", m2)
     names = {e["effect"] for e in found["effects"]}
     assert names <= {"target_displacement", "mount_motion"}, found["verdict"]
     model = tmp_path / "camera.thermal.yaml"
-    fitted = json.loads(run("fit", m1, m2, "-o", model, "--json", "-").stdout)
-    for name, rate in fitted["rates"].items():
+    for name, rate in result("fit", m1, m2, "-o", model)["rates"].items():
         assert abs(rate["value"]) < 4 * rate["sd"], f"{name} {rate}"
-    predicted = run("predict", "--model", model, "--temperature", 28, "--json", "-")
-    assert json.loads(predicted.stdout)
+    assert result("predict", "--model", model, "--temperature", 28)
 
 
 @pytest.fixture(scope="module")
@@ -92,22 +91,18 @@ def photographs(tmp_path_factory):
     truth = crooked.write_frames(folder / "frames", 6, seed=4)
     photos = folder / "photos"
     photos.mkdir()
-    heads = read_rows(folder / "frames" / "epochs.csv")
-    with (folder / "logger.csv").open("w", newline="") as out:
-        log = csv.writer(out, delimiter=";")
-        log.writerow(["Datum", "Uhrzeit", "Temperatur [°C]", "Feuchte [%]"])
-        for k in range(-6, 3 * len(heads) + 6):
-            moment = datetime.fromtimestamp(1.7e9 + k * 10 / 3, UTC)
-            log.writerow([moment.strftime("%d.%m.%Y"), moment.strftime("%H:%M:%S"),
-                          f"{24 + 0.05 * k * 10 / 3:.2f}".replace(".", ","), "45,1"])  # fmt: skip
-    for head in heads:
+    rows = []
+    for k in range(-6, 24):
+        moment = datetime.fromtimestamp(1.7e9 + k * 10 / 3, UTC)
+        degrees = f"{24 + 0.05 * k * 10 / 3:.2f}".replace(".", ",")
+        rows.append(f"{moment:%d.%m.%Y};{moment:%H:%M:%S};{degrees};45,1")
+    log = "\n".join(["Datum;Uhrzeit;Temperatur [°C];Feuchte [%]", *rows, ""])
+    (folder / "logger.csv").write_text(log)
+    for head in read_rows(folder / "frames" / "epochs.csv"):
         moment = datetime.fromtimestamp(float(head["frame_time"]), UTC)
-        with Image.open(folder / "frames" / head["frame"]) as image:
-            exif = image.getexif()
-            exif.get_ifd(0x8769)[0x9003] = moment.strftime("%Y:%m:%d %H:%M:%S")
-            exif.get_ifd(0x8769)[0x920A] = 3.04
-            exif[0x0110] = "bent"
-            image.save(photos / Path(head["frame"]).name, exif=exif, quality=95)
+        grey = cv2.imread(str(folder / "frames" / head["frame"]), cv2.IMREAD_GRAYSCALE)
+        tags = {TAKEN: f"{moment:%Y:%m:%d %H:%M:%S}", FOCAL: 3.04, MODEL: "bent"}
+        save_photograph(photos / Path(head["frame"]).name, tags, grey, quality=95)
     return folder, truth
 
 
@@ -121,8 +116,7 @@ def test_photographs_and_a_logger(photographs, undrawn, tmp_path):
     )  # fmt: skip
     assert "6 epochs" in taken.stdout
     # the frames are measured once
-    replayed = json.loads(run("replay", m1, "--store", store, "--json", "-").stdout)
-    assert replayed["ok"] == 6
+    assert result("replay", m1, "--store", store)["ok"] == 6
     run("export", store, "-o", tmp_path / "rows.csv", "--exterior", "series")
     rows = read_rows(tmp_path / "rows.csv")
     for name in ("c", "x0", "y0"):
@@ -185,11 +179,8 @@ def test_exchanged_names_of_targets(plain, tmp_path):
     found, sd_found, of_fit = rate_of_c(exchanged, tmp_path / "camera.yaml")
     assert abs(found - whole) < sd
     assert sd_found < 1.5 * sd
-    printed = {"fit": of_fit}
-    for command in ("check", "replay"):
-        done = run(command, exchanged)
-        printed[command] = done.stdout + done.stderr
-    for command, text in printed.items():
+    done = [run(command, exchanged) for command in ("check", "replay")]
+    for text in (of_fit, *(one.stdout + one.stderr for one in done)):
         exchange = r"x22 4\d\d px, y37 4\d\d px off; their names look exchanged"
-        assert re.search(exchange, " ".join(text.split())), command
+        assert re.search(exchange, " ".join(text.split()))
     assert "elsewhere" not in of_plain

@@ -39,20 +39,18 @@ def exported(source: Path, out: Path, *more: str) -> list[dict[str, str]]:
 
 
 def live_and_replayed(forker: Forker, recording: Path, folder: Path):
-    """Return a recording's live and replayed tables, and what the daemon printed."""
+    """Return a recording's live and replayed tables, which agree, and what the daemon printed.
+
+    Epochs, rejections, sigma0 and the last result of the series are compared.
+    """
     own = folder / recording.name
     if own != recording:
         shutil.copytree(recording, own)
-    store = folder / "live.db"
-    text = played(forker, own, store)
-    return exported(store, folder / "live.csv", "--extra"), exported(own, folder / "r.csv"), text
-
-
-def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
-    """Check that epochs, rejections, sigma0 and the last series result agree."""
+    text = played(forker, own, folder / "live.db")
+    live = exported(folder / "live.db", folder / "live.csv", "--extra")
+    replayed = exported(own, folder / "r.csv")
     pairs = list(zip(live, replayed, strict=True))
-    without = {a["epoch"]: a["status"] for a, b in pairs if b["status"] == "ok" != a["status"]}
-    assert not without
+    assert not {a["epoch"]: a["status"] for a, b in pairs if b["status"] == "ok" != a["status"]}
     a, b = good(live), good(replayed)
     # a live row has only the epochs so far, so the first rows have few
     rejected, expected = column(a, "n_rejected").sum(), column(b, "n_rejected").sum()
@@ -64,6 +62,7 @@ def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
     for name in MAIN:  # the result of the series, not of the epoch
         difference = float(a[-1][f"series_{name}"]) - float(b[-1][name])
         assert abs(difference) <= 0.2 * float(b[-1][f"sd_{name}"]), f"last epoch's {name}"
+    return live, replayed, text
 
 
 @pytest.mark.slow
@@ -71,7 +70,6 @@ def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
 def test_real_cameras(shared, forker, tmp_path, camera):
     """Fixed cameras, stable for 50 s, scatter as their sds state."""
     live, replayed, text = live_and_replayed(forker, shared / "data" / camera, tmp_path)
-    agree(live, replayed)
     assert len(good(live)) == len(good(replayed)) >= 100
     assert "was moved" not in text
     for name in MAIN:
@@ -95,8 +93,7 @@ def test_real_cameras(shared, forker, tmp_path, camera):
 def test_crooked_fields(forker, tmp_path, kind, epochs):
     """Errors of live rows about their mean agree with their sds."""
     truth = crooked.write(tmp_path / kind, kind, seed=1, epochs=epochs)
-    live, replayed, text = live_and_replayed(forker, tmp_path / kind, tmp_path)
-    agree(live, replayed)
+    live, _, text = live_and_replayed(forker, tmp_path / kind, tmp_path)
     assert len(good(live)) == epochs
     assert kind == "knocked" or "was moved" not in text
     for name in MAIN:
@@ -108,9 +105,8 @@ def test_crooked_fields(forker, tmp_path, kind, epochs):
 @pytest.mark.slow
 def test_frames_of_crooked_planes(forker, tmp_path):
     """Rendered frames of a field with bent planes, surveyed to 2 µm."""
-    recording, truth = tmp_path / "frames", crooked.write_frames(tmp_path / "frames", 14, seed=3)
-    live, replayed, text = live_and_replayed(forker, recording, tmp_path)
-    agree(live, replayed)
+    truth = crooked.write_frames(tmp_path / "frames", 14, seed=3)
+    live, _, text = live_and_replayed(forker, tmp_path / "frames", tmp_path)
     assert len(good(live)) == 14
     assert "was moved" not in text
     error = column(live, "c") - truth["c"]
@@ -127,8 +123,7 @@ def test_a_steady_temperature(shared, forker, tmp_path, camera):
         row["temperature"] = f"{25.0 + 0.0625 * (k % 3 == 0):.4f}"
         row["temperature_time"] = row["frame_time"]
     write_rows(own / "epochs.csv", heads)
-    live, replayed, text = live_and_replayed(forker, own, tmp_path)
-    agree(live, replayed)
+    _, _, text = live_and_replayed(forker, own, tmp_path)
     # cam2 twice moves by 0.2 px for two epochs
     assert text.count("was moved") + text.count("slipped") <= 2 * (camera == "aviary-cam2")
 
@@ -143,10 +138,9 @@ def part_of(
     shutil.copytree(recording, part)
     heads = [r for r in rows(part / "epochs.csv") if int(r["epoch"]) >= first]
     table, epochs = rows(part / "observations.csv"), {r["epoch"] for r in heads}
-    names = sorted({r["target"] for r in table})
-    kept = set(names[::every])
+    kept = sorted({r["target"] for r in table})[::every]
     if drawn is not None:
-        kept = set(np.random.default_rng(drawn[0]).choice(names, drawn[1], replace=False).tolist())
+        kept = np.random.default_rng(drawn[0]).choice(kept, drawn[1], replace=False).tolist()
     write_rows(part / "epochs.csv", heads)
     table = [r for r in table if r["epoch"] in epochs and r["target"] in kept]
     write_rows(part / "observations.csv", table)
@@ -156,8 +150,7 @@ def part_of(
 def test_a_part_of_a_real_camera(shared, forker, tmp_path):
     """Every other target and the last 30 epochs, a recording used in no other test."""
     part = part_of(shared / "data" / "aviary-cam0", tmp_path / "part", 72, every=2)
-    live, replayed, _ = live_and_replayed(forker, part, tmp_path)
-    agree(live, replayed)
+    live_and_replayed(forker, part, tmp_path)
 
 
 @pytest.mark.slow
@@ -195,21 +188,20 @@ def test_exchanged_names_of_targets(shared, forker, tmp_path):
     real = part_of(shared / "data" / "aviary-cam2", tmp_path / "part", 61)
     exchange = {"19.3": "107.0", "107.0": "19.3"}
     replays = []
-    for name in ("exchanged", "without"):
-        shutil.copytree(real, out := tmp_path / name)
-        seen = rows(real / "observations.csv")
-        if name == "without":
-            seen = [row for row in seen if row["target"] not in exchange]
-        seen = [row | {"target": exchange.get(row["target"], row["target"])} for row in seen]
-        write_rows(out / "observations.csv", seen)
-        replays.append(exported(out, tmp_path / f"{name}.csv"))
+    seen = rows(real / "observations.csv")
+    for name, kept in (
+        ("exchanged", [r | {"target": exchange.get(r["target"], r["target"])} for r in seen]),
+        ("without", [r for r in seen if r["target"] not in exchange]),
+    ):
+        shutil.copytree(real, tmp_path / name)
+        write_rows(tmp_path / name / "observations.csv", kept)
+        replays.append(exported(tmp_path / name, tmp_path / f"{name}.csv"))
     assert len(good(replays[0])) == len(good(replays[1])) == 41
     for name in MAIN:
         (a, b), sds = (column(r, name) for r in replays), [column(r, f"sd_{name}") for r in replays]
         assert np.abs(a - b).max() < 0.05 * sds[1].min()
         np.testing.assert_allclose(*sds, rtol=2e-3)
-    played(forker, tmp_path / "exchanged", tmp_path / "live.db")
-    agree(exported(tmp_path / "live.db", tmp_path / "live.csv", "--extra"), replays[0])
+    live_and_replayed(forker, tmp_path / "exchanged", tmp_path)
 
 
 def played(forker: Forker, recording: Path, store: Path, kill_at: int = 0) -> str:

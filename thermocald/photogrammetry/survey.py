@@ -273,6 +273,11 @@ def survey(
             loose = np.isnan(normals[:, 0])
             normals[loose] = target_normals(expected.points)[loose]
         photos = _measure_again(pictures, network, expected, normals, notes, progress)
+        if not photos:
+            raise GeometryError(
+                "no photograph shows the test field in the scale of the measured distances: are "
+                "they in mm, and between these targets?"
+            )
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
         network = adjust_network(
             sensor, photos, expected.names, distances, interior=network.camera.interior,

@@ -21,12 +21,9 @@ from pathlib import Path
 import pytest
 
 from tests.commands import call, every_command
-from tests.daemon.conftest import small_disk
 from tests.marks import mostly_slow
 from thermocald.errors import OutputError
 from thermocald.files import new_file, write_text
-
-__all__ = ["small_disk"]
 
 # {to}: the place that cannot be written; {world} and {sheet}: the folders of the fixtures
 COMMANDS = {

@@ -309,32 +309,3 @@ def preloaded(tmp_path_factory):
     forker = Forker({**ENVIRONMENT, "LD_PRELOAD": ":".join(built)})
     yield forker
     forker.close()
-
-
-@pytest.fixture
-def mount():
-    """Words of `mount` → mounted until the test ends; skips where nothing can be mounted."""
-    mounted: list[Path] = []
-
-    def mounts(*words: object) -> None:
-        command = ["mount", *map(str, words)]
-        if not shutil.which("mount") or subprocess.run(command, check=False).returncode:
-            pytest.skip("nothing can be mounted here: needs root and tmpfs")
-        mounted.append(words[-1])
-
-    yield mounts
-    for folder in reversed(mounted):
-        subprocess.run(["umount", "-q", "-l", folder], check=False)
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path, mount):
-    """MB → the folder of a disk of this size."""
-
-    def make(size_mb: int) -> Path:
-        folder = tmp_path / "disk"
-        folder.mkdir()
-        mount("-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder)
-        return folder
-
-    return make

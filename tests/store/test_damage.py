@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.commands import call
-from tests.daemon.conftest import tool
 from tests.store.small import change, stored_numbers
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError, ThermocaldError
@@ -211,7 +210,7 @@ def test_the_daemon_says_so_and_keeps_a_copy(crashed):
 
 
 @pytest.fixture
-def read_only(crashed):
+def read_only(crashed, request):
     """The same on a medium that is mounted read-only; without root, by mode."""
     folder = crashed.parent
     if os.geteuid() != 0:
@@ -220,11 +219,10 @@ def read_only(crashed):
         yield crashed
         folder.chmod(0o755)
         return
-    if tool("mount", "--bind", folder, folder).returncode:
-        pytest.skip("root, whom modes do not stop, cannot mount here")
-    assert tool("mount", "-o", "remount,ro,bind", folder).returncode == 0
+    mount = request.getfixturevalue("mount")
+    mount("--bind", folder, folder)
+    mount("-o", "remount,ro,bind", folder)
     yield crashed
-    tool("umount", "-l", folder)
 
 
 def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_path):

@@ -121,10 +121,10 @@ def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
     rows = [f"{times_of(misfits)[k]:.2f},{n}.{kind}" for k, n in ((0, "a"), (40, "c"), (45, "b"))]
     (tmp_path / "i.csv").write_text("\n".join(["time,image", *rows, ""]))
 
-    def correct(out):
+    def correct(out, size="410x308"):
         return run(
             "correct", tmp_path / "i.csv", "--model", misfits / "model.yaml", "--log",
-            misfits / "M3", "--size", "410x308", "--out", out, "--json", "-",
+            misfits / "M3", "--size", size, "--out", out, "--json", "-",
         )  # fmt: skip
 
     result = correct(tmp_path / "out")
@@ -142,6 +142,8 @@ def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
         assert written.getexif().get_ifd(0x8769)[TAKEN] == "2026:06:14 12:00:00"
         assert np.asarray(written).shape == (308, 410)
     assert "would be overwritten" in str(correct(tmp_path).exception)
+    assert "no row was corrected" in str(correct(tmp_path / "new", "820x616").exception)
+    assert not (tmp_path / "new").exists()
 
 
 def test_rows_of_standard_input_are_corrected_as_they_come(misfits):

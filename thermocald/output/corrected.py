@@ -18,7 +18,7 @@ from thermocald.analysis.thermal.correction import (
     row_blocks,
 )
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
-from thermocald.files import make_folder, new_file, write_parts
+from thermocald.files import new_file, write_parts
 from thermocald.numbers import counted
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
 from thermocald.result import Result
@@ -123,7 +123,6 @@ class Correction(Result):
         Images that cannot be corrected are added to `refused`. Raises DataError if no image can be
         corrected, UsageError if one would be overwritten.
         """
-        make_folder(out)
         for block in self._blocks(()):
             possible = self._possible(block)
             if not possible.lines:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from thermocald.errors import GeometryError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
@@ -142,7 +143,8 @@ def refuse_before(
     reasons = []
     targets = len(np.unique(rays.target))
     if photos < MIN_PHOTOS:
-        _refuse([f"{photos} photographs show targets; take at least {MIN_PHOTOS}, better 8 to 12"])
+        shown = counted(photos, "photograph")
+        _refuse([f"{shown} with targets; take at least {MIN_PHOTOS}, better 8 to 12"])
     if targets < MIN_TARGETS:
         reasons.append(
             f"{targets} targets are in at least {MIN_RAYS} photographs, {MIN_TARGETS} are needed"

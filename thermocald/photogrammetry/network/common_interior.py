@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -191,8 +192,8 @@ def _snooped(
         redundancy = 2 * n - len(every.free) - 6 * len(bundle.rotations)
         if redundancy < s.minimum_redundancy:
             raise GeometryError(
-                f"{n} image points in {len(bundle.rotations)} photographs leave a redundancy of "
-                f"{redundancy}; at least {s.minimum_redundancy} is needed"
+                f"{n} image points in {counted(len(bundle.rotations), 'photograph')} leave a "
+                f"redundancy of {redundancy}; at least {s.minimum_redundancy} is needed"
             )
         bundle = part.solve(bundle, iterations=_ITERATIONS)
         found = part.cofactors(bundle)

@@ -56,20 +56,13 @@ def cameras(rng, count, sd, between=BETWEEN):
     return true, [camera(values, sd, f"cam{i}") for i, values in enumerate(seen)]
 
 
-@pytest.mark.parametrize(
-    ("noise", "own", "fleets"),
-    [(0.1, 1.0, 40), *(pytest.param(*case, 1000, marks=pytest.mark.slow)
-                       for case in ((0.05, 1.0), (0.3, 0.3), (0.1, 3.0), (0.1, 1.0)))],
-)  # fmt: skip
-def test_a_camera_measured_at_few_temperatures_is_better_than_alone_and_than_its_type(
-    noise, own, fleets
-):
-    """95 % are within 1.96 sds; noise, own: of the fleet and the camera, in sds of the type."""
+def test_a_camera_measured_at_few_temperatures_is_better_than_alone_and_than_its_type():
+    """95 % are within 1.96 sds."""
     rng = np.random.default_rng(8)
     inside, off = [], []
-    for _ in range(fleets):
-        _, fleet = cameras(rng, 10, noise * SCATTER)
-        (true,), (new,) = cameras(rng, 1, own * SCATTER)
+    for _ in range(40):
+        _, fleet = cameras(rng, 10, 0.1 * SCATTER)
+        (true,), (new,) = cameras(rng, 1, SCATTER)
         found = shrink_to_type(new, type_model(fleet, "rpi-v2.1"))
         values, alone = (np.array([m.value(n) for n in NAMES]) for m in (found, new))
         sd = np.array([found.sd(n) for n in NAMES])
@@ -77,11 +70,9 @@ def test_a_camera_measured_at_few_temperatures_is_better_than_alone_and_than_its
         hot_off = (hot.interior.c - true[0] - 20.0 * true[1]) / hot.sd["c"]
         inside.append(np.abs([*((values - true) / sd), hot_off]) < 1.96)
         off.append(np.array([values, alone, TYPE]) - true)
-    share = np.mean(inside, axis=0)
-    assert share[:5].mean() == pytest.approx(0.95, abs=0.04 if fleets < 1000 else 0.01)
-    assert (share > (0.8 if fleets < 1000 else 0.92)).all()
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.04)
     shrunk, by_itself, by_type = np.std(np.array(off) / SCATTER, axis=(0, 2))
-    assert shrunk < (0.8 if own == 1.0 else 1.0) * min(by_itself, by_type)
+    assert shrunk < 0.8 * min(by_itself, by_type)
     assert found.evidence["shrunk_to_type"] == "rpi-v2.1"
     assert (found.camera, found.validity) == (new.camera, new.validity)
 

@@ -23,6 +23,7 @@ from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.output.dashboard import serve
 from thermocald.output.dashboard.application import build_application
+from thermocald.output.dashboard.server import bind
 from thermocald.photogrammetry.camera.camera_model import Sensor, project
 from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.photogrammetry.field.testfield import TestField
@@ -290,6 +291,12 @@ def start_page(store, live) -> tuple[subprocess.Popen, int]:
     server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert "the page is at" in server.stderr.readline()
     return server, port
+
+
+def test_it_takes_connections_before_it_is_announced():
+    """`serve` announces the page, and starts the server afterwards."""
+    with bind("127.0.0.1", 0) as listening:
+        socket.create_connection(listening.getsockname(), timeout=5).close()
 
 
 def test_a_page_that_is_open_hears_the_end(store_path, live):

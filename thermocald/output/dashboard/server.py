@@ -52,6 +52,7 @@ def bind(host: str, port: int) -> socket.socket:
         # the kernel's limit for a client that reads nothing; every connection inherits it
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * _STUCK_S))
         listening.bind((host, port))
+        listening.listen()  # before the page is announced
     except OSError as error:
         listening.close()
         if error.errno == errno.EADDRINUSE:

@@ -239,13 +239,14 @@ function draw(columns, name) {
     margin: { l: 70, r: 15, t: 36, b: 55 }, colorway: PALETTE, showlegend: columns.channels.length > 1,
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "same",
     font: { color: colour("--ink") }, legend: { orientation: "h", y: 1.04, x: 0 },
-    xaxis: { title: { text: "UTC" }, gridcolor: colour("--line"), anchor: "y5", nticks: innerWidth < 600 ? 4 : 10, tickangle: 0 }, hovermode: "x",
+    xaxis: { title: { text: "UTC" }, gridcolor: colour("--line"), nticks: innerWidth < 600 ? 4 : 10, tickangle: 0 }, hovermode: "x",
   };
   const panels = [[columns.channels, "°C"], [["c"], "c in mm"], [["x0"], "x₀ in mm"], [["y0"], "y₀ in mm"],
-    [["sigma0"], "σ₀ (no unit)"]];
+    [["sigma0"], "σ₀ (no unit)"]].filter(([names]) => names.length), step = 1.025 / panels.length;
+  layout.xaxis.anchor = `y${panels.length}`;
   panels.forEach(([names, title], i) => {
-    const axis = i ? `y${i + 1}` : "y", top = 1 - i * 0.205;
-    layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title, standoff: 10 }, automargin: true, domain: [top - 0.18, top],
+    const axis = i ? `y${i + 1}` : "y", top = 1 - i * step;
+    layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title, standoff: 10 }, automargin: true, domain: [Math.max(top - step + 0.025, 0), top],
       gridcolor: colour("--line"), zeroline: false, tickformat: title.endsWith("mm") ? ".4f" : "" };
     for (const name of names) {
       const y = cut(columns[name]), sd = columns["sd_" + name] && cut(columns["sd_" + name]);

@@ -6,13 +6,14 @@ import contextlib
 import errno
 import os
 import stat
+import time
 
 import pytest
 import yaml
 
 from tests.commands import call
 from tests.daemon.conftest import make_recording
-from tests.store.small import create_small_series, small_epoch, stored_numbers
+from tests.store.small import create_small_series, small_epoch, small_result, stored_numbers
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
@@ -97,6 +98,26 @@ def test_what_a_hard_link_lacks_is_not_called_sound(daemon, path, tmp_path, comm
     assert done.returncode == 1
     assert "under another of its names" in done.stderr
     assert call(command, path, *more, folder=tmp_path).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_killed_backup_leaves_no_copy_or_a_whole_one(path, tmp_path, forker):
+    numbers = list(range(1, 4001))
+    with Store.open(path, "append", durable=False) as store:
+        series = create_small_series(store)
+        for number in numbers:
+            store.append(series, small_epoch(number), small_result(number))
+    copies = [tmp_path / f"{k}.db" for k in range(20)]
+    for k, copy in enumerate(copies):
+        process = forker.start(tmp_path, "backup", str(path), str(copy))
+        time.sleep(0.04 * k)
+        process.kill()
+        process.wait()
+    whole = [copy for copy in copies if copy.exists()]
+    assert len(whole) < len(copies)
+    for copy in (path, *whole):
+        assert stored_numbers(copy) == numbers
+    assert call("backup", path, copies[0]).returncode == 0
 
 
 def test_a_store_of_two_names_is_not_written_where_nobody_waits(daemon, path, tmp_path, recording):

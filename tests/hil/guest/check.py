@@ -127,7 +127,7 @@ def stalls(backend):
         result["killed"] = outcome(lambda: described(device.capture()))
         device.close()
     with feeder(320, 240, "GREY"):
-        result["again"] = outcome(lambda: (device.open(), described(device.capture()))[1])
+        result["again"] = until_captured(device)
         device.close()
     return result
 

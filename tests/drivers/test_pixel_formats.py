@@ -47,7 +47,8 @@ def test_bayer_of_a_plain_colour_is_its_luminance(fourcc):
     )
     centre = grey(data.tobytes(), fourcc)[4:-4, 4:-4]
     luminance = 0.299 * colour["R"] + 0.587 * colour["G"] + 0.114 * colour["B"]
-    assert centre == pytest.approx(luminance, abs=1.0)
+    # some versions of OpenCV truncate 8 bits
+    assert centre == pytest.approx(luminance, abs=1.5 if eight else 1.0)
 
 
 def pack_10(values):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -109,7 +110,8 @@ def test_one_plane_seen_frontally_is_weak():
     obs = scene.observe(field, np.random.default_rng(9), exterior=exterior)
     a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=3.04)
     assert a.status == "weak_geometry"
-    assert "one plane seen at 2° from frontal" in a.reason
+    # rounding decides whether the matrix counts as singular
+    assert re.search("one plane seen at 2° from frontal|cannot separate c, Z0", a.reason)
 
 
 def test_targets_in_one_corner_too_few_and_of_another_field_are_reported():

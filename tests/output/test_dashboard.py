@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from urllib.parse import urljoin
 
 import cv2
@@ -394,6 +395,8 @@ def page_with(tmp_path):
             status["store"] |= {"lost": 2, "lost_why": "the disk was full"}
             document = {**status, "warnings": status_warnings(status)}
             (live / "status.json").write_text(json.dumps(document))
+            late = time.time() + 600.0  # not yet silent, however busy the machine
+            os.utime(live / "status.json", (late, late))
 
         return f"http://127.0.0.1:{port}/", start
 

@@ -463,8 +463,8 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
 def test_the_page_of_a_silent_daemon_says_so_and_its_times_are_utc(page_with, page_of, tmp_path):
     """A killed daemon's page said "live" for ever; the curves were drawn in local time."""
     url, start = page_with(2)
-    page = page_of(url, timezone_id="Asia/Tokyo")
     start()
+    page = page_of(url, timezone_id="Asia/Tokyo")
     page.wait_for_function(_SETTLED, arg=_name(1))  # always the first camera
     assert page.text_content("#connection") == "live"
     assert page.get_attribute("#overlay", "viewBox") == "0 0 640 480"  # of the first frame shown

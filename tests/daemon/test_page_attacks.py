@@ -7,7 +7,7 @@ import signal
 import socket
 import time
 import urllib.request
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +55,8 @@ def test_the_page_keeps_to_its_memory_and_slow_clients_hold_nobody_up(daemon, me
         with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=60) as answer:
             return answer.read()
 
-    with process:
+    with process, ExitStack() as ends:
+        ends.callback(process.kill)  # also after a failure
         assert len(get(CSV).splitlines()) == 6001
         resident = []
         for _ in range(30):
@@ -89,7 +90,6 @@ def test_the_page_keeps_to_its_memory_and_slow_clients_hold_nobody_up(daemon, me
             assert channel.recv(1) == b""
         for channel in (*slow, *silent):
             channel.close()
-        process.kill()
     # the daemon beside it went on, at ten epochs a second
     assert daemon.stop() == 0
     results = daemon.results()

@@ -289,7 +289,8 @@ def start_page(store, live) -> tuple[subprocess.Popen, int]:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "thermocald", "dashboard", "--store", str(store)]
     command += ["--live", str(live), "--port", str(port)]
-    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    environment = os.environ | {"MALLOC_ARENA_MAX": "2"}  # as in its systemd unit
+    server = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
     assert "the page is at" in server.stderr.readline()
     return server, port
 

@@ -360,7 +360,8 @@ def keep(page, name: str) -> None:
     """Write an image of the whole page to the folder THERMOCALD_PAGES."""
     if folder := os.environ.get("THERMOCALD_PAGES"):
         Path(folder).mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=f"{folder}/{name}.png", full_page=True)
+        # not by path=, for which Playwright begins a thread that outlives the test
+        Path(folder, f"{name}.png").write_bytes(page.screenshot(full_page=True))
 
 
 @pytest.mark.slow

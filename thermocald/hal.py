@@ -259,6 +259,11 @@ class Device:
         if close is not None:
             close()
 
+    @property
+    def timeout_s(self) -> float:
+        """The longest that a call may take, s; it counts as hung some time later."""
+        return float(getattr(self.options, "timeout_s", 0.0))
+
     def opened(self) -> Any:
         """Return the handle; raises DeviceGone while the device is closed."""
         if self.handle is None:

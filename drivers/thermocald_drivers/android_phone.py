@@ -211,11 +211,14 @@ class AdbPhone(Device):
         line.check_okay()
         text = line.read_until_close().split()
         end = time.time()
+        second, _, fraction = "".join(text[:1]).partition(".")
+        # Android 7 and older print no fraction: the middle of the second
+        half_s = 0.0 if fraction.isdecimal() else 0.5
         try:
-            phone = support.parse_number(text[0])
-        except (ValueError, IndexError) as error:
+            phone = half_s + support.parse_number(second if half_s else text[0])
+        except ValueError as error:
             raise BadReading(f"{self.where}: `date` prints {' '.join(text)!r}") from error
-        return phone - (start + end) / 2.0, "".join(text[1:2]), (end - start) / 2.0
+        return phone - (start + end) / 2.0, "".join(text[1:2]), half_s + (end - start) / 2.0
 
     def _call(self, action: Callable[[], Any]) -> Any:
         """Run an action; raises adbutils' errors as DeviceErrors by the server's answer."""

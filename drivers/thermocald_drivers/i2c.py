@@ -284,10 +284,11 @@ class Sht3xThermometer(I2cThermometer):
     chip = "SHT3x"
     addresses = (0x44, 0x45)
     range_c = (-40.0, 125.0)
-    SINGLE_SHOT_HIGH, SERIAL_NUMBER, SOFT_RESET = 0x2400, 0x3780, 0x30A2
+    SINGLE_SHOT_HIGH, SERIAL_NUMBER, BREAK, SOFT_RESET = 0x2400, 0x3780, 0x3093, 0x30A2
 
     def _identify(self) -> None:
-        self._command(self.SOFT_RESET, 0.002)  # ends the periodic mode of an earlier program
+        self._command(self.BREAK, 0.001)  # in the periodic mode of an earlier program, before any
+        self._command(self.SOFT_RESET, 0.002)
         self._command(self.SERIAL_NUMBER, 0.001)
         self._words(2)
 

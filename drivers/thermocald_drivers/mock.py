@@ -129,6 +129,10 @@ class MockDevice(Device):
         self._calls = 0
         self._started: float | None = None
 
+    @property
+    def timeout_s(self) -> float:
+        return 0.0  # the option is the length of a fault
+
     def open(self) -> None:
         if self._started is None:
             self._started = self.clock.monotonic()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+
 import pytest
 from thermocald_drivers.i2c import Lm75Thermometer, crc8
 
@@ -108,6 +110,22 @@ def test_a_chip_that_has_just_been_powered_is_read_again(bus, monkeypatch):
         # its first conversion ends while the driver waits
         monkeypatch.setattr(device, "_wait", lambda _: bus.chips[0x18].word(5, 0xC190))
         assert device.read().values == {"temperature": 25.0}
+
+
+def test_an_sht3x_in_periodic_mode_is_stopped_before_any_other_command(bus):
+    bus.chips[0x44] = chip = sht3x()
+    answer, periodic = chip.on_write, [True]
+
+    def in_periodic_mode(chip, register, data):  # SHT3x-DIS v6, 4.8: break; 4.9: reset when idle
+        if (register, data) == (0x30, b"\x93"):
+            periodic.clear()
+        elif periodic:
+            raise OSError(errno.EREMOTEIO, "not acknowledged")
+        answer(chip, register, data)
+
+    chip.on_write = in_periodic_mode
+    with thermometer("sht3x") as device:
+        assert device.read().values["temperature"] == pytest.approx(25.0, abs=0.01)
 
 
 def test_the_crc_is_that_of_the_data_sheet():

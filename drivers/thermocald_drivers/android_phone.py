@@ -61,10 +61,13 @@ if TYPE_CHECKING:
     from thermocald.hal import Reading
 
 
-DENIED = (
-    "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); if no "
-    "dialog appears: developer options, 'Revoke USB debugging authorizations', re-plug"
-)
+DENIED = {
+    "unauthorized": "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick "
+    "'always'); if no dialog appears: developer options, 'Revoke USB debugging authorizations', "
+    "re-plug",
+    "permissions": "no permissions; see the udev rules in systemd/",
+}
+"""What the adb server says of a phone that it must not use, and advice."""
 OFFLINE = (
     "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
 )
@@ -158,14 +161,8 @@ class AdbPhone(Device):
                 f"{self.where}: not attached; adb lists {others}; {advice}",
                 seen=self.seen,
             )
-        state = states[0]
-        if state in ("unauthorized", "offline"):
-            raise self._translated(state)
-        if state == "no" or state.startswith("no perm"):  # "no permissions (…); see http…"
-            message = f"{self.where}: no permissions; see the udev rules in systemd/"
-            raise support.denied(message, seen=self.seen)
-        if state != "device":
-            raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
+        if states != ["device"]:
+            raise self._translated(f"its state is {states[0]!r}; let it boot into Android")
         self.handle, self.seen = client.device(serial=o.serial), True
 
     def shell(self, command: str) -> str:
@@ -242,18 +239,17 @@ class AdbPhone(Device):
             self._lines.clear()
 
     def _translated(self, message: str) -> DeviceError:
-        if "unauthorized" in message:
-            return support.denied(f"{self.where}: {DENIED}", seen=self.seen)
+        for word, advice in DENIED.items():
+            if word in message:
+                return support.denied(f"{self.where}: {advice}", seen=self.seen)
         if "offline" in message:
             return DeviceGone(f"{self.where}: {OFFLINE}")
         if "connect to adb server" in message or "No adb exe" in message:
             server = f"{self.options.host}:{self.options.port}"
             return DeviceNotFound(f"no adb server at {server}: {message}")
-        if "not found" in message or "closed" in message or "Unknown data" in message:
-            return DeviceGone(f"{self.where}: {message}")
         if "chunk missing" in message or "Invalid sync" in message:
-            return DeviceGone(f"{self.where}: a transfer broke off ({message})")
-        return BadReading(f"{self.where}: {message}")
+            message = f"a transfer broke off ({message})"
+        return DeviceGone(f"{self.where}: {' '.join(message.split())}")
 
 
 ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'

@@ -13,7 +13,8 @@ denied here with EBUSY. The chip's identity is checked when it is opened; 0xFFFF
 drives the bus. `channel` names the temperature.
 
 * TMP117 (±0.1 °C): one one-shot conversion of 8 averages per reading. The driver waits for
-  Data_Ready, so that no value is read twice; 0x8000 precedes the first conversion (SNOSD82D, 7.6).
+  Data_Ready, so that no value is read twice; −256 °C precedes the first conversion, and is out of
+  range (SNOSD82D, 7.6).
 * MCP9808 (±0.25 °C): bits 15–13 of the register are alert flags, bit 12 the sign (DS25095A, 5).
 * LM75 family, `chip`: lm75 (also LM75A, LM75B, which use two more bits), lm75b, tmp75, tmp102. They
   have no identity: the driver checks the bits that a chip leaves at zero, in its limits as well
@@ -171,10 +172,7 @@ class Tmp117Thermometer(I2cThermometer):
         self._write(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
         self._wait(0.1245)
         self._await(self.CONFIGURATION, self.DATA_READY, self.DATA_READY, 0.01)
-        raw = self._driven(self._read(self.TEMPERATURE))
-        if raw == 0x8000:
-            raise BadReading(f"{self.where}: 0x8000, the power-on value; no conversion took place")
-        return signed(raw, 16) / 128.0, ""
+        return signed(self._driven(self._read(self.TEMPERATURE)), 16) / 128.0, ""
 
 
 class _ConvertingThermometer(I2cThermometer):
@@ -327,10 +325,13 @@ class Bme280Thermometer(I2cThermometer):
 
     def _identify(self) -> None:
         self._expect("the identity", self._read(self.IDENTITY, 0xFF), 0x60)
-        table = self._block(self.CALIBRATION, 26)
-        if table in (bytes(26), b"\xff" * 26):
+        self._calibration()
+
+    def _calibration(self) -> tuple[int, ...]:
+        table = self._block(self.CALIBRATION, 6)
+        if table in (bytes(6), b"\xff" * 6):
             raise BadReading(f"{self.where}: the calibration registers are empty")
-        self._calibration = struct.unpack("<Hhh", table[:6])
+        return struct.unpack("<Hhh", table)
 
     def _block(self, register: int, size: int) -> bytes:
         return bytes(self.handle.read_i2c_block_data(self.address, register, size))
@@ -345,7 +346,8 @@ class Bme280Thermometer(I2cThermometer):
         raw = data[3] << 12 | data[4] << 4 | data[5] >> 4
         if chips.is_idle_word("bme280", raw):
             raise BadReading(f"{self.where}: 0x{raw:05x}, the temperature was not measured")
-        return bme280_celsius(raw, self._calibration), ""
+        # read each time: the chip may have been exchanged between two readings
+        return bme280_celsius(raw, self._calibration()), ""
 
 
 def bme280_celsius(raw: int, calibration: tuple[int, ...]) -> float:

@@ -126,12 +126,9 @@ class MockDevice(Device):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self.timeout_s = 0.0  # the option is the length of a fault
         self._calls = 0
         self._started: float | None = None
-
-    @property
-    def timeout_s(self) -> float:
-        return 0.0  # the option is the length of a fault
 
     def open(self) -> None:
         if self._started is None:

@@ -193,9 +193,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
                 idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
                 return self.judge(channel, f"1-wire {rom}", value, idle)
-            except BadReading as error:
-                problem = error
-            except OSError as error:
+            except OSError as error:  # also a BadReading
                 problem = support.fault(error, f"1-wire {rom}", seen=True)
                 if isinstance(problem, DeviceGone):
                     raise DeviceGone(f"1-wire {rom}: is not on the bus") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import struct
 
 import pytest
 from thermocald_drivers.i2c import Lm75Thermometer, crc8
@@ -33,7 +34,7 @@ HELD = [
     *(
         ("tmp117", {}, tmp117(raw), value)
         for raw, value in [(0x0001, 0.0078125), (0x0C80, 25.0), (0xF380, -25.0), (0x3200, 100.0),
-                           (0xE480, -55.0), (0x8000, "0x8000")]
+                           (0xE480, -55.0), (0x8000, "-256 °C is outside")]
     ),
     ("tmp117", {}, tmp117(ready=False), "did not end"),
     *(
@@ -102,6 +103,15 @@ def test_the_power_up_register_is_not_zero_degrees(bus, name, options, chip, zer
                 bus.chips[place] = chip(word)
                 assert device.read().values == {"temperature": celsius}
             device.clock.advance(61.0)
+
+
+def test_a_bme280_that_is_exchanged_between_two_readings_has_its_own_calibration(bus):
+    bus.chips[0x76] = chip = bme280()
+    with thermometer("bme280") as device:
+        device.read()
+        other = struct.pack("<Hhh", 28485, 26735, 50)  # 20.44 °C of the same raw value
+        chip.registers |= {0x88 + k: bytes([byte]) for k, byte in enumerate(other)}
+        assert device.read().values == {"temperature": pytest.approx(20.440, abs=0.001)}
 
 
 def test_a_chip_that_has_just_been_powered_is_read_again(bus, monkeypatch):

@@ -280,10 +280,8 @@ class DeviceLoop:
     def busy_s(self) -> float:
         """Return how long the current call has taken beyond its time-out, s; 0 between calls."""
         since = self._busy_since
-        if since is None:
-            return 0.0
-        overdue_s: float = self.clock.monotonic() - since - self.link.device.timeout_s
-        return max(0.0, overdue_s)
+        allowed_s: float = self.link.device.timeout_s
+        return 0.0 if since is None else max(0.0, self.clock.monotonic() - since - allowed_s)
 
     def _run(self) -> None:
         try:

@@ -56,8 +56,8 @@ def sht3x(temperature=0x6666, damage=0):
 
 
 # Calibration and raw values of the worked example of the BMP280 data sheet (BST-BMP280-DS001, 3.12)
-# of the temperature: dig_T1 … dig_T3; the driver reads the 20 further bytes and ignores them
-CALIBRATION = struct.pack("<Hhh", 27504, 26435, -1000) + bytes(20)
+# of the temperature: dig_T1 … dig_T3
+CALIBRATION = struct.pack("<Hhh", 27504, 26435, -1000)
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 

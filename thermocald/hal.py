@@ -269,7 +269,7 @@ class Device:
 
     def identity(self) -> Mapping[str, str]:
         """Return name, serial number and versions, which distinguish this device from others."""
-        return {}
+        return {"name": self.where}
 
     def warnings(self) -> Sequence[str]:
         """Return one sentence for each setting that harms the results; shown in the status."""

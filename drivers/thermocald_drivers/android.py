@@ -187,15 +187,14 @@ class AndroidCamera(AdbPhone, Camera):
 
     def _require_space(self) -> None:
         """Raise PermanentDeviceError if the storage is full; unknown free space passes."""
-        lines = self.shell(f"df -k {quote(self.folder)} 2>/dev/null || df -k /sdcard").split("\n")
-        fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
-        if len(fields) >= 4 and fields[3].isdigit():
-            free_mb = int(fields[3]) / 1024.0
-            if free_mb < self.options.minimum_free_mb:
-                raise PermanentDeviceError(
-                    f"{self.where}: its storage is full ({free_mb:.0f} MB free, minimum "
-                    f"{self.options.minimum_free_mb:g}); delete photographs, or set delete: true"
-                )
+        text = self.shell(f"df -k {quote(self.folder)} 2>/dev/null || df -k /sdcard")
+        found = re.search(r"\s([0-9]+)\s+[0-9]+%\s", text)
+        free_mb = int(found[1]) / 1024.0 if found else math.inf
+        if free_mb < self.options.minimum_free_mb:
+            raise PermanentDeviceError(
+                f"{self.where}: its storage is full ({free_mb:.0f} MB free, minimum "
+                f"{self.options.minimum_free_mb:g}); delete photographs, or set delete: true"
+            )
 
     def _new_photograph(self, before: set[str]) -> tuple[str, bytes, support.Grey]:
         """Wait for the one new photograph to be complete; return its (path, bytes, image)."""

@@ -128,9 +128,6 @@ class AdbPhone(Device):
         self.where = f"phone {self.options.serial}"
         self._lines: list[Any] = []
 
-    def identity(self) -> Mapping[str, str]:
-        return {"serial": self.options.serial}
-
     def open(self) -> None:
         """Find the phone among the server's devices; raises a DeviceError if it cannot be used."""
         adbutils = support.library("adbutils", "android")

@@ -41,8 +41,6 @@ from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from thermocald.hal import Reading
 
 
@@ -97,11 +95,6 @@ class I2cThermometer(support.CheckedThermometer):
 
     def named_channels(self) -> list[str]:
         return [self.options.channel]
-
-    def identity(self) -> Mapping[str, str]:
-        return {
-            "chip": self.chip, "address": f"0x{self.address:02x}", "bus": str(self.options.bus)
-        }  # fmt: skip
 
     def read(self) -> Reading:
         self.opened()

@@ -148,9 +148,6 @@ class _KernelThermometer(support.CheckedThermometer):
     def named_channels(self) -> list[str]:
         return list(self.options.channels)
 
-    def identity(self) -> Mapping[str, str]:
-        return {"chip": self.chip, "path": str(self.handle or "")}
-
     def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
         """Return {channel: kernel's input} by the option `channels`."""
         if not self.options.channels:

@@ -140,7 +140,7 @@ class MockDevice(Device):
 
     def identity(self) -> Mapping[str, str]:
         seed = getattr(self.options, "seed", 0)
-        return {"name": self.where, "serial": f"mock-{seed}"}
+        return {**super().identity(), "serial": f"mock-{seed}"}
 
     def _fault(self, call: int) -> Kind | None:
         elapsed = self._elapsed(self.clock.monotonic())

@@ -36,7 +36,6 @@ from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from concurrent.futures import Future
 
     from thermocald.hal import Reading
@@ -115,7 +114,6 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         attempts: Annotated[int, Field(ge=1, le=10)] = 2
         sysfs: support.Text = "/sys"
 
-    where = "1-wire"
     range_c = (-55.0, 125.0)
 
     def __init__(self, **options: Any) -> None:
@@ -124,6 +122,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         ids = list(self.sensors.values())
         if twice := {rom for rom in ids if ids.count(rom) > 1}:
             raise ConfigurationError(f"sensors: {min(twice)} is given twice")
+        self.where = f"1-wire {', '.join(ids)}"
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._pending: dict[str, Future[float]] = {}
 
@@ -149,14 +148,11 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         if not any((self.root / rom).is_dir() for rom in self.sensors.values()):
             there = ", ".join(sorted(p.name for p in self.root.glob("??-*"))) or "no sensor"
             raise support.absent(
-                f"1-wire {', '.join(self.sensors.values())}: not on the bus, there is {there}; "
-                "check dtoverlay=w1-gpio and the wiring",
+                f"{self.where}: not on the bus, there is {there}; check "
+                "dtoverlay=w1-gpio and the wiring",
                 seen=self.seen,
             )
         self.handle = self.seen = True
-
-    def identity(self) -> Mapping[str, str]:
-        return {"sensors": ", ".join(self.sensors.values())}
 
     def read(self) -> Reading:
         self.opened()

@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
+WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?")
 FRAMING = "is not data bits, parity (N, E, O) and stop bits, such as 8N1"
 LONGEST_LINE = 512
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
@@ -223,9 +224,6 @@ class SerialThermometer(support.CheckedThermometer):
         if not self.command:
             self._line, self._synchronous = b"", False
 
-    def identity(self) -> Mapping[str, str]:
-        return {"instrument": self.options.instrument or "serial line", "port": self.options.port}
-
     def named_channels(self) -> list[str]:
         return list(self.channels)
 
@@ -382,14 +380,13 @@ class SerialThermometer(support.CheckedThermometer):
 
     def _skipped(self, match: re.Match[str], channel: str) -> str:
         """Return a character of the number that the pattern skips, as `.*` does, or ""."""
-        line, (begin, end), sides = match.string, match.span(channel), []
-        point = "" if re.search("[.,]", match[channel]) else "[.,]?"
-        if line[begin] not in "+- " and re.search(rf"(?:[-+]|[0-9]{point})\Z", line[:begin]):
-            sides.append(begin - 1)
-        if re.match(rf"{point}[0-9]|[eE][-+]?[0-9]", line[end:]):
-            sides.append(end)
-        blanked = {at: f"{line[:at]}\0{line[at + 1 :]}" for at in sides}
-        return next((line[at] for at in sides if self.pattern.fullmatch(blanked[at])), "")
+        line, (begin, end) = match.string, match.span(channel)
+        for number in WHOLE_NUMBER.finditer(line):
+            for cut, beside in ((begin, begin - 1), (end, end)):
+                blanked = f"{line[:beside]}\0{line[beside + 1 :]}"
+                if number.start() < cut < number.end() and self.pattern.fullmatch(blanked):
+                    return line[beside]
+        return ""
 
     def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
         """Raise BadReading for a number that lost digits, since firmware always prints as many.

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from thermocald.acquisition.device_loop import Link, OutputLoop, Schedule
+from thermocald.acquisition.device_loop import DeviceLoop, Link, OutputLoop, Schedule
 from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound, WrongDevice
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
@@ -65,6 +65,22 @@ def test_fast_ticks_back_off(clock, link_of):
     poll(link, 600, 0.05)
     assert 10 < len(attempts) < 40  # not 600: the pauses grow to 2 s
     assert max(b - a for a, b in pairwise(attempts)) <= 2.1
+
+
+def test_a_slow_logger_does_not_hang_within_its_time_out(clock, link_of):
+    link, busy = link_of(), []
+    link.device.timeout_s = 300.0
+
+    def read():
+        for _ in range(2):
+            clock.advance(200.0)
+            busy.append(loop.busy_s())
+        loop.stop()
+
+    loop = DeviceLoop(link, read, clock.monotonic())
+    loop.start()
+    assert loop.join(5.0)
+    assert busy == [0.0, 100.0]
 
 
 @pytest.mark.parametrize(

@@ -141,23 +141,18 @@ def test_the_rest_of_a_late_line_is_no_answer(instrument, line, reopened):
             assert device.read().values["temperature"] == 18.25 or not line[:cut].strip()
 
 
-@pytest.mark.parametrize(
-    ("pattern", "line", "expected"),
-    [
+def test_a_pattern_that_takes_a_part_of_a_number(instrument):
+    for pattern, line, expected in (
         (r".*(?P<t>[-+]?\d+\.\d+).*", "T=21.55 C", "skips '2'"),  # 1.55: `.*` takes what it can
         (r".*?(?P<t>\d+\.\d+).*", "T=-5.25 C", "skips '-'"),
         (r".*?(?P<t>\d+).*", "T=21.55 C", r"skips '\.'"),
-        (r"(?P<t>[\d.]+).*", "2.15E+01", "skips 'E'"),
-        (r".*?(?P<t>[-+]?\d+\.\d+).*", "T=21.55 C", 21.55),
-        (r"(?P<t>[-+]?\d+\.\d+).*", "21.55,45.0", 21.55),
+        (r".*?(?P<t>[-+]?\d+\.\d+).*", "21.55,45.0", 21.55),
         (r"CH1-(?P<t>[-+]?\d+\.\d+)", "CH1-23.4", 23.4),
         (r".*(?P<t>[-+]\d+\.\d)C", "0R0+021.5C", 21.5),
-    ],
-)
-def test_a_pattern_that_takes_a_part_of_a_number(instrument, pattern, line, expected):
-    far = instrument({b"T?\r\n": line.encode() + b"\r\n"})
-    with asked(far, pattern=pattern) as device:
-        check_readings(device, lambda _: None, [(line, expected)])
+    ):
+        far = instrument({b"T?\r\n": line.encode() + b"\r\n"})
+        with asked(far, pattern=pattern) as device:
+            check_readings(device, lambda _: None, [(line, expected)])
 
 
 def test_the_first_line_after_a_pause_is_whole(instrument, monkeypatch):

@@ -182,14 +182,14 @@ class AdbServer(LineServer):
         command, size = struct.unpack("<4sI", stream.read(8))
         path = stream.read(size).decode()
         if command == b"LIST":
-            entries = [(".", 0o040755, 0)]
+            entries = [(b".", 0o040755, 0)]
             if path == phone.folder:
-                entries += [(n, 0o100660, len(phone.content(n))) for n in list(phone.files)]
+                entries += [
+                    (n.encode(), 0o100660, len(phone.content(n))) for n in list(phone.files)
+                ]
             for name, mode, length in entries:
-                head = struct.pack(
-                    "<4sIIII", b"DENT", mode, length, 1_700_000_000, len(name.encode())
-                )
-                line.sendall(head + name.encode())
+                head = struct.pack("<4sIIII", b"DENT", mode, length, 1_700_000_000, len(name))
+                line.sendall(head + name)
             line.sendall(b"DONE" + bytes(16))
         elif command == b"RECV":
             data = phone.content(path.rsplit("/", 1)[1])

@@ -152,8 +152,7 @@ class AndroidCamera(AdbPhone, Camera):
                 f"{self.options.width}×{self.options.height}; set the camera app to its full size, "
                 "and do not turn the phone"
             )
-        tags = exif(jpeg)
-        tags |= focus_state(self.shell("dumpsys media.camera"))
+        tags = exif(jpeg) | focus_state(self.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered)
         if self.options.delete:
@@ -305,11 +304,8 @@ def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | 
 
     zone: the time zone, +hhmm, of a photograph that states none. None without a valid time.
     """
-    text = tags.get("time")
-    if not isinstance(text, str):
-        return None
     try:
-        naive = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
+        naive = datetime.strptime(str(tags.get("time")), "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
     seconds = naive.replace(tzinfo=UTC).timestamp()

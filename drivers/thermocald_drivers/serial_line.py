@@ -316,7 +316,7 @@ class SerialThermometer(support.CheckedThermometer):
                 raise self._nothing(skipped, problem)
             if received := self._received():
                 heard = time.monotonic()
-            elif not (self.command or self._line) and time.monotonic() - heard > PAUSE_S:
+            elif not self._line.strip(b"\0") and time.monotonic() - heard > PAUSE_S:
                 self._synchronous = True  # what comes next is the start of a line
             self._line += received
 

@@ -40,9 +40,6 @@ def test_photographs_by_the_triggers_of_the_vendors(bench, fake, trigger, comman
     assert frame.exposure == pytest.approx(1 / 60, rel=1e-4)
     assert fake.commands.count(command) == 2
     assert len(fake.files) == 3  # they are deleted only when told
-    with bench.device(**trigger, delete=True) as device:
-        device.capture()
-    assert len(fake.files) == 3
 
 
 @pytest.mark.parametrize("offset", [0.0, 37.25, -7200.0])

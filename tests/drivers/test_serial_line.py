@@ -159,6 +159,7 @@ def test_the_first_line_after_a_pause_is_whole(instrument, monkeypatch):
     monkeypatch.setattr(serial_line, "PAUSE_S", 0.2)  # of a logger with one line per ten minutes
     far = instrument()
     with thermometer(far, pattern=PATTERN, timeout_s=0.6) as device:
+        far.send(b"\0")
         thread = later(lambda: far.send(b"T=21.50\r\n"), 0.4)
         assert device.read().values == {"temperature": 21.5}
         thread.join()

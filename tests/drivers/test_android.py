@@ -61,11 +61,9 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(bench, fake, offset):
 
 
 def test_without_fractions_or_in_another_zone_it_is_the_triggers(bench, fake):
+    fake.shoot = shoot(subsecond=None)
     with bench.device() as device:
-        for knob, value in (
-            ("shoot", shoot(subsecond=None)), ("date", "%d.%%N +0000"), ("date", "%.9f +0100")
-        ):  # fmt: skip
-            setattr(fake, knob, value)
+        for fake.date in ("%.9f +0000", "%d.%%N +0000", "%.9f +0100"):
             time.sleep((0.6 - time.time()) % 1)  # s that a whole second would be off
             called = time.time()
             assert called - 0.2 < device.capture().utc < time.time()
@@ -93,12 +91,9 @@ def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half
     assert one.clock_offset() == (pytest.approx(offset), "+0000", pytest.approx(half))
 
 
-# nothing, Samsung's trailer, a motion photo's video, the gain map of Ultra HDR
-AFTER = [b"", b"\0\0\1\n\x0e\0\0\0Image_UTC_DataSEFH$\0\0\0SEFT", b"\0\0\0\x18ftypmp42" + bytes(99),
-         photograph(0.0, size=(32, 16))]  # fmt: skip
-
-
-@pytest.mark.parametrize("after", AFTER)
+@pytest.mark.parametrize(  # nothing, Samsung's trailer, a video, the gain map of Ultra HDR
+    "after", [b"", b"Image_UTC_DataSEFT", b"\0\0\0\x18ftypmp42", photograph(0.0, size=(32, 16))]
+)
 def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench, fake, after):
     whole = photograph(time.time()) + after
 

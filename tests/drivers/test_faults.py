@@ -105,7 +105,6 @@ NOT_USED = {
         ({"broken": range(1000)}, {}, errors.BadReading, r"only broken|as broken"),
         (first(1000), {}, errors.BadReading, "partial frame"),
         (first(200), MJPG, errors.BadReading, "partial frame"),
-        (first(0), MJPG, errors.BadReading, "partial frame"),
         ({"encode": lambda *_: JPEG}, MJPG, errors.BadReading, "broken JPEG"),
         ({"stalled": True}, SOON, errors.DeviceTimeout, r"no new frame in 0\.3 s"),
     ],

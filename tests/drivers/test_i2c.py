@@ -108,9 +108,8 @@ def test_the_power_up_register_is_not_zero_degrees(bus, name, options, chip, zer
 def test_a_bme280_that_is_exchanged_between_two_readings_has_its_own_calibration(bus):
     bus.chips[0x76] = chip = bme280()
     with thermometer("bme280") as device:
-        device.read()
-        other = struct.pack("<Hhh", 28485, 26735, 50)  # 20.44 °C of the same raw value
-        chip.registers |= {0x88 + k: bytes([byte]) for k, byte in enumerate(other)}
+        for k, byte in enumerate(struct.pack("<Hhh", 28485, 26735, 50)):
+            chip.registers[0x88 + k] = bytes([byte])
         assert device.read().values == {"temperature": pytest.approx(20.440, abs=0.001)}
 
 

@@ -46,6 +46,7 @@ from thermocald.errors import (
     BadReading,
     ConfigurationError,
     DeviceDenied,
+    DeviceError,
     DeviceGone,
     DeviceTimeout,
     PermanentDeviceError,
@@ -144,14 +145,6 @@ class AndroidCamera(AdbPhone, Camera):
         self.shell(self.command)
         triggered = (triggered + time.time()) / 2.0
         path, jpeg, image = self._new_photograph(set(before))
-        height, width = image.shape
-        if (width, height) != (self.options.width, self.options.height):
-            # after a good one, the app was set to another size: it may be set back
-            raise (BadReading if self._first else WrongDevice)(
-                f"{self.where}: the photograph has {width}×{height} px, not "
-                f"{self.options.width}×{self.options.height}; set the camera app to its full size, "
-                "and do not turn the phone"
-            )
         tags = exif(jpeg) | focus_state(self.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered)
@@ -197,8 +190,9 @@ class AndroidCamera(AdbPhone, Camera):
 
     def _new_photograph(self, before: set[str]) -> tuple[str, bytes, support.Grey]:
         """Wait for the one new photograph to be complete; return its (path, bytes, image)."""
-        deadline = time.monotonic() + self.options.timeout_s
-        last_size, name, short = -1, "", ""
+        o, deadline = self.options, time.monotonic() + self.options.timeout_s
+        problem: DeviceError | None = None
+        last_size = -1
         while time.monotonic() < deadline:
             # an app hides a file until it is complete
             visible = {
@@ -213,16 +207,28 @@ class AndroidCamera(AdbPhone, Camera):
                     "switch off burst, HDR and RAW+JPEG copies, and do not touch the phone"
                 )
             for name, size in new.items():
-                if size > 0 and size == last_size:
-                    jpeg = self.pull(f"{self.folder}/{name}")
-                    try:
-                        return f"{self.folder}/{name}", jpeg, support.decode_jpeg(jpeg)
-                    except BadReading as error:
-                        short = f"{name}: {error}"
-                last_size = size
+                problem = problem or BadReading(f"{self.where}: partial photograph, {name}")
+                complete, last_size = size == last_size > 0, size
+                if not complete:
+                    continue
+                jpeg = self.pull(f"{self.folder}/{name}")
+                try:
+                    image = support.decode_jpeg(jpeg)
+                except BadReading as error:
+                    problem = BadReading(f"{self.where}: partial photograph, {name}: {error}")
+                    continue
+                height, width = image.shape
+                if (width, height) == (o.width, o.height):
+                    return f"{self.folder}/{name}", jpeg, image
+                # an app may replace its preview yet; after a good one, its size may be set back
+                problem = (BadReading if self._first else WrongDevice)(
+                    f"{self.where}: the photograph has {width}×{height} px, not "
+                    f"{o.width}×{o.height}; set the camera app to its full size, and do not turn "
+                    "the phone"
+                )
             time.sleep(POLL_S)
-        if new:
-            raise BadReading(f"{self.where}: partial photograph, {short or name}")
+        if problem:
+            raise problem
         if visible:
             raise BadReading(
                 f"{self.where}: no JPEG but {', '.join(sorted(visible))}; set the camera app to "

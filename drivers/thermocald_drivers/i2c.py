@@ -321,20 +321,17 @@ class Bme280Thermometer(I2cThermometer):
         self._calibration()
 
     def _calibration(self) -> tuple[int, ...]:
-        table = self._block(self.CALIBRATION, 6)
+        table = bytes(self.handle.read_i2c_block_data(self.address, self.CALIBRATION, 6))
         if table in (bytes(6), b"\xff" * 6):
             raise BadReading(f"{self.where}: the calibration registers are empty")
         return struct.unpack("<Hhh", table)
-
-    def _block(self, register: int, size: int) -> bytes:
-        return bytes(self.handle.read_i2c_block_data(self.address, register, size))
 
     def _measure(self) -> tuple[float, str]:
         self._write(self.CONTROL_HUMIDITY, 0b001, 0xFF)
         self._write(self.CONTROL, self.FORCED_X2_X1, 0xFF)
         self._wait(0.012)
         self._await(self.STATUS, self.MEASURING, 0, 0.005)
-        data = self._block(self.DATA, 8)
+        data = self.handle.read_i2c_block_data(self.address, self.DATA, 8)
         self._driven(data[6] << 8 | data[7])
         raw = data[3] << 12 | data[4] << 4 | data[5] >> 4
         if chips.is_idle_word("bme280", raw):

@@ -139,8 +139,7 @@ class MockDevice(Device):
         self.handle = True
 
     def identity(self) -> Mapping[str, str]:
-        seed = getattr(self.options, "seed", 0)
-        return {**super().identity(), "serial": f"mock-{seed}"}
+        return {**super().identity(), "serial": f"mock-{getattr(self.options, 'seed', 0)}"}
 
     def _fault(self, call: int) -> Kind | None:
         elapsed = self._elapsed(self.clock.monotonic())

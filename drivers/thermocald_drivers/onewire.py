@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceError, DeviceGone
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone
 from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import support
 
@@ -123,6 +123,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         if twice := {rom for rom in ids if ids.count(rom) > 1}:
             raise ConfigurationError(f"sensors: {min(twice)} is given twice")
         self.where = f"1-wire {', '.join(ids)}"
+        self.timeout_s *= len(ids)
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._pending: dict[str, Future[float]] = {}
 
@@ -156,7 +157,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
 
     def read(self) -> Reading:
         self.opened()
-        deadline = self.clock.monotonic() + self.options.timeout_s * len(self.sensors)
+        deadline = self.clock.monotonic() + self.timeout_s
         for channel in self.sensors:
             late = self._pending.get(channel)
             if late is None or late.done():  # a sensor that still hangs is not read twice
@@ -173,14 +174,12 @@ class Ds18b20Thermometer(support.CheckedThermometer):
 
     def _await(self, channel: str, deadline: float) -> float:
         """Wait for a sensor's thread and return its result."""
-        patience_s = self.options.timeout_s * len(self.sensors)
-        late = f"1-wire {self.sensors[channel]}: no answer in {patience_s:g} s"
+        late = f"1-wire {self.sensors[channel]}: no answer in {self.timeout_s:g} s"
         left_s = deadline - self.clock.monotonic()
         return float(support.result_in_time(self._pending[channel], left_s, late))
 
     def _read_one(self, channel: str) -> float:
         rom = self.sensors[channel]
-        problem: DeviceError | None = None
         for _ in range(self.options.attempts):
             try:
                 content = (self.root / rom / "w1_slave").read_text(
@@ -193,5 +192,4 @@ class Ds18b20Thermometer(support.CheckedThermometer):
                 problem = support.fault(error, f"1-wire {rom}", seen=True)
                 if isinstance(problem, DeviceGone):
                     raise DeviceGone(f"1-wire {rom}: is not on the bus") from error
-        assert problem is not None
         raise problem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -100,7 +101,8 @@ def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench,
     def action(fake):
         fake.add(".pending-1-IMG.jpg", b"half")
         fake.add("IMG_2.dng", b"raw")
-        fake.add("Bob's 照片.JPG", whole, 0.4)
+        fake.add("Bob's 照片.JPG", photograph(0.0, size=(48, 32)))  # a preview, which is replaced
+        threading.Timer(0.1, fake.add, ("Bob's 照片.JPG", whole, 0.4)).start()
 
     fake.shoot = action
     with bench.device(delete=True) as device:

@@ -125,7 +125,7 @@ NOT_USED = {
         ({"shoot": lambda phone: phone.add("IMG_1.jpg", photograph(time.time() - 20.0))}, {},
          errors.BadReading, "taken 20 s before the trigger"),
         ({"shoot": None}, SOON, errors.DeviceTimeout, "the camera app is open"),
-        ({"shoot": shoot(size=(48, 32))}, {}, errors.WrongDevice, "has 48×32 px, not 96×64"),
+        ({"shoot": shoot(size=(48, 32))}, SOON, errors.WrongDevice, "has 48×32 px, not 96×64"),
         ({"cut_transfer": True}, {}, errors.DeviceGone, "broke off"),
         ({"hang_s": 0.6}, SOON, errors.DeviceTimeout, r"no answer in 0\.3 s"),
     ],

@@ -231,8 +231,8 @@ class AndroidCamera(AdbPhone, Camera):
             raise problem
         if visible:
             raise BadReading(
-                f"{self.where}: no JPEG but {', '.join(sorted(visible))}; set the camera app to "
-                "JPEG (not HEIF, not RAW alone)"
+                f"{self.where}: it stored {', '.join(sorted(visible))} but no JPEG; set the camera "
+                "app to JPEG (not HEIF, not RAW alone)"
             )
         self._require_space()
         self._wake()

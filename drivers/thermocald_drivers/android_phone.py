@@ -34,6 +34,7 @@ Source: android.hardware.thermal TemperatureType, AOSP BatteryService; dumps of 
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import socket
@@ -73,8 +74,6 @@ OFFLINE = (
 )
 
 _CLOCK_S, _CLOCK_TRIES = 0.002, 12
-ADB_CLASSES = ("char-usb_device",)
-"""The nodes that an adb server opens if this driver starts it."""
 
 
 class PhoneOptions(DriverOptions):
@@ -120,7 +119,7 @@ def require_server(host: str, port: int, timeout_s: float, *, seen: bool) -> Non
 class AdbPhone(Device):
     """A phone's connection, shared by its drivers."""
 
-    device_classes = ADB_CLASSES
+    device_classes = ("char-usb_device",)  # of an adb server that this driver starts
     Options: ClassVar[type[DriverOptions]] = PhoneOptions
 
     def __init__(self, **options: Any) -> None:
@@ -131,6 +130,7 @@ class AdbPhone(Device):
     def open(self) -> None:
         """Find the phone among the server's devices; raises a DeviceError if it cannot be used."""
         adbutils = support.library("adbutils", "android")
+        logging.getLogger("adbutils").setLevel(logging.ERROR)  # it warns of old ones at each call
         o = self.options
         if not o.start_server:
             require_server(o.host, o.port, o.timeout_s, seen=self.seen)
@@ -206,7 +206,7 @@ class AdbPhone(Device):
         text = line.read_until_close().split()
         end = time.time()
         second, _, fraction = "".join(text[:1]).partition(".")
-        # Android 7 and older print no fraction: the middle of the second
+        # without a fraction (old versions of Android): the middle of the second
         half_s = 0.0 if fraction.isdecimal() else 0.5
         try:
             phone = half_s + support.parse_number(second if half_s else text[0])

@@ -121,7 +121,7 @@ NOT_USED = {
          errors.BadReading, "partial photograph, IMG_1"),
         ({"shoot": shoot(count=2)}, {}, errors.BadReading, "2 new photographs"),
         ({"shoot": lambda phone: phone.add("IMG_1.heic", b"ftypheic")}, SOON,
-         errors.BadReading, "no JPEG but IMG_1.heic; set the camera app to JPEG"),
+         errors.BadReading, "it stored IMG_1.heic but no JPEG; set the camera"),
         ({"shoot": lambda phone: phone.add("IMG_1.jpg", photograph(time.time() - 20.0))}, {},
          errors.BadReading, "taken 20 s before the trigger"),
         ({"shoot": None}, SOON, errors.DeviceTimeout, "the camera app is open"),

@@ -26,7 +26,8 @@ The driver wakes and unlocks the phone (but enters no PIN), opens the camera app
 open, since a restart would focus again. A photograph is the single new JPEG in the folder; it is
 accepted when its size no longer changes, all bytes were received and it is complete (a vendor's
 data or a video may follow it). Its time is the EXIF time, corrected by the phone's clock offset as
-measured after each photograph; without one, the time of the trigger.
+measured after each photograph; without one, the time of the trigger. A photograph that was taken
+more than 5 s before the trigger is rejected.
 Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 """
 

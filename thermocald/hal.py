@@ -228,7 +228,8 @@ class Device:
     The constructor raises a ConfigurationError and does not touch hardware.
     `open` raises a DeviceError; `close` never raises and may be called twice.
     where: the device's name in messages; handle: the opened resource, None while the device is
-    closed; seen: whether it was open before, since a device that is missing then has disappeared.
+    closed; seen: whether it was open before, since a device that is missing then has disappeared;
+    timeout_s: how long a call may take, s: its option. Some time later it counts as hung.
     """
 
     Options: ClassVar[type[DriverOptions]] = DriverOptions
@@ -243,6 +244,7 @@ class Device:
     def __init__(self, *, clock: Clock, **options: Any) -> None:
         self.clock = clock
         self.options = self.Options.read(options)
+        self.timeout_s: float = getattr(self.options, "timeout_s", 0.0)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> Sequence[Found]:  # noqa: ARG003
@@ -267,7 +269,7 @@ class Device:
 
     def identity(self) -> Mapping[str, str]:
         """Return name, serial number and versions, which distinguish this device from others."""
-        return {}
+        return {"name": self.where}
 
     def warnings(self) -> Sequence[str]:
         """Return one sentence for each setting that harms the results; shown in the status."""
@@ -406,10 +408,8 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
     """
     points = {point.name: point for point in entry_points(group=f"thermocald.{kind}s")}
     if name not in points:
-        raise ConfigurationError(
-            f"there is no {kind} driver {name!r}; installed are: "
-            f"{', '.join(sorted(points)) or 'none'}"
-        )
+        installed = ", ".join(driver_names(kind)) or "none"
+        raise ConfigurationError(f"there is no {kind} driver {name!r}; installed are: {installed}")
     try:
         loaded: type[Any] = points[name].load()
     except ImportError as error:

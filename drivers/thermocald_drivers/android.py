@@ -23,10 +23,11 @@ photograph whose focus, focal length or zoom has changed is rejected (`refuse_un
 does not report its focus, the status warns that it cannot be checked.
 
 The driver wakes and unlocks the phone (but enters no PIN), opens the camera app once and leaves it
-open, since a restart would focus again. A photograph is the single new file in the folder; it is
-accepted when its size no longer changes, all bytes were received and the JPEG is complete. Its time
-is the EXIF time, corrected by the phone's clock offset as measured at each open; without one, the
-time of the trigger.
+open, since a restart would focus again. A photograph is the single new JPEG in the folder; it is
+accepted when its size no longer changes, all bytes were received and it is complete (a vendor's
+data or a video may follow it). Its time is the EXIF time, corrected by the phone's clock offset as
+measured after each photograph; without one, the time of the trigger. A photograph that was taken
+more than 5 s before the trigger is rejected.
 Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 """
 
@@ -37,6 +38,7 @@ import math
 import re
 import time
 from datetime import UTC, datetime
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
@@ -45,6 +47,7 @@ from thermocald.errors import (
     BadReading,
     ConfigurationError,
     DeviceDenied,
+    DeviceError,
     DeviceGone,
     DeviceTimeout,
     PermanentDeviceError,
@@ -62,11 +65,10 @@ WAKE_KEY = 224
 OPEN_APP = "am start -a android.media.action.STILL_IMAGE_CAMERA"
 STATE = (
     "dumpsys power | grep -m1 mWakefulness=; "
-    "dumpsys window | grep -m1 -E 'mShowingLockscreen=|mDreamingLockscreen=|isKeyguardShowing='; "
-    "dumpsys window | grep -m1 mCurrentFocus="
+    "dumpsys window | grep -m1 -E 'mShowingLockscreen=|mDreamingLockscreen=|isKeyguardShowing='"
 )
 POLL_S = 0.1
-CLOCKS_DIFFER_S = 5.0
+CLOCKS_DIFFER_S, LATEST_S, COARSE_S = 5.0, 600.0, 0.2
 EXIF_IFD = 0x8769
 TAGS = {
     0x829A: "exposure_s",
@@ -77,8 +79,6 @@ TAGS = {
     0x9206: "subject_distance_m",
     0x920A: "focal_length_mm",
     0x9291: "subsecond",
-    0xA402: "exposure_mode",
-    0xA403: "white_balance",
     0xA404: "digital_zoom",
 }
 EXPOSURE = ("exposure_s", "iso")
@@ -117,7 +117,6 @@ class AndroidCamera(AdbPhone, Camera):
         self.folder = o.folder.rstrip("/")
         self._unchecked = ""
         self._first: dict[str, Any] | None = None
-        self._offset, self._zone = 0.0, ""
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
@@ -128,7 +127,6 @@ class AndroidCamera(AdbPhone, Camera):
         super().open()
         self._wake()
         self._require_space()
-        self._offset, self._zone, _ = self.clock_offset()
         self.shell(OPEN_APP)
 
     def warnings(self) -> list[str]:
@@ -147,20 +145,12 @@ class AndroidCamera(AdbPhone, Camera):
         triggered = time.time()
         self.shell(self.command)
         triggered = (triggered + time.time()) / 2.0
-        path, jpeg = self._new_photograph(set(before))
-        tags = exif(jpeg)
-        if (tags["width"], tags["height"]) != (self.options.width, self.options.height):
-            # after a good one, the app was set to another size: it may be set back
-            raise (BadReading if self._first else WrongDevice)(
-                f"{self.where}: the photograph has {tags['width']}×{tags['height']} px, not "
-                f"{self.options.width}×{self.options.height}; set the camera app to its full size"
-            )
-        tags |= focus_state(self.shell("dumpsys media.camera"))
+        path, jpeg, image = self._new_photograph(set(before))
+        tags = exif(jpeg) | focus_state(self.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered)
-        image, _ = support.decode(memoryview(jpeg), "JPEG", self.options.width, self.options.height)
         if self.options.delete:
-            self.shell(f"rm -f '{path}'")
+            self.shell(f"rm -f {quote(path)}")
         middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         return Frame(
@@ -190,43 +180,61 @@ class AndroidCamera(AdbPhone, Camera):
 
     def _require_space(self) -> None:
         """Raise PermanentDeviceError if the storage is full; unknown free space passes."""
-        lines = self.shell(f"df -k '{self.folder}' 2>/dev/null || df -k /sdcard").split("\n")
-        fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
-        if len(fields) >= 4 and fields[3].isdigit():
-            free_mb = int(fields[3]) / 1024.0
-            if free_mb < self.options.minimum_free_mb:
-                raise PermanentDeviceError(
-                    f"{self.where}: its storage is full ({free_mb:.0f} MB free, minimum "
-                    f"{self.options.minimum_free_mb:g}); delete photographs, or set delete: true"
-                )
+        text = self.shell(f"df -k {quote(self.folder)} 2>/dev/null || df -k /sdcard")
+        found = re.search(r"\s([0-9]+)\s+[0-9]+%\s", text)
+        free_mb = int(found[1]) / 1024.0 if found else math.inf
+        if free_mb < self.options.minimum_free_mb:
+            raise PermanentDeviceError(
+                f"{self.where}: its storage is full ({free_mb:.0f} MB free, minimum "
+                f"{self.options.minimum_free_mb:g}); delete photographs, or set delete: true"
+            )
 
-    def _new_photograph(self, before: set[str]) -> tuple[str, bytes]:
-        """Wait for the one new photograph to be complete; return its (path, bytes)."""
-        deadline = time.monotonic() + self.options.timeout_s
-        last_size, name, short = -1, "", ""
+    def _new_photograph(self, before: set[str]) -> tuple[str, bytes, support.Grey]:
+        """Wait for the one new photograph to be complete; return its (path, bytes, image)."""
+        o, deadline = self.options, time.monotonic() + self.options.timeout_s
+        problem: DeviceError | None = None
+        last_size = -1
         while time.monotonic() < deadline:
-            new = {
+            # an app hides a file until it is complete
+            visible = {
                 name: size
                 for name, size in self.listing(self.folder).items()
-                if name not in before
-                and name.lower().endswith((".jpg", ".jpeg"))
-                and not name.startswith((".pending", ".trashed"))
+                if name not in before and not name.startswith(".")
             }
+            new = {n: size for n, size in visible.items() if n.lower().endswith((".jpg", ".jpeg"))}
             if len(new) > 1:
                 raise BadReading(
                     f"{self.where}: {len(new)} new photographs ({', '.join(sorted(new))}); "
                     "switch off burst, HDR and RAW+JPEG copies, and do not touch the phone"
                 )
             for name, size in new.items():
-                if size > 0 and size == last_size:
-                    jpeg = self.pull(f"{self.folder}/{name}")
-                    if len(jpeg) == size and support.jpeg_end(jpeg):
-                        return f"{self.folder}/{name}", jpeg
-                    short = f"{name} has {len(jpeg)} of {size} bytes or its JPEG has no end"
-                last_size = size
+                problem = problem or BadReading(f"{self.where}: partial photograph, {name}")
+                complete, last_size = size == last_size > 0, size
+                if not complete:
+                    continue
+                jpeg = self.pull(f"{self.folder}/{name}")
+                try:
+                    image = support.decode_jpeg(jpeg)
+                except BadReading as error:
+                    problem = BadReading(f"{self.where}: partial photograph, {name}: {error}")
+                    continue
+                height, width = image.shape
+                if (width, height) == (o.width, o.height):
+                    return f"{self.folder}/{name}", jpeg, image
+                # an app may replace its preview yet; after a good one, its size may be set back
+                problem = (BadReading if self._first else WrongDevice)(
+                    f"{self.where}: the photograph has {width}×{height} px, not "
+                    f"{o.width}×{o.height}; set the camera app to its full size, and do not turn "
+                    "the phone"
+                )
             time.sleep(POLL_S)
-        if short or name:
-            raise BadReading(f"{self.where}: partial photograph, {short or name}")
+        if problem:
+            raise problem
+        if visible:
+            raise BadReading(
+                f"{self.where}: it stored {', '.join(sorted(visible))} but no JPEG; set the camera "
+                "app to JPEG (not HEIF, not RAW alone)"
+            )
         self._require_space()
         self._wake()
         raise DeviceTimeout(
@@ -254,27 +262,32 @@ class AndroidCamera(AdbPhone, Camera):
 
     def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> float:
         """Return the start of the exposure, s UTC on this machine's clock."""
-        stated = exposure_start(tags, self._zone)
+        offset, zone, uncertainty_s = self.clock_offset()  # the phone may set its clock at any time
+        stated = exposure_start(tags, zone)
         if stated is None:
             return triggered
         utc, resolution_s = stated
-        start = utc - self._offset
-        if abs(start - triggered) > CLOCKS_DIFFER_S:
+        start = utc - offset
+        if CLOCKS_DIFFER_S < triggered - start < LATEST_S:
+            raise BadReading(
+                f"{self.where}: the photograph was taken {triggered - start:.0f} s before the "
+                "trigger, and is that of an earlier one; the phone is slower than timeout_s"
+            )
+        if abs(start - triggered) > CLOCKS_DIFFER_S:  # its zone or date is not the phone's
             return triggered
-        if resolution_s >= 1.0:  # whole seconds: the trigger's time within that second
-            return min(max(triggered, start), start + 1.0)
+        spread_s = resolution_s + uncertainty_s
+        if spread_s > COARSE_S:  # whole seconds: the trigger's time within them
+            return min(max(triggered, start - uncertainty_s), start + spread_s)
         return start
 
 
 def exif(jpeg: bytes) -> dict[str, Any]:
-    """Return the TAGS of a photograph, and its `width`, `height`, `make` and `model`."""
+    """Return the TAGS of a photograph."""
     image_module = support.library("PIL.Image", "android")
     try:
         with image_module.open(io.BytesIO(jpeg)) as image:
             base = image.getexif()
             found = {name: _plain(base.get_ifd(EXIF_IFD).get(tag)) for tag, name in TAGS.items()}
-            found |= {"make": _plain(base.get(0x010F)), "model": _plain(base.get(0x0110))}
-            found |= {"width": image.width, "height": image.height}
     except (OSError, ValueError, SyntaxError) as error:
         raise BadReading(f"these {len(jpeg)} bytes are not a photograph") from error
     return {name: value for name, value in found.items() if value is not None}
@@ -298,11 +311,8 @@ def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | 
 
     zone: the time zone, +hhmm, of a photograph that states none. None without a valid time.
     """
-    text = tags.get("time")
-    if not isinstance(text, str):
-        return None
     try:
-        naive = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
+        naive = datetime.strptime(str(tags.get("time")), "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
     seconds = naive.replace(tzinfo=UTC).timestamp()

@@ -34,6 +34,7 @@ Source: android.hardware.thermal TemperatureType, AOSP BatteryService; dumps of 
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import socket
@@ -61,17 +62,18 @@ if TYPE_CHECKING:
     from thermocald.hal import Reading
 
 
-DENIED = (
-    "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); if no "
-    "dialog appears: developer options, 'Revoke USB debugging authorizations', re-plug"
-)
+DENIED = {
+    "unauthorized": "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick "
+    "'always'); if no dialog appears: developer options, 'Revoke USB debugging authorizations', "
+    "re-plug",
+    "permissions": "no permissions; see the udev rules in systemd/",
+}
+"""What the adb server says of a phone that it must not use, and advice."""
 OFFLINE = (
     "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
 )
 
 _CLOCK_S, _CLOCK_TRIES = 0.002, 12
-ADB_CLASSES = ("char-usb_device",)
-"""The nodes that an adb server opens if this driver starts it."""
 
 
 class PhoneOptions(DriverOptions):
@@ -117,7 +119,7 @@ def require_server(host: str, port: int, timeout_s: float, *, seen: bool) -> Non
 class AdbPhone(Device):
     """A phone's connection, shared by its drivers."""
 
-    device_classes = ADB_CLASSES
+    device_classes = ("char-usb_device",)  # of an adb server that this driver starts
     Options: ClassVar[type[DriverOptions]] = PhoneOptions
 
     def __init__(self, **options: Any) -> None:
@@ -125,12 +127,10 @@ class AdbPhone(Device):
         self.where = f"phone {self.options.serial}"
         self._lines: list[Any] = []
 
-    def identity(self) -> Mapping[str, str]:
-        return {"serial": self.options.serial}
-
     def open(self) -> None:
         """Find the phone among the server's devices; raises a DeviceError if it cannot be used."""
         adbutils = support.library("adbutils", "android")
+        logging.getLogger("adbutils").setLevel(logging.ERROR)  # it warns of old ones at each call
         o = self.options
         if not o.start_server:
             require_server(o.host, o.port, o.timeout_s, seen=self.seen)
@@ -158,14 +158,8 @@ class AdbPhone(Device):
                 f"{self.where}: not attached; adb lists {others}; {advice}",
                 seen=self.seen,
             )
-        state = states[0]
-        if state in ("unauthorized", "offline"):
-            raise self._translated(state)
-        if state == "no" or state.startswith("no perm"):  # "no permissions (…); see http…"
-            message = f"{self.where}: no permissions; see the udev rules in systemd/"
-            raise support.denied(message, seen=self.seen)
-        if state != "device":
-            raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
+        if states != ["device"]:
+            raise self._translated(f"its state is {states[0]!r}; let it boot into Android")
         self.handle, self.seen = client.device(serial=o.serial), True
 
     def shell(self, command: str) -> str:
@@ -211,11 +205,14 @@ class AdbPhone(Device):
         line.check_okay()
         text = line.read_until_close().split()
         end = time.time()
+        second, _, fraction = "".join(text[:1]).partition(".")
+        # without a fraction (old versions of Android): the middle of the second
+        half_s = 0.0 if fraction.isdecimal() else 0.5
         try:
-            phone = support.parse_number(text[0])
-        except (ValueError, IndexError) as error:
+            phone = half_s + support.parse_number(second if half_s else text[0])
+        except ValueError as error:
             raise BadReading(f"{self.where}: `date` prints {' '.join(text)!r}") from error
-        return phone - (start + end) / 2.0, "".join(text[1:2]), (end - start) / 2.0
+        return phone - (start + end) / 2.0, "".join(text[1:2]), half_s + (end - start) / 2.0
 
     def _call(self, action: Callable[[], Any]) -> Any:
         """Run an action; raises adbutils' errors as DeviceErrors by the server's answer."""
@@ -239,18 +236,17 @@ class AdbPhone(Device):
             self._lines.clear()
 
     def _translated(self, message: str) -> DeviceError:
-        if "unauthorized" in message:
-            return support.denied(f"{self.where}: {DENIED}", seen=self.seen)
+        for word, advice in DENIED.items():
+            if word in message:
+                return support.denied(f"{self.where}: {advice}", seen=self.seen)
         if "offline" in message:
             return DeviceGone(f"{self.where}: {OFFLINE}")
         if "connect to adb server" in message or "No adb exe" in message:
             server = f"{self.options.host}:{self.options.port}"
             return DeviceNotFound(f"no adb server at {server}: {message}")
-        if "not found" in message or "closed" in message or "Unknown data" in message:
-            return DeviceGone(f"{self.where}: {message}")
         if "chunk missing" in message or "Invalid sync" in message:
-            return DeviceGone(f"{self.where}: a transfer broke off ({message})")
-        return BadReading(f"{self.where}: {message}")
+            message = f"a transfer broke off ({message})"
+        return DeviceGone(f"{self.where}: {' '.join(message.split())}")
 
 
 ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'

@@ -85,10 +85,9 @@ class LedOutput(Output):
         self._good: bool | None = None
 
     def close(self) -> None:
-        led, self.handle = self.handle, None
-        if led is not None:
-            led.off()
-            led.close()
+        if self.handle is not None:
+            self.handle.off()
+        super().close()
 
     def emit(self, result: Mapping[str, Any]) -> None:
         led = self.opened()
@@ -125,10 +124,9 @@ class RelayOutput(HeatingOutput):
     def close(self) -> None:
         self._stop_watchdog()
         with self._lock:
-            relay, self.handle = self.handle, None
-            if relay is not None:
-                relay.off()
-                relay.close()
+            if self.handle is not None:
+                self.handle.off()
+            super().close()
 
     def measure(self, result: Mapping[str, Any]) -> float | None:
         self._stop_watchdog()

@@ -13,7 +13,8 @@ denied here with EBUSY. The chip's identity is checked when it is opened; 0xFFFF
 drives the bus. `channel` names the temperature.
 
 * TMP117 (±0.1 °C): one one-shot conversion of 8 averages per reading. The driver waits for
-  Data_Ready, so that no value is read twice; 0x8000 precedes the first conversion (SNOSD82D, 7.6).
+  Data_Ready, so that no value is read twice; −256 °C precedes the first conversion, and is out of
+  range (SNOSD82D, 7.6).
 * MCP9808 (±0.25 °C): bits 15–13 of the register are alert flags, bit 12 the sign (DS25095A, 5).
 * LM75 family, `chip`: lm75 (also LM75A, LM75B, which use two more bits), lm75b, tmp75, tmp102. They
   have no identity: the driver checks the bits that a chip leaves at zero, in its limits as well
@@ -40,8 +41,6 @@ from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from thermocald.hal import Reading
 
 
@@ -96,11 +95,6 @@ class I2cThermometer(support.CheckedThermometer):
 
     def named_channels(self) -> list[str]:
         return [self.options.channel]
-
-    def identity(self) -> Mapping[str, str]:
-        return {
-            "chip": self.chip, "address": f"0x{self.address:02x}", "bus": str(self.options.bus)
-        }  # fmt: skip
 
     def read(self) -> Reading:
         self.opened()
@@ -171,10 +165,7 @@ class Tmp117Thermometer(I2cThermometer):
         self._write(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
         self._wait(0.1245)
         self._await(self.CONFIGURATION, self.DATA_READY, self.DATA_READY, 0.01)
-        raw = self._driven(self._read(self.TEMPERATURE))
-        if raw == 0x8000:
-            raise BadReading(f"{self.where}: 0x8000, the power-on value; no conversion took place")
-        return signed(raw, 16) / 128.0, ""
+        return signed(self._driven(self._read(self.TEMPERATURE)), 16) / 128.0, ""
 
 
 class _ConvertingThermometer(I2cThermometer):
@@ -284,10 +275,11 @@ class Sht3xThermometer(I2cThermometer):
     chip = "SHT3x"
     addresses = (0x44, 0x45)
     range_c = (-40.0, 125.0)
-    SINGLE_SHOT_HIGH, SERIAL_NUMBER, SOFT_RESET = 0x2400, 0x3780, 0x30A2
+    SINGLE_SHOT_HIGH, SERIAL_NUMBER, BREAK, SOFT_RESET = 0x2400, 0x3780, 0x3093, 0x30A2
 
     def _identify(self) -> None:
-        self._command(self.SOFT_RESET, 0.002)  # ends the periodic mode of an earlier program
+        self._command(self.BREAK, 0.001)  # in the periodic mode of an earlier program, before any
+        self._command(self.SOFT_RESET, 0.002)
         self._command(self.SERIAL_NUMBER, 0.001)
         self._words(2)
 
@@ -326,25 +318,26 @@ class Bme280Thermometer(I2cThermometer):
 
     def _identify(self) -> None:
         self._expect("the identity", self._read(self.IDENTITY, 0xFF), 0x60)
-        table = self._block(self.CALIBRATION, 26)
-        if table in (bytes(26), b"\xff" * 26):
-            raise BadReading(f"{self.where}: the calibration registers are empty")
-        self._calibration = struct.unpack("<Hhh", table[:6])
+        self._calibration()
 
-    def _block(self, register: int, size: int) -> bytes:
-        return bytes(self.handle.read_i2c_block_data(self.address, register, size))
+    def _calibration(self) -> tuple[int, ...]:
+        table = bytes(self.handle.read_i2c_block_data(self.address, self.CALIBRATION, 6))
+        if table in (bytes(6), b"\xff" * 6):
+            raise BadReading(f"{self.where}: the calibration registers are empty")
+        return struct.unpack("<Hhh", table)
 
     def _measure(self) -> tuple[float, str]:
         self._write(self.CONTROL_HUMIDITY, 0b001, 0xFF)
         self._write(self.CONTROL, self.FORCED_X2_X1, 0xFF)
         self._wait(0.012)
         self._await(self.STATUS, self.MEASURING, 0, 0.005)
-        data = self._block(self.DATA, 8)
+        data = self.handle.read_i2c_block_data(self.address, self.DATA, 8)
         self._driven(data[6] << 8 | data[7])
         raw = data[3] << 12 | data[4] << 4 | data[5] >> 4
         if chips.is_idle_word("bme280", raw):
             raise BadReading(f"{self.where}: 0x{raw:05x}, the temperature was not measured")
-        return bme280_celsius(raw, self._calibration), ""
+        # read each time: the chip may have been exchanged between two readings
+        return bme280_celsius(raw, self._calibration()), ""
 
 
 def bme280_celsius(raw: int, calibration: tuple[int, ...]) -> float:

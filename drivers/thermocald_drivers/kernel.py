@@ -100,14 +100,8 @@ class _KernelThermometer(support.CheckedThermometer):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        o = self.options
-        if o.minimum_c >= o.maximum_c:
-            raise ConfigurationError(
-                f"minimum_c {o.minimum_c:g} is not below maximum_c {o.maximum_c:g}"
-            )
-        self.chip = self.where = getattr(o, self.key)
-        self.sysfs = Path(o.sysfs)
-        self.range_c = o.minimum_c, o.maximum_c
+        self.chip = self.where = getattr(self.options, self.key)
+        self.sysfs = Path(self.options.sysfs)
         self._channels: dict[str, str] = {}
         self._name = ""
 
@@ -153,9 +147,6 @@ class _KernelThermometer(support.CheckedThermometer):
 
     def named_channels(self) -> list[str]:
         return list(self.options.channels)
-
-    def identity(self) -> Mapping[str, str]:
-        return {"chip": self.chip, "path": str(self.handle or "")}
 
     def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
         """Return {channel: kernel's input} by the option `channels`."""

@@ -126,6 +126,7 @@ class MockDevice(Device):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self.timeout_s = 0.0  # the option is the length of a fault
         self._calls = 0
         self._started: float | None = None
 
@@ -138,8 +139,7 @@ class MockDevice(Device):
         self.handle = True
 
     def identity(self) -> Mapping[str, str]:
-        seed = getattr(self.options, "seed", 0)
-        return {"name": self.where, "serial": f"mock-{seed}"}
+        return {**super().identity(), "serial": f"mock-{getattr(self.options, 'seed', 0)}"}
 
     def _fault(self, call: int) -> Kind | None:
         elapsed = self._elapsed(self.clock.monotonic())

@@ -31,12 +31,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceError, DeviceGone
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone
 from thermocald.hal import DriverOptions, Found
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from concurrent.futures import Future
 
     from thermocald.hal import Reading
@@ -115,7 +114,6 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         attempts: Annotated[int, Field(ge=1, le=10)] = 2
         sysfs: support.Text = "/sys"
 
-    where = "1-wire"
     range_c = (-55.0, 125.0)
 
     def __init__(self, **options: Any) -> None:
@@ -124,6 +122,8 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         ids = list(self.sensors.values())
         if twice := {rom for rom in ids if ids.count(rom) > 1}:
             raise ConfigurationError(f"sensors: {min(twice)} is given twice")
+        self.where = f"1-wire {', '.join(ids)}"
+        self.timeout_s *= len(ids)
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
         self._pending: dict[str, Future[float]] = {}
 
@@ -149,18 +149,15 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         if not any((self.root / rom).is_dir() for rom in self.sensors.values()):
             there = ", ".join(sorted(p.name for p in self.root.glob("??-*"))) or "no sensor"
             raise support.absent(
-                f"1-wire {', '.join(self.sensors.values())}: not on the bus, there is {there}; "
-                "check dtoverlay=w1-gpio and the wiring",
+                f"{self.where}: not on the bus, there is {there}; check "
+                "dtoverlay=w1-gpio and the wiring",
                 seen=self.seen,
             )
         self.handle = self.seen = True
 
-    def identity(self) -> Mapping[str, str]:
-        return {"sensors": ", ".join(self.sensors.values())}
-
     def read(self) -> Reading:
         self.opened()
-        deadline = self.clock.monotonic() + self.options.timeout_s * len(self.sensors)
+        deadline = self.clock.monotonic() + self.timeout_s
         for channel in self.sensors:
             late = self._pending.get(channel)
             if late is None or late.done():  # a sensor that still hangs is not read twice
@@ -177,14 +174,12 @@ class Ds18b20Thermometer(support.CheckedThermometer):
 
     def _await(self, channel: str, deadline: float) -> float:
         """Wait for a sensor's thread and return its result."""
-        patience_s = self.options.timeout_s * len(self.sensors)
-        late = f"1-wire {self.sensors[channel]}: no answer in {patience_s:g} s"
+        late = f"1-wire {self.sensors[channel]}: no answer in {self.timeout_s:g} s"
         left_s = deadline - self.clock.monotonic()
         return float(support.result_in_time(self._pending[channel], left_s, late))
 
     def _read_one(self, channel: str) -> float:
         rom = self.sensors[channel]
-        problem: DeviceError | None = None
         for _ in range(self.options.attempts):
             try:
                 content = (self.root / rom / "w1_slave").read_text(
@@ -193,11 +188,8 @@ class Ds18b20Thermometer(support.CheckedThermometer):
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
                 idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
                 return self.judge(channel, f"1-wire {rom}", value, idle)
-            except BadReading as error:
-                problem = error
-            except OSError as error:
+            except OSError as error:  # also a BadReading
                 problem = support.fault(error, f"1-wire {rom}", seen=True)
                 if isinstance(problem, DeviceGone):
                     raise DeviceGone(f"1-wire {rom}: is not on the bus") from error
-        assert problem is not None
         raise problem

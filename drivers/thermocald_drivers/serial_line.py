@@ -12,7 +12,7 @@ r"""Thermometers that send lines of text on a serial port.
         unit: F                                 # C (default), F, K; mA: of a 4 … 20 mA loop
         scale: 1.0                              # factor of the printed number
         offset: 0.0                             # added after the scale
-        timeout_s: 2
+        timeout_s: 2                            # without a command: more than between two lines
         minimum_c: -60                          # and maximum_c: 125; instruments: -100 … 300
         chip: sht31                             # the sensor behind the firmware, if known
         refuse_c: [-127, -50, -46.85, -45, 85]  # values that mean "no sensor"
@@ -29,14 +29,16 @@ are rejected as **printed**, before scale and offset, rounded or truncated as in
 `refuse_c` replaces the list, and [] accepts all. Accepted only with a recent reading within 5 K are
 0, words of all ones, the ends of displays and transmitters (-99.9, -200, 850), and with `chip` its
 further idle values (25.00 of an LSM6DS3). A number is rejected as incomplete if it has fewer
-decimals than earlier lines, or begins or ends with its point. With `instrument`, the instrument's
+decimals than earlier lines, begins or ends with its point, or if the pattern skips a digit, sign or
+point beside it (`.*`). With `instrument`, the instrument's
 own error texts serve instead. A loop current below 3.6 or above 21 mA means a broken loop (NAMUR
 NE 43).
 
 A line that was in the queue before the reading was requested is never used. With `command`, the
 driver waits until the line is quiet, discards the end of an unfinished line and then repeats the
-command; without it, the next line that *ends* after the call counts. Echo, garbage and prompts are
-skipped until `timeout_s`; the error then quotes what was received.
+command; without it, the next line that *ends* after the call counts, the first after opening only
+if a pause of 2 s precedes it. Echo, garbage and prompts are skipped until `timeout_s`; the error
+then quotes what was received.
 Source: the instruments' manuals, named with each.
 """
 
@@ -63,10 +65,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
+WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?")
 FRAMING = "is not data bits, parity (N, E, O) and stop bits, such as 8N1"
 LONGEST_LINE = 512
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
 """Degree signs of other encodings as Latin-1 text: masculine ordinal, 0xF8, 0xDF."""
+PAUSE_S = 2.0
 POLL_S = 0.05  # changing pyserial's time-out later would configure the port again
 QUEUE = 4000
 """A queue of this many bytes may have overflowed the kernel's buffer (4096)."""
@@ -133,7 +137,7 @@ class SerialThermometer(support.CheckedThermometer):
         scale: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
         offset: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
         checksum: Literal["none", "xor", "sum8", "nmea"] = "none"
-        timeout_s: support.Seconds = 2.0
+        timeout_s: Annotated[float, Field(ge=0.01, le=3600.0)] = 2.0
         minimum_c: support.Celsius = -60.0
         maximum_c: support.Celsius = 125.0
         chip: support.Text | None = None
@@ -173,7 +177,6 @@ class SerialThermometer(support.CheckedThermometer):
             raise ConfigurationError("pattern: name the value, such as (?P<temperature>[-+0-9.]+)")
         if o.checksum != "none" and "checksum" not in self.pattern.groupindex:
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
-        self.range_c = o.minimum_c, o.maximum_c
         self._decimals: dict[str, tuple[int, bool, int]] = {}
         self._line = b""
         self._synchronous = False
@@ -221,9 +224,6 @@ class SerialThermometer(support.CheckedThermometer):
         if not self.command:
             self._line, self._synchronous = b"", False
 
-    def identity(self) -> Mapping[str, str]:
-        return {"instrument": self.options.instrument or "serial line", "port": self.options.port}
-
     def named_channels(self) -> list[str]:
         return list(self.channels)
 
@@ -248,7 +248,7 @@ class SerialThermometer(support.CheckedThermometer):
         if not there:
             raise BadReading(f"{self.where}: {match.string!r} has no value")
         measures = {
-            channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match[channel]))
+            channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match))
             for channel in there
         }
         reading = self.reading(measures, start)
@@ -288,7 +288,8 @@ class SerialThermometer(support.CheckedThermometer):
 
     def _next_match(self) -> tuple[re.Match[str], float]:
         """Return the next line that matches, and the machine's monotonic time at its end."""
-        deadline = time.monotonic() + self.options.timeout_s
+        heard = time.monotonic()
+        deadline = heard + self.options.timeout_s
         skipped: list[str] = []
         problem = ""
         while True:
@@ -313,7 +314,11 @@ class SerialThermometer(support.CheckedThermometer):
                 self._line, self._synchronous = b"", False
             if time.monotonic() >= deadline:
                 raise self._nothing(skipped, problem)
-            self._line += self._received()
+            if received := self._received():
+                heard = time.monotonic()
+            elif not self._line.strip(b"\0") and time.monotonic() - heard > PAUSE_S:
+                self._synchronous = True  # what comes next is the start of a line
+            self._line += received
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
         """Return the error for a time-out, which names the fault of the lines received."""
@@ -344,10 +349,16 @@ class SerialThermometer(support.CheckedThermometer):
             return ""
         return f"checksum {given} in {match.string!r}, computed {computed:02X}"
 
-    def _celsius(self, channel: str, text: str) -> float:
+    def _celsius(self, channel: str, match: re.Match[str]) -> float:
         """Convert a printed number to °C; BadReading if it means that nothing was measured."""
+        text = match[channel]
         number = support.parse_number(text, comma=True)
         where = f"{self.where}, {channel}: {text}"
+        if skipped := self._skipped(match, channel):
+            raise BadReading(
+                f"{where} may be a part of a number: the pattern skips {skipped!r} beside it; "
+                "write what precedes and follows the number into the pattern"
+            )
         exponent = Decimal(text.strip().replace(",", ".")).as_tuple().exponent
         decimals = max(0, -int(exponent))
         self._require_whole(channel, re.split("[eE]", text.strip())[0], where)
@@ -366,6 +377,16 @@ class SerialThermometer(support.CheckedThermometer):
             )
         idle = self._idle(number, decimals) if self.options.refuse_c else ""
         return self.judge(channel, where, celsius, idle)
+
+    def _skipped(self, match: re.Match[str], channel: str) -> str:
+        """Return a character of the number that the pattern skips, as `.*` does, or ""."""
+        line, (begin, end) = match.string, match.span(channel)
+        for number in WHOLE_NUMBER.finditer(line):
+            for cut, beside in ((begin, begin - 1), (end, end)):
+                blanked = f"{line[:beside]}\0{line[beside + 1 :]}"
+                if number.start() < cut < number.end() and self.pattern.fullmatch(blanked):
+                    return line[beside]
+        return ""
 
     def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
         """Raise BadReading for a number that lost digits, since firmware always prints as many.

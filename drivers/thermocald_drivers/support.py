@@ -223,15 +223,20 @@ def result_in_time(task: Future[Any], seconds: float, late: str) -> Any:
 class CheckedThermometer(Thermometer):
     """A thermometer that checks the temperatures of its channels, and makes its readings of them.
 
-    range_c: of the sensor. An idle value, which a chip reports without having measured (see
-    `chips`), is accepted only if a reading less than NEIGHBOUR_AGE_S old, since the opening, lies
-    within NEIGHBOUR_STEP_K of it. An idle value never supports another.
+    range_c: of the sensor; the options minimum_c and maximum_c replace it. An idle value, which a
+    chip reports without having measured (see `chips`), is accepted only if a reading less than
+    NEIGHBOUR_AGE_S old, since the opening, lies within NEIGHBOUR_STEP_K of it. An idle value never
+    supports another.
     """
 
     range_c: tuple[float, float]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        if hasattr(self.options, "minimum_c"):
+            self.range_c = low_c, high_c = self.options.minimum_c, self.options.maximum_c
+            if low_c >= high_c:
+                raise ConfigurationError(f"minimum_c {low_c:g} is not below maximum_c {high_c:g}")
         self._checked: dict[str, tuple[float, float]] = {}
         self._numbers: dict[str, tuple[float, float]] = {}
 
@@ -362,26 +367,24 @@ def _grey(data: memoryview, fourcc: str, width: int, height: int, stride: int) -
     return cast("Grey", cv2.cvtColor(image, conversion))
 
 
-def jpeg_end(data: bytes) -> bool:
-    """Return whether the bytes start and end like a JPEG; cameras pad the end with zeros."""
-    return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
+def decode_jpeg(encoded: bytes) -> Grey:
+    """Return a JPEG's grey image; cameras pad its end, and phones append a video or other data."""
+    import simplejpeg
+
+    try:
+        return np.ascontiguousarray(simplejpeg.decode_jpeg(encoded, colorspace="GRAY")[:, :, 0])
+    except ValueError as error:
+        raise BadReading(f"partial frame or broken JPEG, {len(encoded)} bytes ({error})") from error
 
 
 def decode(
     data: memoryview, fourcc: str, width: int, height: int, stride: int = 0
 ) -> tuple[Grey, bytes | None]:
     """Return (grey image, the JPEG as received or None); the buffer may then be reused."""
-    if fourcc not in ("MJPG", "JPEG"):
+    if fourcc != "MJPG":
         return _grey(data, fourcc, width, height, stride), None
-    import simplejpeg
-
     encoded = bytes(data)
-    if not jpeg_end(encoded):
-        raise BadReading(f"partial frame: {len(encoded)} bytes without the end of a JPEG")
-    try:
-        grey = simplejpeg.decode_jpeg(encoded, colorspace="GRAY")[:, :, 0]
-    except ValueError as error:
-        raise BadReading(f"broken JPEG: {error}") from error
+    grey = decode_jpeg(encoded)
     if grey.shape != (height, width):
         raise BadReading(f"the JPEG has {grey.shape[1]}×{grey.shape[0]} px, not {width}×{height}")
-    return np.ascontiguousarray(grey), encoded
+    return grey, encoded

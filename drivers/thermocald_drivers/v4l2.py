@@ -187,8 +187,7 @@ class V4l2Camera(Camera):
         return support.automatic_warnings(self._wanted)
 
     def identity(self) -> Mapping[str, str]:
-        card = self.handle.card if self.handle else ""
-        return {"device": str(self.options.device or self.options.serial), "card": card}
+        return {**super().identity(), "card": self.handle.card if self.handle else ""}
 
     def capture(self) -> Frame:
         stream: Stream = self.opened()

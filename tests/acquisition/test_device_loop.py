@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from thermocald.acquisition.device_loop import Link, OutputLoop, Schedule
+from thermocald.acquisition.device_loop import DeviceLoop, Link, OutputLoop, Schedule
 from thermocald.errors import DeviceDenied, DeviceGone, DeviceNotFound, WrongDevice
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
@@ -65,6 +65,14 @@ def test_fast_ticks_back_off(clock, link_of):
     poll(link, 600, 0.05)
     assert 10 < len(attempts) < 40  # not 600: the pauses grow to 2 s
     assert max(b - a for a, b in pairwise(attempts)) <= 2.1
+
+
+def test_a_slow_logger_does_not_hang_within_its_time_out(clock, link_of):
+    loop = DeviceLoop(link_of(), lambda: None, begin=0.0)
+    loop.link.device.timeout_s, loop._busy_since = 300.0, clock.monotonic()
+    for busy_s in (0.0, 100.0):
+        clock.advance(200.0)
+        assert loop.busy_s() == busy_s
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -40,14 +41,11 @@ def test_photographs_by_the_triggers_of_the_vendors(bench, fake, trigger, comman
     assert frame.exposure == pytest.approx(1 / 60, rel=1e-4)
     assert fake.commands.count(command) == 2
     assert len(fake.files) == 3  # they are deleted only when told
-    with bench.device(**trigger, delete=True) as device:
-        device.capture()
-    assert len(fake.files) == 3
 
 
 @pytest.mark.parametrize("offset", [0.0, 37.25, -7200.0])
 def test_the_time_is_exifs_with_the_phones_clock_compared(bench, fake, offset):
-    exposed = []
+    exposed, fake.clock_offset = [], -1.0
 
     def with_lag(fake):
         time.sleep(0.15)  # of the shutter, which the trigger's time lacks
@@ -55,17 +53,18 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(bench, fake, offset):
         shoot()(fake)
         exposed.append(time.time())
 
-    fake.clock_offset, fake.shoot = offset, with_lag
+    fake.shoot = with_lag
     with bench.device() as device:
+        fake.clock_offset = offset  # it is set at any time
         frame = device.capture()
     before, after = exposed
     assert before - 0.005 < frame.utc - 1 / 120 < after + 0.005
 
 
-def test_without_fractions_or_with_a_clock_that_was_set_it_is_the_triggers(bench, fake):
+def test_without_fractions_or_in_another_zone_it_is_the_triggers(bench, fake):
+    fake.shoot = shoot(subsecond=None)
     with bench.device() as device:
-        for knob, value in (("shoot", shoot(subsecond=None)), ("clock_offset", 3600.0)):
-            setattr(fake, knob, value)
+        for fake.date in ("%.9f +0000", "%d.%%N +0000", "%.9f +0100"):
             time.sleep((0.6 - time.time()) % 1)  # s that a whole second would be off
             called = time.time()
             assert called - 0.2 < device.capture().utc < time.time()
@@ -93,15 +92,22 @@ def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half
     assert one.clock_offset() == (pytest.approx(offset), "+0000", pytest.approx(half))
 
 
-def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench, fake):
+@pytest.mark.parametrize(  # nothing, Samsung's trailer, a video, the gain map of Ultra HDR
+    "after", [b"", b"Image_UTC_DataSEFT", b"\0\0\0\x18ftypmp42", photograph(0.0, size=(32, 16))]
+)
+def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench, fake, after):
+    whole = photograph(time.time()) + after
+
     def action(fake):
         fake.add(".pending-1-IMG.jpg", b"half")
         fake.add("IMG_2.dng", b"raw")
-        shoot(writing_s=0.4)(fake)
+        fake.add("Bob's 照片.JPG", photograph(0.0, size=(48, 32)))  # a preview, which is replaced
+        threading.Timer(0.1, fake.add, ("Bob's 照片.JPG", whole, 0.4)).start()
 
     fake.shoot = action
-    with bench.device() as device:
-        assert device.capture().encoded.endswith(b"\xff\xd9")
+    with bench.device(delete=True) as device:
+        assert device.capture().encoded == whole
+    assert sorted(fake.files) == [".pending-1-IMG.jpg", "IMG_2.dng"]
 
 
 @pytest.mark.parametrize("refuse", [False, None, True])

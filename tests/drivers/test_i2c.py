@@ -31,7 +31,7 @@ HELD = [
     *(
         ("tmp117", {}, tmp117(raw), value)
         for raw, value in [(0x0001, 0.0078125), (0x0C80, 25.0), (0xF380, -25.0), (0x3200, 100.0),
-                           (0xE480, -55.0), (0x8000, "0x8000")]
+                           (0xE480, -55.0), (0x8000, "-256 °C is outside")]
     ),
     ("tmp117", {}, tmp117(ready=False), "did not end"),
     *(
@@ -48,6 +48,7 @@ HELD = [
     *((name, {}, chip(0xFFFF), "0xFFFF") for name, chip in (
         ("mcp9808", mcp9808), ("tmp117", tmp117), ("lm75", lm75))),
     ("bme280", {}, bme280(adc_h=0xFFFF), "0xFFFF"),
+    ("sht3x", {}, sht3x(periodic=True), pytest.approx(25.0, abs=0.005)),
     ("sht3x", {}, sht3x(0x0000), "outside"),
     ("sht3x", {}, sht3x(0xFFFE), "outside"),
     ("bme280", {}, bme280(adc_t=0x80000), "0x80000"),
@@ -100,6 +101,14 @@ def test_the_power_up_register_is_not_zero_degrees(bus, name, options, chip, zer
                 bus.chips[place] = chip(word)
                 assert device.read().values == {"temperature": celsius}
             device.clock.advance(61.0)
+
+
+def test_a_bme280_that_is_exchanged_between_two_readings_has_its_own_calibration(bus):
+    bus.chips[0x76] = chip = bme280()
+    with thermometer("bme280") as device:
+        for k, byte in enumerate(bytes.fromhex("456f 6f68 3200")):  # dig_T1 … dig_T3
+            chip.registers[0x88 + k] = bytes([byte])
+        assert device.read().values == {"temperature": pytest.approx(20.440, abs=0.001)}
 
 
 def test_a_chip_that_has_just_been_powered_is_read_again(bus, monkeypatch):

@@ -7,6 +7,7 @@ import time
 from contextlib import ExitStack, closing
 
 import pytest
+from thermocald_drivers import serial_line
 
 from tests.drivers.fakes.pty_instrument import Instrument
 from tests.drivers.laboratory import check_readings
@@ -138,6 +139,29 @@ def test_the_rest_of_a_late_line_is_no_answer(instrument, line, reopened):
         far.answers = {b"?\r": [rest + b"+018.25C\r", b"+018.25C\r", b"+018.25C\r"]}
         with closing(device):
             assert device.read().values["temperature"] == 18.25 or not line[:cut].strip()
+
+
+def test_a_pattern_that_takes_a_part_of_a_number(instrument):
+    for pattern, line, expected in (
+        (r".*(?P<t>[-+]?\d+\.\d+).*", "T=21.55 C", "skips '2'"),  # 1.55: `.*` takes what it can
+        (r".*?(?P<t>\d+\.\d+).*", "T=-5.25 C", "skips '-'"),
+        (r".*?(?P<t>\d+).*", "T=21.55 C", r"skips '\.'"),
+        (r"CH1-(?P<t>[-+]?\d+\.\d+)", "CH1-23.4", 23.4),
+        (r".*(?P<t>[-+]\d+\.\d)C", "0R0+021.5C", 21.5),
+    ):
+        far = instrument({b"T?\r\n": line.encode() + b"\r\n"})
+        with asked(far, pattern=pattern) as device:
+            check_readings(device, lambda _: None, [(line, expected)])
+
+
+def test_the_first_line_after_a_pause_is_whole(instrument, monkeypatch):
+    monkeypatch.setattr(serial_line, "PAUSE_S", 0.2)  # of a logger with one line per ten minutes
+    far = instrument()
+    with thermometer(far, pattern=PATTERN, timeout_s=0.6) as device:
+        far.send(b"\0")
+        thread = later(lambda: far.send(b"T=21.50\r\n"), 0.4)
+        assert device.read().values == {"temperature": 21.5}
+        thread.join()
 
 
 def test_a_port_that_another_program_holds(instrument):

@@ -52,6 +52,7 @@ WRONG = {
         ({"pattern": PATTERN, "scale": 0.0}, "0 makes every number the same"),
         ({"pattern": PATTERN, "chip": "sht99"}, "chip: 'sht99' is not one of"),
         ({"pattern": PATTERN, "command": "T°"}, "command"),
+        ({"pattern": PATTERN, "minimum_c": 200}, "minimum_c 200 is not below maximum_c 125"),
     ]),
     ("thermometer", "mock"): ({}, [
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),

@@ -278,9 +278,10 @@ class DeviceLoop:
         return not self._thread.is_alive()
 
     def busy_s(self) -> float:
-        """Return how long the current call has taken, s; 0 between calls."""
+        """Return how long the current call has taken beyond its time-out, s; 0 between calls."""
         since = self._busy_since
-        return 0.0 if since is None else self.clock.monotonic() - since
+        allowed_s: float = self.link.device.timeout_s
+        return 0.0 if since is None else max(0.0, self.clock.monotonic() - since - allowed_s)
 
     def _run(self) -> None:
         try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import shlex
 import socket
 import struct
 import time
@@ -73,6 +74,7 @@ class FakePhone:
 
     folder: str = "/sdcard/DCIM/Camera"
     clock_offset: float = 0.0
+    date: str = "%.9f +0000"
     files: dict[str, bytes] = field(default_factory=dict)
     growing: dict[str, tuple[float, float]] = field(default_factory=dict)
     awake: bool = False
@@ -109,12 +111,12 @@ class FakePhone:
             self.awake, self.locked = True, self.stays_locked
         if command == self.trigger and self.shoot:
             self.shoot(self)
-        if match := re.match(r"rm -f '(.*)'", command):
-            self.files.pop(match[1].rsplit("/", 1)[1], None)
+        if command.startswith("rm -f"):
+            self.files.pop(shlex.split(command)[2].rsplit("/", 1)[1], None)
         if command.startswith(("timeout", "pkill")):
             self.load = command.startswith("timeout")
         answers = {
-            "date": f"{self.now():.9f} +0000\n",
+            "date": self.date % self.now() + "\n",
             "dumpsys power": f"  mWakefulness={'Awake' if self.awake else 'Asleep'}\n"
             f"  mShowingLockscreen={str(self.locked).lower()}\n",
             "df": f"Filesystem 1K-blocks Used Available Use% On\n/dev/x 9 9 {self.free_kb} 9% /\n",
@@ -180,12 +182,14 @@ class AdbServer(LineServer):
         command, size = struct.unpack("<4sI", stream.read(8))
         path = stream.read(size).decode()
         if command == b"LIST":
-            entries = [(".", 0o040755, 0)]
+            entries = [(b".", 0o040755, 0)]
             if path == phone.folder:
-                entries += [(n, 0o100660, len(phone.content(n))) for n in list(phone.files)]
+                entries += [
+                    (n.encode(), 0o100660, len(phone.content(n))) for n in list(phone.files)
+                ]
             for name, mode, length in entries:
                 head = struct.pack("<4sIIII", b"DENT", mode, length, 1_700_000_000, len(name))
-                line.sendall(head + name.encode())
+                line.sendall(head + name)
             line.sendall(b"DONE" + bytes(16))
         elif command == b"RECV":
             data = phone.content(path.rsplit("/", 1)[1])

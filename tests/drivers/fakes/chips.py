@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 
 from thermocald_drivers.i2c import crc8
 
-from tests.drivers.fakes.smbus import Chip
+from tests.drivers.fakes.smbus import Chip, os_error
 
 
 def mcp9808(raw=0xC190, configuration=0x0000):
@@ -37,7 +38,7 @@ def lm75(raw=0x1900, configuration=0x00):
     return chip
 
 
-def sht3x(temperature=0x6666, damage=0):
+def sht3x(temperature=0x6666, damage=0, periodic=False):
     chip = Chip()
 
     def words(*values):
@@ -45,7 +46,11 @@ def sht3x(temperature=0x6666, damage=0):
         return bytes([data[0] ^ damage]) + data[1:]
 
     def answer(self, register, data):
+        nonlocal periodic
         command = register << 8 | data[0]
+        periodic &= command != 0x3093  # SHT3x-DIS v6, 4.8: break; 4.9: any other when idle
+        if periodic:
+            raise os_error(errno.EREMOTEIO)
         if command == 0x3780:
             self.reply = words(0x0BAD, 0xCAFE)
         elif command == 0x2400:
@@ -56,8 +61,8 @@ def sht3x(temperature=0x6666, damage=0):
 
 
 # Calibration and raw values of the worked example of the BMP280 data sheet (BST-BMP280-DS001, 3.12)
-# of the temperature: dig_T1 … dig_T3; the driver reads the 20 further bytes and ignores them
-CALIBRATION = struct.pack("<Hhh", 27504, 26435, -1000) + bytes(20)
+# of the temperature: dig_T1 … dig_T3
+CALIBRATION = struct.pack("<Hhh", 27504, 26435, -1000)
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 

@@ -38,7 +38,7 @@ _STATED = re.compile(
     r"|[(\[{<]\s*[o*]?(?P<bracket>[CFK])\.?\s*[)\]}>,]"
     r"|(?P<word>celsius|f\w?[ah]r?h?r?[ae]n?h?ei[td]|fahr(?![^\W\d_])|kelvin)"
     r"|(?P<sign>[℃℉])|(?P<chinese>[华華]氏)"
-    r"|temp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
+    r"|te?mp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
@@ -63,7 +63,7 @@ def without_unit(text: str) -> str:
     while found := _STATED.search(text):
         begin = found.start("temp") if found["temp"] else found.start()
         text = f"{text[:begin]} {text[found.end() :]}"
-    return " ".join(text.split()).strip(" _.,/-()[]{}")
+    return " ".join(text.split()).replace("_ _", "_").strip(" _.,/-()[]{}")
 
 
 def to_celsius(values: Array, unit: str) -> Array:
@@ -239,7 +239,10 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)  # as vcgencmd writes it
+    # `temp=` of vcgencmd, a head of NumPy
+    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)
+    if mark == " ":
+        plain = (line.removeprefix("# ") for line in plain)
     reader = csv.reader(plain, delimiter=mark, skipinitialspace=True)
     try:
         for row in reader:
@@ -390,7 +393,7 @@ def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
 
 TEMPERATURE_NAME = re.compile(
     r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
-    r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
+    r"|\bt\d*\b|\btt_|\btmp|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
     re.IGNORECASE,
 )
 OTHER_NAME = re.compile(

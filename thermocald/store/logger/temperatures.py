@@ -38,12 +38,12 @@ from thermocald.store.logger.dialect import (
     to_celsius,
 )
 from thermocald.store.logger.options import (
-    LABEL,
     LogOptions,
     channel_name,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
+    label_columns,
     quoted,
     require_columns,
 )
@@ -58,13 +58,15 @@ from thermocald.store.recording.sense import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
-_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNORECASE)
+_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*|[a-z]+/[\w/]+)$", re.IGNORECASE)
+_UNCLEAR = re.compile(r"(?<![^\W_])(?:[A-Z]{1,2}[SD]T|MSK|МСК|HKT|SGT)(?![^\W_])")
 """A line above the table that states the time zone; cities behind it may have summer time."""
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
@@ -74,11 +76,15 @@ _CHANGES = "last_changed"
 _LONGEST_PAUSE_S = 86400.0
 _NO_READING = {
     -127.0, -196.6, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 3276.7, 9999.0, 9999.99,
+    -6999.0, 6999.0, -7999.0, 7999.0,
 }  # fmt: skip
 """Numbers that stand for none: -196.6 is the -127 of the DS18B20 in °F, 3276.7 a full register."""
+_TENTHS = re.compile(r"([+-]\d{3})(\d),\d")
+"""A temperature of NOAA's integrated surface data: tenths, and a code of quality."""
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _LATEST_S = 1e11
+_HOURS = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d[0-2]\d")
 _SECONDS = re.compile(r"(.*):([0-5]\d)(\D*)", re.ASCII)
 """A time with its last two digits, probably the seconds."""
 _MOST_REPEATED = 0.1  # of the rows
@@ -124,14 +130,16 @@ def read_log(
         + ("" if options.temperatures else " (guessed; set --temperature-column to change)"),
         *order_notes, *notes, *table.left_out(),
     ]  # fmt: skip
-    times, channels, repeated = _sort_by_time(times, channels)
+    times, channels, repeated, others = _sort_by_time(times, channels)
     if repeated:
         text = f"{counted(repeated, 'row')} with the time of the row before: left out"
         without = "; the times have no seconds: take the logger's own file, not a spreadsheet's"
         rough = (
             repeated > _MOST_REPEATED * len(steps) and not (times % 60).any() and steps.min() >= 0
         )
-        notes.append(f"doubtful: {text}{without}" if rough else f"log: {text}")
+        several = "; its reading is another: are sensors below one another? Make a file of each"
+        end = several if others > 0.5 * repeated else without if rough else ""
+        notes.append(f"{'doubtful' if end else 'log'}: {text}{end}")
     return TemperatureLog(times, channels, tuple(notes))
 
 
@@ -145,6 +153,7 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
     }
     channels: dict[str, Array] = {}
     notes: list[str] = []
+    names = _choose_sensors(table, sensors, options) if sensors else ()
     for name in table.values:
         values, found = _to_celsius_column(table, name, options)
         channel = given.get(name) or (name if name in options.wanted else channel_name(name))
@@ -154,9 +163,19 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
         notes += found
     if not sensors:
         return channels, notes
+    labels = np.array(table.labels)
+    return {
+        given.get(n) or channel_name(n): np.where(labels == n, values, np.nan) for n in names
+    }, notes
+
+
+def _choose_sensors(table: _Table, sensors: Sequence[str], options: LogOptions) -> tuple[str, ...]:
+    """Return the sensors with temperatures in a table of several; empty the readings of others."""
+    path = table.file.path
     asked = [name for name in options.temperatures if name not in table.file.names]
     names = require_columns(path, sensors, asked, "--temperature-column")
-    values, labels = next(iter(channels.values())), np.array(table.labels)
+    ((column, read),) = table.values.items()
+    values, labels = np.array(read), np.array(table.labels)
     names = (
         names
         or tuple(filter(options.wanted.__contains__, sensors))
@@ -168,12 +187,12 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
     )
     if not names:
         raise DataError(
-            f"{path}: no sensor in column {LABEL!r} has temperatures: {quoted(sensors[:6])}; "
-            "export one that has"
+            f"{path}: no sensor in column {quoted(label_columns(table.file))} has temperatures: "
+            f"{quoted(sensors[:6])}; export one that has"
         )
-    return {
-        given.get(n) or channel_name(n): np.where(labels == n, values, np.nan) for n in names
-    }, notes
+    values[~np.isin(labels, names)] = np.nan
+    table.values[column] = array("d", values)
+    return names
 
 
 def _hold_readings(
@@ -206,18 +225,24 @@ def _hold_readings(
     return np.concatenate(more), {n: np.concatenate(c) for n, c in repeated.items()}, notes
 
 
-def _sort_by_time(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str, Array], int]:
-    """Sort rows by time and join those of one time; return also the number left out."""
+def _sort_by_time(
+    times: Array, channels: dict[str, Array]
+) -> tuple[Array, dict[str, Array], int, int]:
+    """Sort rows by time and join those of one time; return also how many are left out.
+
+    The last number is that of rows left out whose readings are others, by more than 1 K.
+    """
     unique, place = np.unique(times, return_inverse=True)
-    kept, taken = {}, np.zeros(len(times), dtype=bool)
+    kept, taken, others = {}, *np.zeros((2, len(times)), dtype=bool)
     for name, values in channels.items():
         known = np.flatnonzero(np.isfinite(values))
         _, first = np.unique(place[known], return_index=True)
         kept[name] = np.full(len(unique), np.nan)
         kept[name][place[known[first]]] = values[known[first]]
         taken[known[first]] = True
+        others |= np.abs(values - kept[name][place]) > 1.0
     lost = int((~taken & np.any([np.isfinite(v) for v in channels.values()], axis=0)).sum())
-    return unique, kept, lost
+    return unique, kept, lost, int(others.sum())
 
 
 class _Table:
@@ -247,12 +272,14 @@ class _Table:
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
         self.labels: list[str] = []
         columns = [(name, file.names.index(name)) for name in names]
-        label = file.names.index(LABEL) if LABEL in file.names else None
+        labels = list(map(file.names.index, label_columns(file)))
         self.are_serials = len(times) == 1 and are_serials(file.column(times[0]))
         bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
+        # 2026061412, the hours of a weather service
+        tail = "00" if all(map(_HOURS.fullmatch, file.column(times[0]))) else ""
         head = 0
         for line, row in file.rows():
-            text = " ".join(row[place] for place in self._places)
+            text = " ".join(row[place] for place in self._places) + tail
             seconds = _as_seconds(text) if bare else None
             at = (-1, seconds) if seconds is not None else self._find_moment(line, text)
             if at is None:
@@ -269,8 +296,8 @@ class _Table:
             self._lines.append(line)
             for name, place in columns:
                 self.values[name].append(self._value(line, name, row[place]))
-            if label is not None:
-                self.labels.append(row[label])
+            if labels:
+                self.labels.append(" ".join(row[place] for place in labels))
         self.times = self._utc(clock)
 
     def _is_other_head(self, row: list[str]) -> bool:
@@ -331,13 +358,15 @@ class _Table:
         Parsing the time of each reading would take longer than all else.
         """
         try:
-            half = parse_moment(f"{before}:30{after}", self._order)
+            whole, half = (parse_moment(f"{before}:{s}{after}", self._order) for s in ("00", "30"))
         except ValueError:
             return -1
-        # in some forms the last digits are minutes or a fraction
-        if not isinstance(half, datetime) or half.second != 30 or half.microsecond:
+        # in some forms the last digits are minutes, a fraction, or those of a zone
+        if not (isinstance(whole, datetime) and isinstance(half, datetime)):
             return -1
-        self._moments.append(half.replace(second=0))
+        if (half - whole).total_seconds() != 30.0:
+            return -1
+        self._moments.append(whole)
         return len(self._moments) - 1
 
     def _moment(self, line: int, text: str) -> datetime | None:
@@ -345,7 +374,8 @@ class _Table:
         try:
             moment = parse_serial(text) if self.are_serials else parse_moment(text, self._order)
         except ValueError as cause:
-            if not text[:1].isdigit():
+            # a footer may be `60 records`
+            if not text[:1].isdigit() or re.fullmatch(r"\d{1,5} \D*", text):
                 return None
             raise DataError(
                 f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
@@ -362,6 +392,8 @@ class _Table:
         """Return a reading in the unit of the file, NaN for none."""
         if not text:
             return np.nan
+        if found := _TENTHS.fullmatch(text):
+            text = f"{found[1]}.{found[2]}"
         plain = text.replace(",", ".") if self.file.decimal == "," else text
         if not plain[-1].isdigit() and (unit := UNIT_BEHIND.search(plain)):
             plain = plain[: unit.start()]
@@ -372,7 +404,7 @@ class _Table:
             value = np.nan
         if math.isfinite(value) and value not in _NO_READING:
             return value
-        if re.search(r"\d", text) and value not in _NO_READING:
+        if re.match(r"[^#]*\d", text) and value not in _NO_READING:
             raise DataError(
                 f"{self.file.path}, line {line}, column {name!r}: {text[:40]!r} is not a number"
             )
@@ -386,12 +418,16 @@ def _as_seconds(text: str) -> float | None:
         seconds = whole_seconds(float(text))
     except ValueError:
         return None
-    return seconds if seconds < _LATEST_S else None
+    # of 12 and 14 digits is a date with a time
+    return seconds if seconds < _LATEST_S and len(text.split(".")[0]) not in (12, 14) else None
 
 
 def _apply_header_zone(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
     """Return the logger's clock with the zone in the head of its times, and notes."""
     stated = stated_zones(header)
+    if not stated and (unclear := _UNCLEAR.search(header)) and not clock.forced:
+        where = f"doubtful: {unclear[0]!r} in the head of the times may be one of several zones"
+        return clock, [f"{where}: {clock.zone} is used, if --log-timezone does not give it"]
     if not stated:
         return clock, []
     note = f"log: the header gives the time zone {'/'.join(stated)}"

@@ -85,8 +85,8 @@ _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _LATEST_S = 1e11
 _HOURS = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d[0-2]\d")
-_SECONDS = re.compile(r"(.*):([0-5]\d)(\D*)", re.ASCII)
-"""A time with its last two digits, probably the seconds."""
+_SECONDS = re.compile(r"(.*?):([0-5]\d(?:\.\d+)?)(\D*(?:[+-]\d\d:?\d\d)?)", re.ASCII)
+"""A time with its last two digits before a zone, probably the seconds."""
 _MOST_REPEATED = 0.1  # of the rows
 
 

@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import replace
 from datetime import datetime
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -60,8 +60,6 @@ from thermocald.store.recording.sense import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
@@ -151,9 +149,10 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
         for old, new in options.names.items()
         for column in require_columns(path, [*table.file.names, *sensors], [old], "--name")
     }
+    if sensors:
+        _separate_sensors(table, sensors, options)
     channels: dict[str, Array] = {}
     notes: list[str] = []
-    names = _choose_sensors(table, sensors, options) if sensors else ()
     for name in table.values:
         values, found = _to_celsius_column(table, name, options)
         channel = given.get(name) or (name if name in options.wanted else channel_name(name))
@@ -161,38 +160,29 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
             channel += "_"
         channels[channel] = values
         notes += found
-    if not sensors:
-        return channels, notes
-    labels = np.array(table.labels)
-    return {
-        given.get(n) or channel_name(n): np.where(labels == n, values, np.nan) for n in names
-    }, notes
+    return channels, notes
 
 
-def _choose_sensors(table: _Table, sensors: Sequence[str], options: LogOptions) -> tuple[str, ...]:
-    """Return the sensors with temperatures in a table of several; empty the readings of others."""
+def _separate_sensors(table: _Table, sensors: Sequence[str], options: LogOptions) -> None:
+    """Make a column of each sensor with temperatures in a table that has all below one another."""
     path = table.file.path
     asked = [name for name in options.temperatures if name not in table.file.names]
     names = require_columns(path, sensors, asked, "--temperature-column")
-    ((column, read),) = table.values.items()
-    values, labels = np.array(read), np.array(table.labels)
-    names = (
-        names
-        or tuple(filter(options.wanted.__contains__, sensors))
-        or tuple(
-            n
-            for n in sensors
-            if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
-        )
-    )
-    if not names:
+    names = names or tuple(filter(options.wanted.__contains__, sensors))
+    ((column, values),) = table.values.items()
+    labels = np.array(table.labels)
+    every = {n: np.where(labels == n, values, np.nan) for n in names or sensors}
+    table.values = {
+        name: readings
+        for name, readings in every.items()
+        if names or (np.isfinite(readings).any() and not OTHER_NAME.search(name))
+    }
+    table.units = dict.fromkeys(table.values, table.units[column])
+    if not table.values:
         raise DataError(
             f"{path}: no sensor in column {quoted(label_columns(table.file))} has temperatures: "
             f"{quoted(sensors[:6])}; export one that has"
         )
-    values[~np.isin(labels, names)] = np.nan
-    table.values[column] = array("d", values)
-    return names
 
 
 def _hold_readings(
@@ -266,7 +256,7 @@ class _Table:
         # of each row: the moment from which its seconds count, -1 for 1970
         self._of, self._moments = array("i"), list[datetime]()
         self._minute = cache(self._find_minute)
-        self.values = {name: array("d") for name in names}
+        self.values: dict[str, Any] = {name: array("d") for name in names}
         self.units: dict[str, Counter[str]] = {name: Counter() for name in names}
         self._untimed: list[tuple[int, str]] = []
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
@@ -466,12 +456,7 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
         unit = "degC"
     elif unit != "degC" and options.unit is None:
         notes.append(f"log: {name!r} is converted from {unit}, the unit in {source}")
-    celsius = to_celsius(values, unit)
-    labels = np.array(table.labels or np.zeros(len(celsius)))
-    for sensor in np.unique(labels):
-        rows = np.flatnonzero(labels == sensor)
-        celsius[rows], doubts = _drop_unmeasured(table, name, rows, celsius[rows], options)
-        notes += doubts
+    celsius, doubts = _drop_unmeasured(table, name, to_celsius(values, unit), options)
     wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -480,20 +465,20 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
             f"temperatures of cameras lie between {_PLAUSIBLE_C[0]:g} and {_PLAUSIBLE_C[1]:g} °C. "
             "Another unit (--unit), or another column (--temperature-column)?"
         )
-    return celsius, notes
+    return celsius, [*notes, *doubts]
 
 
 def _drop_unmeasured(
-    table: _Table, name: str, rows: NDArray[np.int64], celsius: Array, options: LogOptions
+    table: _Table, name: str, celsius: Array, options: LogOptions
 ) -> tuple[Array, list[str]]:
-    """Return one sensor's rows (n,) °C, NaN for values given without a measurement, and notes.
+    """Return readings (n,) °C, NaN for values given without a measurement, and notes.
 
     Raises DataError if the unit changes midway and was not given.
     """
-    if changed := find_unit_change(table.times[rows], celsius):
+    if changed := find_unit_change(table.times, celsius):
         row, words = changed
         last = celsius[:row][np.isfinite(celsius[:row])][-1]
-        where = f"{table.where(rows[row])}, column {name!r}: the unit seems to change {words} here"
+        where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"
         if options.unit is None:
             raise DataError(
                 f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts "
@@ -511,7 +496,7 @@ def _drop_unmeasured(
         why = "leaping away and back" if sort else "given without a measurement"
         notes.append(
             f"doubtful: {counted(sum(s.stop - s.first for s in found), 'reading')} of {name!r} "
-            f"{why} (the first {celsius[first]:.4g} °C, {table.where(rows[first])}): {treated}"
+            f"{why} (the first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:

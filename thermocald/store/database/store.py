@@ -161,18 +161,6 @@ class Store(SeriesReader):
                 self.path, counted(missing, "epoch"), series.name,
             )  # fmt: skip
 
-    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
-        names = ("id", "number", "detail_checksum")  # half the time of reading whole rows
-        with self._reads("observations") as connection:
-            found = connection.execute(
-                f"SELECT {', '.join(names)} FROM epoch WHERE series_id = ? AND number BETWEEN ? "
-                "AND ? AND measured IS NOT NULL ORDER BY number, revision",
-                (series.id, first, last),
-            ).fetchall()
-            rows = [dict(zip(names, values, strict=True)) for values in found]
-            packed = {row["number"]: epochs.read_details(connection, row)[1] for row in rows}
-            return {number: epochs.unpack_observations(seen) for number, seen in packed.items()}
-
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         result = np.full((len(numbers), 16, 16), np.nan)
         for i, number in enumerate(map(int, numbers)):

@@ -175,12 +175,8 @@ def open_log(
     if not any(map(str.strip, begin + end)):
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
-    try:
-        mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)
-    except DataError:
-        if not ours:
-            raise
-        mark = ","
+    sample = end if len(end) == _SAMPLE else begin + end
+    mark = separator or ("," if ours else _detect_separator(path, sample))
     start, last = list(_parse_rows(path, begin, mark)), _split_lines(end, mark)
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:

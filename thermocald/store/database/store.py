@@ -198,32 +198,23 @@ class Store(SeriesReader):
     def readings(self, thermometer: str | None = None) -> Iterator[LoggedReading]:
         """Yield the readings that belong to no epoch, in the order in which they were stored."""
         after = -1
-        while True:
-            with self._reads("readings") as connection:
-                condition = (
-                    "WHERE id > ? AND thermometer = ifnull(?, thermometer) ORDER BY id LIMIT ?"
-                )
-                wanted = (after, thermometer, _READINGS_AT_ONCE)
-                page = list(columns.examined_rows(connection, "reading", condition, wanted))
-                for row in _intact(page):
-                    name = file_name(row["thermometer"], "thermometer", StoreError)
+        while page := self.rows_after("reading", after, _READINGS_AT_ONCE):
+            after = page[-1]["id"]
+            for row in _intact(page):
+                name = file_name(row["thermometer"], "thermometer", StoreError)
+                if thermometer in (None, name):
                     values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
                     yield LoggedReading(name, row["utc"], values, trusted)
-            if len(page) < _READINGS_AT_ONCE:
-                return
-            after = page[-1]["id"]
 
     def events(self) -> list[Event]:
         """Return the events, oldest first."""
-        with self._reads("events") as connection:
-            rows = columns.examined_rows(connection, "event", "ORDER BY id")
-            return [
-                Event(
-                    row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
-                    json.loads(row["data"]),
-                )
-                for row in _intact(rows)
-            ]  # fmt: skip
+        return [
+            Event(
+                row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
+                json.loads(row["data"]),
+            )
+            for row in _intact(self.rows_after("event", -1, -1))
+        ]  # fmt: skip
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """Return the clock steps that the daemon recorded, oldest first, equal for all series."""

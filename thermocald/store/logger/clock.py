@@ -297,11 +297,6 @@ def whole_seconds(number: float) -> float:
     return number / next((parts for least, parts in _PARTS if number >= least), 1.0)
 
 
-def is_date_like(text: str) -> bool:
-    """Return whether text begins as 06/14/2026 or 14/06/2026 does, month or day first."""
-    return re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}(?!\d)", text) is not None
-
-
 def date_orders(text: str) -> set[str] | None:
     """Return the orders, of ORDERS, in which text is a date; None if it has only one form."""
     text = _month_to_number(text.strip())

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
-from thermocald.store.logger.clock import is_date_like, parse_moment
+from thermocald.store.logger.clock import date_orders, parse_moment
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -341,7 +341,7 @@ def _is_time(field: str) -> bool:
         parse_moment(field)
     except ValueError:
         # month before day, not decided yet; or days of a spreadsheet
-        return is_date_like(field) or re.fullmatch(r"[45]\d{4}[.,]\d{5,}", field) is not None
+        return bool(date_orders(field)) or re.fullmatch(r"[45]\d{4}[.,]\d{5,}", field) is not None
     return True
 
 
@@ -422,7 +422,7 @@ def _kind_of(value: str) -> str:
     try:
         found = parse_moment(value)
     except ValueError:
-        if is_date_like(value):
+        if date_orders(value):
             return "moment" if ":" in value else "date"
         return "number" if number else "text"
     if isinstance(found, datetime):

@@ -336,9 +336,21 @@ class _Table:
         found = _SECONDS.fullmatch(text)
         if found and (begin := self._minute(found[1], found[3])) >= 0:
             return begin, float(found[2])
-        moment = self._moment(line, text)
-        if moment is None:
-            return None
+        try:
+            moment = parse_serial(text) if self.are_serials else parse_moment(text, self._order)
+        except ValueError as cause:
+            # a footer may be `60 records`
+            if not text[:1].isdigit() or re.fullmatch(r"\d{1,5} \D*", text):
+                return None
+            raise DataError(
+                f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
+                f"not a date with a time ({cause})"
+            ) from cause
+        if not isinstance(moment, datetime):
+            raise DataError(
+                f"{self.file.path}, line {line}: {text[:40]!r} is only a date or a time; name "
+                "both columns (--time-column twice)"
+            )
         self._moments.append(moment)
         return len(self._moments) - 1, 0.0
 
@@ -358,25 +370,6 @@ class _Table:
             return -1
         self._moments.append(whole)
         return len(self._moments) - 1
-
-    def _moment(self, line: int, text: str) -> datetime | None:
-        """Return the time of a row, None for a row that has no readings."""
-        try:
-            moment = parse_serial(text) if self.are_serials else parse_moment(text, self._order)
-        except ValueError as cause:
-            # a footer may be `60 records`
-            if not text[:1].isdigit() or re.fullmatch(r"\d{1,5} \D*", text):
-                return None
-            raise DataError(
-                f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
-                f"not a date with a time ({cause})"
-            ) from cause
-        if not isinstance(moment, datetime):
-            raise DataError(
-                f"{self.file.path}, line {line}: {text[:40]!r} is only a date or a time; name "
-                "both columns (--time-column twice)"
-            )
-        return moment
 
     def _value(self, line: int, name: str, text: str) -> float:
         """Return a reading in the unit of the file, NaN for none."""

@@ -414,6 +414,9 @@ def test_the_hour_that_comes_twice(tmp_path):
     start = datetime(2026, 10, 24, 23, 50, tzinfo=UTC).timestamp()
     found = logged(tmp_path, twice, clock=replace(BERLIN, ambiguous="order")).times
     assert ((found - start) / 60).tolist() == [0, 30, 60, 90, 120, 140]
+    newest = at("03:10", "02:50", "02:20", "02:50", "02:20", "01:50")
+    back = logged(tmp_path, newest, clock=replace(BERLIN, ambiguous="order")).times
+    assert back.tolist() == found.tolist()
     once = at("01:50", "02:20", "02:50", "03:10")
     with pytest.raises(DataError, match="order of the rows does not show"):
         logged(tmp_path, once, clock=replace(BERLIN, ambiguous="order"))

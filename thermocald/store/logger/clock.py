@@ -155,6 +155,8 @@ class DeviceClock:
         if self.ambiguous == "later":
             return later
         back = np.flatnonzero(np.diff(earlier) < 0) + 1
+        if (np.diff(earlier) > 0).sum() == 1 < len(back):  # the newest row is the first
+            return self._choose(earlier[::-1], later[::-1], again)[::-1]
         if len(back) != 1:
             raise DataError(
                 f"{again}, and the order of the rows does not show which is meant (time runs back "

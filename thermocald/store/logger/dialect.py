@@ -100,7 +100,7 @@ _DECIMAL = re.compile(r"[+-]?\d+([.,])\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
-    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º']?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
+    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º']?\s*[CFK]|[°º℃℉]|deg\s?[CF]|%)?)?"
     r"|unavailable|unknown|none|null|n/?an?|-+|err(?:or)?",
     re.IGNORECASE,
 )

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta, timezone, tzinfo
 from typing import TYPE_CHECKING
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 import numpy as np
 
@@ -55,10 +55,7 @@ def time_zone(text: str) -> tzinfo:
 
 def stated_zones(text: str) -> dict[str, tzinfo]:
     """Return the zones that a head names: Europe/Berlin, else such as GMT+01:00 or EST and EDT."""
-    cities = {}
-    for name in _CITY.findall(text):
-        with suppress(UsageError):
-            cities[name] = time_zone(name)
+    cities = {n: time_zone(n) for n in _CITY.findall(text) if n in available_timezones()}
     return cities or {name: _zone(name.upper()) for name in _STATED_ZONE.findall(text)}
 
 

@@ -267,7 +267,7 @@ def _detect_encoding(path: Path) -> str:
     most words of a log that this program knows.
     """
     if not path.is_file():
-        raise DataError(f"{path}: is not a file")
+        raise DataError(f"{path}: {'is not a file' if path.exists() else 'does not exist'}")
     if path.stat().st_size > _LARGEST_BYTES:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; split it")
     try:

@@ -132,8 +132,7 @@ def require_columns(
 def channel_name(name: str) -> str:
     """Return a recording's name for a column, without the unit, which is °C there."""
     quantity = without_unit(column_label(name))
-    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
-    plain = plain[:48]
+    plain = (re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature")[:48]
     return f"{plain} of the log" if channel_fault(plain) else plain
 
 

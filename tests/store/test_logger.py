@@ -65,7 +65,8 @@ LOGS = {
             *rows_of(",{m:%Y-%m-%dT%H:%M:%SZ},950,pressure"),
             *rows_of(",{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f},box")]),
     "NumPy, savetxt": ("# time temp", "{s:.18e} {t:.18e}"),
-    "USGS, a column of zones": ("datetime\ttz_cd\tWater temp", "{e:%Y-%m-%d %H:%M}\tEST\t{t:.2f}"),
+    "USGS, a column of zones": (
+        "datetime\ttz_cd\tWater temp", "{e:%Y-%m-%d %H:%M}\tEST\t{t:.2f}", "Mean\t\t22.0"),
     "DWD": ("MESS_DATUM;PP_10;TT_10;TD_10", "{b:%Y%m%d%H%M};-999;{t:.2f};13.4"),
     "NOAA, tenths and a code": ("DATE,TMP", '"{m:%Y-%m-%dT%H:%M:%SZ}","+0{d},1"'),
     "Excel in Korean": ("날짜;온도", "{b:%Y-%m-%d} 오후 {b:%I:%M:%S};{t:.2f}"),

@@ -139,10 +139,10 @@ def channel_name(name: str) -> str:
 def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     """Return the columns that make up a time: it, or a date and a time, and perhaps the zone."""
     if options.times:
-        found = require_columns(file.path, file.names, options.times, "--time-column")
-    else:
-        found = _guess_time_columns(file)
-    zones = [n for n in file.names if n not in found and set(file.column(n)) <= ZONES_H.keys()]
+        return require_columns(file.path, file.names, options.times, "--time-column")
+    found = _guess_time_columns(file)
+    words = {name: set(filter(None, file.column(name))) for name in file.names}
+    zones = [name for name, said in words.items() if said and said <= ZONES_H.keys()]
     return (*found, *zones[:1]) if lacks_zone(file.column(found[-1])[0]) else found
 
 

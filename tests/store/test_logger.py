@@ -336,10 +336,10 @@ def test_another_head_below_is_refused(tmp_path, head):
     assert len(read(tmp_path, "\n".join(one), [*rows[:6], one[0], *rows[6:]]).times) == 27
 
 
-@pytest.mark.parametrize("lost", [5, 12])
-def test_a_row_that_is_cut_off_is_left_out(tmp_path, lost):
+@pytest.mark.parametrize(("time", "lost"), [("{s}", 5), ("{s}", 12), ("{b:%d.%m.%Y %X}", 20)])
+def test_a_row_that_is_cut_off_is_left_out(tmp_path, time, lost):
     """A logger is writing the row: of 22.60 is left 22, or of the time a part."""
-    data = "\r\n".join(["time,T °C", *rows_of("{s},{t:.2f}"), ""])
+    data = "\r\n".join(["time,T °C", *rows_of(time + ",{t:.2f}"), ""])
     found = logged(tmp_path, data[:-lost])
     assert found.times.tolist() == TIMES[:-1]
     assert "the last row is cut off" in found.notes[-1]

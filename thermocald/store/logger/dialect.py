@@ -175,8 +175,7 @@ def open_log(
     if not any(map(str.strip, begin + end)):
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
-    sample = end if len(end) == _SAMPLE else begin + end
-    mark = separator or ("," if ours else _detect_separator(path, sample))
+    mark = separator or ("," if ours else _detect_separator(path, begin + end))
     start, last = list(_parse_rows(path, begin, mark)), _split_lines(end, mark)
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
@@ -198,6 +197,7 @@ def open_log(
         )
     above = tuple(" ".join(row) for _, row in start[:first])
     is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
+    rows = rows[: len(rows) - is_cut]
     kinds = tuple(_kind(column) for column in zip(*rows, strict=True))
     return LoggerFile(
         path, names, start[first][0], encoding, mark, found, rows, kinds, above, is_cut, is_assumed

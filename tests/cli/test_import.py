@@ -98,7 +98,13 @@ def test_clock_errors_and_zones_of_each_device(place):
 
 
 @pytest.mark.parametrize(
-    "name", ["IMG_20260614_12000{}", "2026-06-14 12.00.0{}", "PXL_20260614_10000{}000.MP"]
+    "name",
+    [
+        "IMG_20260614_12000{}",
+        "2026-06-14 12.00.0{}",
+        "PXL_20260614_10000{}000.MP",
+        f"f_{START // 10:.0f}{{}}.0",
+    ],
 )
 def test_times_from_names(place, name):
     for i in range(6):
@@ -136,7 +142,10 @@ def stop_the_clock(folder):
         (None, "--timezone UTC --encoding hex", "--encoding hex: is unknown"),
         (third(size=(48, 64)), "--timezone UTC", r"3\.jpg: has 48 × 64 px"),
         (lambda f: (f / "3.jpg").write_bytes(b"\xff\xd8no"), "--timezone UTC", "is not a picture"),
-        (third(""), "--timezone UTC", r"3\.jpg: EXIF holds no time.*--times name"),
+        *(
+            (third(no), "--timezone UTC", r"3\.jpg: EXIF holds no time.*--times name")
+            for no in ("", "0000:00:00 00:00:00", "    :  :     :  :  ")
+        ),
         (third("2000:01:01 00:00:05"), "--timezone UTC", r"0\.jpg: was taken at .*Z, years"),
         (third(tags={MAKE: "Canon"}), "--timezone UTC", OF_ANOTHER),
         (third(tags={MODEL: "imx477"}), "--timezone UTC", OF_ANOTHER),

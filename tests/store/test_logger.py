@@ -34,7 +34,7 @@ def rows_of(row: str, celsius=CELSIUS) -> list[str]:
     return [
         row.format(m=m, b=m + timedelta(hours=2), e=m - timedelta(hours=5), s=int(m.timestamp()),
                    t=t, c=f"{t:.2f}".replace(".", ","), f=1.8 * t + 32, k=t + 273.15, i=i + 1,
-                   day=m.timestamp() / 86400 + 25569 + 2 / 24)
+                   d=round(10 * t), day=m.timestamp() / 86400 + 25569 + 2 / 24)
         for i, (m, t) in enumerate(zip(MOMENTS, celsius, strict=True))
     ]  # fmt: skip
 
@@ -57,9 +57,21 @@ LOGS = {
     "milliseconds": ("time,temp", "{s}000,{t:.2f}"),
     "InfluxDB in ns": ("name,time,value", "temp,{s}000000000,{t:.2f}"),
     "InfluxDB in µs": ("name,time,value", "temp,{s}000000,{t:.2f}"),
-    "InfluxDB, annotated": (
-        "#group,false,false\n#datatype,dateTime:RFC3339,double\n#default,,\n,_time,_value",
-        ",{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f}"),
+    "InfluxDB, annotated": (  # _start is that of the query
+        "#group,true,false,false\n#datatype,dateTime,dateTime,double\n,_start,_time,_value",
+        ",2026-06-14T00:00:00Z,{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f}"),
+    "InfluxDB, a table of each field": (
+        ",_time,_value,_field", [
+            *rows_of(",{m:%Y-%m-%dT%H:%M:%SZ},950,pressure"),
+            *rows_of(",{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f},box")]),
+    "NumPy, savetxt": ("# time temp", "{s:.18e} {t:.18e}"),
+    "USGS, a column of zones": (
+        "datetime\ttz_cd\tWater temp", "{e:%Y-%m-%d %H:%M}\tEST\t{t:.2f}", "Mean\t\t22.0"),
+    "DWD": ("MESS_DATUM;PP_10;TT_10;TD_10", "{b:%Y%m%d%H%M};-999;{t:.2f};13.4"),
+    "NOAA, tenths and a code": ("DATE,TMP", '"{m:%Y-%m-%dT%H:%M:%SZ}","+0{d},1"'),
+    "Excel in Korean": ("날짜;온도", "{b:%Y-%m-%d} 오후 {b:%I:%M:%S};{t:.2f}"),
+    "HOBOware in Swedish": ("#,Datum Tid,Temp", "{i},{b:%m/%d/%y %I:%M:%S} em,{t:.2f}"),
+    "Windows in Hungarian": ("Dátum;Temp", "{b:%Y. %m. %d. %H:%M:%S};{c}"),
     "spaces, as a shell writes vcgencmd": ("", "{b:%Y-%m-%d %H:%M:%S}  temp={t:.2f}'C"),
     "commas, as a shell writes vcgencmd": ("", "{m:%Y-%m-%dT%H:%M:%S}Z,temp={t:.2f}'C"),
     "a shell's date in German": ("", "Mo {m.day}. Jul {m:%H:%M:%S} UTC {m.year};{t:.2f}"),
@@ -75,7 +87,7 @@ LOGS = {
     # Comfort Software: statistics below the rows
     "Testo": (
         "Datum/Zeit;Temperatur[°C];Feuchte[%rF]", "{b:%d.%m.%Y %H:%M:%S};{c};45,1",
-        "", "Minimum;21,50;45,0", "Maximum;22,60;45,1", "Mittelwert;22,05;45,1"),
+        "", "Minimum;21,50;45,0", "Maximum;22,60;45,1", "Mittelwert;22,05;#DIV/0!", "12 Werte;;"),
     "months as words": ("Timestamp,Temperature (C)", '"{b:%b %d, %Y %I:%M %p}",{t:.2f}'),
     # T&D Thermo Recorder: the time again as a spreadsheet's day number
     "T&D Ondotori": ('"Date/Time","Date/Time","No.1"\n"","","Temp.(C)"',
@@ -96,6 +108,7 @@ LOGS = {
     "Campbell TOA5, a mean": (
         'TOA5,river\n"TIMESTAMP","V_Min","AirT_Avg","AirT_Max"\nTS,Volts,Deg C,Deg C\n,Min,Avg,Max',
         '"{b:%Y-%m-%d %H:%M:%S}",12.7,{t:.2f},{f:.2f}'),
+    "hours of 14 digits": ("time;T °C", "{b:%Y%m%d%H%M%S};{t:.2f}"),
     "days of a spreadsheet": ("Datum;T °C", "{day:.5f};{t:.2f}"),
     "ThingSpeak": ("created_at,entry_id,field1", "{m:%Y-%m-%d %H:%M:%S} UTC,{i},{t:.2f}"),
     "Chinese dates below a logger's name": (
@@ -105,7 +118,7 @@ LOGS = {
         "time,T °C", [*rows_of("{s},{t:.2f}")[:6], "# battery", *rows_of("{s},{t:.2f}")[6:]]),
 }  # fmt: skip
 SAID = {
-    "Testo": "3 rows without a time: left out (line 15: 'Minimum')",
+    "Testo": "4 rows without a time: left out (line 15: 'Minimum')",
     "HOBOconnect, in Eastern standard time": "is converted from degF, the unit in its head",
     "kelvin": "is converted from K",
 }
@@ -144,6 +157,15 @@ def test_sensors_below_one_another_are_channels(tmp_path):
         logged(tmp_path, data, temperatures=("sensor.lens",))
     given = {"temperatures": ("sensor.cpu",), "names": {"sensor.cpu": "processor"}}
     assert list(logged(tmp_path, data, **given).channels) == ["processor"]
+
+
+def test_of_one_sensor_of_many_only_its_readings_are_examined(tmp_path):
+    """1013 hPa is no temperature, but not asked for either."""
+    data = "entity_id,state,last_changed\n" + "".join(
+        f"sensor.{name},{value},{1780000000 + 60 * k}\n"
+        for k in range(9) for name, value in (("box", 21.5), ("air_pressure", 1013), ("w", 2000))
+    )  # fmt: skip
+    assert list(logged(tmp_path, data, temperatures=("sensor.box",)).channels) == ["sensor.box"]
 
 
 def test_a_log_of_changes_holds_its_value_in_a_pause_but_not_while_unavailable(tmp_path):
@@ -314,10 +336,10 @@ def test_another_head_below_is_refused(tmp_path, head):
     assert len(read(tmp_path, "\n".join(one), [*rows[:6], one[0], *rows[6:]]).times) == 27
 
 
-@pytest.mark.parametrize("lost", [5, 12])
-def test_a_row_that_is_cut_off_is_left_out(tmp_path, lost):
+@pytest.mark.parametrize(("time", "lost"), [("{s}", 5), ("{s}", 12), ("{b:%d.%m.%Y %X}", 20)])
+def test_a_row_that_is_cut_off_is_left_out(tmp_path, time, lost):
     """A logger is writing the row: of 22.60 is left 22, or of the time a part."""
-    data = "\r\n".join(["time,T °C", *rows_of("{s},{t:.2f}"), ""])
+    data = "\r\n".join(["time,T °C", *rows_of(time + ",{t:.2f}"), ""])
     found = logged(tmp_path, data[:-lost])
     assert found.times.tolist() == TIMES[:-1]
     assert "the last row is cut off" in found.notes[-1]
@@ -335,6 +357,9 @@ DOUBTFUL = {
         head, "{s},{f:.2f}", "70.7 is taken as °C; if it is °F, it is 21.5 °C: give --unit")
        for head in ("temp", "T1", "Sensor 1", "value")},
     "85": ("temp °C", "{s},85.00", "all 12 readings are 85 °C"),
+    "sensors below one another": (
+        "sensor,temp °C", [f"{m:%Y-%m-%d %X},S{k},{20 + k}" for m in MOMENTS for k in (0, 5)],
+        "left out; its reading is another: are sensors below one another? Make a file of each"),
 }  # fmt: skip
 
 
@@ -390,6 +415,9 @@ def test_the_hour_that_comes_twice(tmp_path):
     start = datetime(2026, 10, 24, 23, 50, tzinfo=UTC).timestamp()
     found = logged(tmp_path, twice, clock=replace(BERLIN, ambiguous="order")).times
     assert ((found - start) / 60).tolist() == [0, 30, 60, 90, 120, 140]
+    newest = at("03:10", "02:50", "02:20", "02:50", "02:20", "01:50")
+    back = logged(tmp_path, newest, clock=replace(BERLIN, ambiguous="order")).times
+    assert back.tolist() == found.tolist()
     once = at("01:50", "02:20", "02:50", "03:10")
     with pytest.raises(DataError, match="order of the rows does not show"):
         logged(tmp_path, once, clock=replace(BERLIN, ambiguous="order"))
@@ -404,7 +432,7 @@ def test_the_hour_that_comes_twice(tmp_path):
 def test_seconds_count_from_their_minute_also_in_the_hour_that_comes_twice(tmp_path, form):
     """The minutes of such an hour are written alike, but are two."""
     zone = time_zone("+02:00") if form.endswith("+02:00") else BERLIN.zone
-    times = datetime(2026, 10, 24, 23, 50, 7, tzinfo=UTC).timestamp() + 20.0 * np.arange(600)
+    times = datetime(2026, 10, 24, 23, 50, 10, tzinfo=UTC).timestamp() + 20.0 * np.arange(600)
     rows = [f"{datetime.fromtimestamp(t, zone):{form}};21.5" for t in times]
     clock = replace(BERLIN, ambiguous="order")
     found = logged(tmp_path, "\n".join(["time;T °C", *rows, ""]), clock=clock)
@@ -465,14 +493,16 @@ def test_what_is_none_is_refused(parse, texts, error, words):
     ("Zeit (MEZ)", 1, "Europe/Berlin"), ("timestamp_utc", 0, "Europe/Berlin"),
     ("Time (EST/EDT)", -4, "America/New_York"), ("Time (CST/CDT)", -5, "America/Chicago"),
     ("Time (CST)", 8, "Asia/Shanghai"), ("Time, GMT-03:30", -3.5, "UTC"),
+    ("Time (Asia/Tokyo)", 9, "UTC"), ("Timezone: Europe/Berlin\nTime", 2, "UTC"),
     ("Time zone: (UTC+01:00) Berlin, Rome\nTime", 2, "Europe/Berlin"),
 ])  # fmt: skip
 def test_the_zone_in_the_head_of_the_times_is_theirs(tmp_path, head, offset_h, zone):
     rows = [f"{datetime.fromtimestamp(t + 3600 * offset_h, UTC):%Y-%m-%d %X};21.5" for t in TIMES]
     found = read(tmp_path, f"{head};T °C", rows, clock=DeviceClock(time_zone(zone)))
     assert found.times.tolist() == TIMES
-    used = "(CST)" not in head and "Berlin" not in head
+    used = "(CST)" not in head and ") Berlin" not in head
     assert used == any("gives the time zone" in note for note in found.notes)
+    assert ("(CST)" in head) == any("'CST' in the head" in note for note in found.notes)
 
 
 def test_a_zone_that_is_given_for_the_logger_overrules_that_of_its_head(tmp_path):

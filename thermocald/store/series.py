@@ -172,10 +172,6 @@ class SeriesReader(ABC):
         """Return the steps of the clock while this series ran, oldest first."""
 
     @abstractmethod
-    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
-        """Return the latest observations of epochs `first` to `last` (numbers) that have some."""
-
-    @abstractmethod
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """Return covariances (E, 16, 16) of the epochs `numbers`, NaN without a result."""
 
@@ -204,6 +200,11 @@ class SeriesReader(ABC):
         stamped = self._epochs(series, first, last, details)
         times = self._corrected_times(series) if self.corrected else None
         return stamped if times is None else map(times.correct, stamped)
+
+    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
+        """Return the latest observations of epochs `first` to `last` (numbers) that have some."""
+        epochs = (stored.epoch for stored in self._epochs(series, first, last, details=True))
+        return {e.number: e.observations for e in epochs if e.observations is not None}
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Return columns (E,) over all epochs by name: a million epochs in a fraction of a second.

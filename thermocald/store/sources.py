@@ -117,14 +117,9 @@ class StoredRecording:
 
     def extra_columns(self) -> dict[str, Array]:
         """Return the further columns (E,) by name, NaN for an epoch without a value."""
-        place = {int(number): row for row, number in enumerate(self.columns.numbers)}
-        found: dict[str, Array] = {}
-        for stored in self.store.epochs(self.series, details=False):
-            for name, value in stored.extra.items():
-                column = found.setdefault(name, np.full(len(place), np.nan))
-                if (row := place.get(stored.epoch.number)) is not None:
-                    column[row] = value
-        return dict(sorted(found.items()))
+        epochs = self.store.epochs(self.series, details=False)
+        names = sorted({name for stored in epochs for name in stored.extra})
+        return self.store.series_columns(self.series, names)
 
     def __len__(self) -> int:
         return len(self.columns)

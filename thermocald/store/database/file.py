@@ -65,7 +65,7 @@ _ADVICE = {
     "SQLITE_CANTOPEN": "it cannot be opened; check that its folder exists and may be written",
     "SQLITE_BUSY": "another program keeps it locked",
     "SQLITE_NOTADB": _NO_STORE,
-    "SQLITE_CORRUPT": _NO_STORE,
+    "SQLITE_CORRUPT": f"{_NO_STORE}; if a backup was copied here, remove the old -wal file first",
 }
 """Advice by the beginning of SQLite's name of an error; {}: SQLite's message."""
 # The -wal file must not fill a small card; a replay need not sync so often.

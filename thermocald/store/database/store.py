@@ -161,18 +161,6 @@ class Store(SeriesReader):
                 self.path, counted(missing, "epoch"), series.name,
             )  # fmt: skip
 
-    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
-        names = ("id", "number", "detail_checksum")  # half the time of reading whole rows
-        with self._reads("observations") as connection:
-            found = connection.execute(
-                f"SELECT {', '.join(names)} FROM epoch WHERE series_id = ? AND number BETWEEN ? "
-                "AND ? AND measured IS NOT NULL ORDER BY number, revision",
-                (series.id, first, last),
-            ).fetchall()
-            rows = [dict(zip(names, values, strict=True)) for values in found]
-            packed = {row["number"]: epochs.read_details(connection, row)[1] for row in rows}
-            return {number: epochs.unpack_observations(seen) for number, seen in packed.items()}
-
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         result = np.full((len(numbers), 16, 16), np.nan)
         for i, number in enumerate(map(int, numbers)):
@@ -210,32 +198,23 @@ class Store(SeriesReader):
     def readings(self, thermometer: str | None = None) -> Iterator[LoggedReading]:
         """Yield the readings that belong to no epoch, in the order in which they were stored."""
         after = -1
-        while True:
-            with self._reads("readings") as connection:
-                condition = (
-                    "WHERE id > ? AND thermometer = ifnull(?, thermometer) ORDER BY id LIMIT ?"
-                )
-                wanted = (after, thermometer, _READINGS_AT_ONCE)
-                page = list(columns.examined_rows(connection, "reading", condition, wanted))
-                for row in _intact(page):
-                    name = file_name(row["thermometer"], "thermometer", StoreError)
+        while page := self.rows_after("reading", after, _READINGS_AT_ONCE):
+            after = page[-1]["id"]
+            for row in _intact(page):
+                name = file_name(row["thermometer"], "thermometer", StoreError)
+                if thermometer in (None, name):
                     values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
                     yield LoggedReading(name, row["utc"], values, trusted)
-            if len(page) < _READINGS_AT_ONCE:
-                return
-            after = page[-1]["id"]
 
     def events(self) -> list[Event]:
         """Return the events, oldest first."""
-        with self._reads("events") as connection:
-            rows = columns.examined_rows(connection, "event", "ORDER BY id")
-            return [
-                Event(
-                    row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
-                    json.loads(row["data"]),
-                )
-                for row in _intact(rows)
-            ]  # fmt: skip
+        return [
+            Event(
+                row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
+                json.loads(row["data"]),
+            )
+            for row in _intact(self.rows_after("event", -1, -1))
+        ]  # fmt: skip
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """Return the clock steps that the daemon recorded, oldest first, equal for all series."""

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta, timezone, tzinfo
 from typing import TYPE_CHECKING
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 import numpy as np
 
@@ -54,8 +54,16 @@ def time_zone(text: str) -> tzinfo:
 
 
 def stated_zones(text: str) -> dict[str, tzinfo]:
-    """Return the zones that a column's head names, such as GMT+01:00, UTC or EST and EDT."""
-    return {name: _zone(name.upper()) for name in _STATED_ZONE.findall(text)}
+    """Return the zones that a head names: Europe/Berlin, else such as GMT+01:00 or EST and EDT."""
+    cities = {n: time_zone(n) for n in _CITY.findall(text) if n in available_timezones()}
+    return cities or {name: _zone(name.upper()) for name in _STATED_ZONE.findall(text)}
+
+
+def lacks_zone(text: str) -> bool:
+    """Return whether text is a date with a time, or a time, to which a zone can be added."""
+    text = _month_to_number(text.strip())
+    found = _FULL.fullmatch(text) or _ONLY_TIME.fullmatch(text)
+    return found is not None and not found["zone"]
 
 
 def clock_error(text: str) -> float:
@@ -144,6 +152,8 @@ class DeviceClock:
         if self.ambiguous == "later":
             return later
         back = np.flatnonzero(np.diff(earlier) < 0) + 1
+        if (np.diff(earlier) > 0).sum() == 1 < len(back):  # the newest row is the first
+            return self._choose(earlier[::-1], later[::-1], again)[::-1]
         if len(back) != 1:
             raise DataError(
                 f"{again}, and the order of the rows does not show which is meant (time runs back "
@@ -176,28 +186,29 @@ def device_clock(
     )
 
 
-_DATE = r"(?P<a>\d{1,4})(?P<mark>[-./:])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})\.?"
+_DATE = r"(?P<a>\d{1,4})(?P<mark>[-/:]|\. ?)(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})\.?"
 _COMPACT_DATE = r"(?P<compact>\d{8})"
 _TIME = (
     r"(?P<h>\d{1,2})[:.](?P<m>\d{2})(?:[:.](?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?"
-    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?"
+    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?|[FfEe][Mm]|[ΠΜπμ]\.?μ\.?)?"
 )
 _COMPACT_TIME = r"(?P<ct>\d{6})(?:[.,]?(?P<cf>\d{1,9}))?"
-_ZONES_H = {
+ZONES_H = {
     "Z": 0, "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "MEZ": 1, "CEST": 2,
     "MESZ": 2, "EET": 2, "EEST": 3, "EST": -5, "EDT": -4, "CDT": -5, "MST": -7, "MDT": -6,
     "PST": -8, "PDT": -7, "JST": 9, "AEST": 10, "AEDT": 11,
 }  # fmt: skip
 """Zones by their letters; without CST, which China and America have."""
-_ZONE = rf"(?:,?\s*(?P<zone>{'|'.join(_ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}(?::?\d{{2}})?))?"
+_ZONE = rf"(?:,?\s*(?P<zone>{'|'.join(ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}(?::?\d{{2}})?))?"
 _STATED_ZONE = re.compile(
     rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?::?\d{{2}})?"
-    rf"|(?:(?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in _ZONES_H if len(n) > 2)})(?![^\W_]))"
+    rf"|(?:(?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in ZONES_H if len(n) > 2)})(?![^\W_]))"
 )
+_CITY = re.compile(r"[A-Z][a-z]+/[A-Z][\w/]+")
 _FULL = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})[ T,;_-]+(?:{_TIME}|{_COMPACT_TIME}){_ZONE}")
 _ONLY_DATE = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})")
 _ONLY_TIME = re.compile(rf"{_TIME}{_ZONE}")
-_NUMBER = re.compile(r"\d{9,13}(?:[.,]\d+)?|\d{16}|\d{19}")
+_NUMBER = re.compile(r"\d{9,13}(?:[.,]\d+)?|\d{16}|\d{19}|\d\.\d{9,}[eE]\+(?:09|12)")
 _NAMED_DATE = re.compile(
     r"(?:[^\W\d_]{2,9}\.?,?\s+)?"  # the day of the week
     r"(?:(?P<m1>[^\W\d_]{3,9})\.?\s+(?P<d1>\d{1,2})(?:st|nd|rd|th)?,?\s+(?P<y1>\d{4})"
@@ -218,7 +229,9 @@ _MONTHS = {
 """Months by their first letters in six languages; those that begin with `jui` by four."""
 _SERIAL = re.compile(r"\d{5}(?:[.,]\d+)?")
 _WORD = re.compile(r"[A-Za-z]{3}")
-_CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
+_CHINESE = str.maketrans(dict(zip("年月日时時分秒", "-- ::: ", strict=True)))
+_COMPACT = re.compile(r"((?:19|20)\d\d[01]\d[0-3]\d)([0-2]\d[0-5]\d)([0-5]\d)?")
+_HALF_DAY = re.compile(r"(?:(上午|午前|오전)|下午|午後|오후)\s*([\d:]+)")
 _PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
 
 
@@ -235,6 +248,8 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     Numbers are seconds (or ms, µs, ns) since 1970 UTC. Raises ValueError for other text.
     """
     text = _month_to_number(text.strip())
+    if found := _COMPACT.fullmatch(text):  # as ms it would be 1976
+        text = f"{found[1]} {found[2]}{found[3] or '00'}"
     if _NUMBER.fullmatch(text):
         try:
             return datetime.fromtimestamp(whole_seconds(float(text.replace(",", "."))), UTC)
@@ -281,25 +296,20 @@ def whole_seconds(number: float) -> float:
     return number / next((parts for least, parts in _PARTS if number >= least), 1.0)
 
 
-def is_date_like(text: str) -> bool:
-    """Return whether text begins as 06/14/2026 or 14/06/2026 does, month or day first."""
-    return re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}(?!\d)", text) is not None
-
-
 def date_orders(text: str) -> set[str] | None:
     """Return the orders, of ORDERS, in which text is a date; None if it has only one form."""
     text = _month_to_number(text.strip())
     found = _FULL.fullmatch(text) or _ONLY_DATE.fullmatch(text)
     if found is None or found["compact"] or len(found["a"]) == 4:
         return None
-    if found["mark"] == "." and len(found["c"]) == 4:
+    if found["mark"][0] == "." and len(found["c"]) == 4:
         return None
     possible = set()
     for order in ORDERS:
         with suppress(ValueError):
             _date(found, order)
             possible.add(order)
-    if found["mark"] == ".":
+    if found["mark"][0] == ".":
         possible.discard("mdy")  # unless the user gives it
     return possible
 
@@ -308,7 +318,8 @@ def _month_to_number(text: str) -> str:
     """Rewrite a date with the month as a word, or in Chinese, as 2026-06-14."""
     if text.isascii() and not _WORD.search(text):
         return text
-    text = _OF_DATE.sub(r"\1\4 \2\3 \6 \5", text.translate(_CHINESE))
+    text = _HALF_DAY.sub(lambda half: f"{half[2]} {'AM' if half[1] else 'PM'}", text)
+    text = _OF_DATE.sub(r"\1\4 \2\3 \6 \5", text.translate(_CHINESE).rstrip(": "))
     found = _NAMED_DATE.fullmatch(text)
     if found is None:
         return text
@@ -341,9 +352,9 @@ def _time(found: re.Match[str]) -> time:
         hour, minute, second = int(groups["h"]), int(groups["m"]), int(groups["s"] or 0)
         part = groups["f"] or ""
         if groups["half"]:
-            if not 1 <= hour <= 12:
+            if hour > 12:
                 raise ValueError(f"{hour} {groups['half']} is not a time")
-            hour = hour % 12 + (12 if groups["half"][0] in "Pp" else 0)
+            hour = hour % 12 + (12 if groups["half"][0] in "PpEeΜμ" else 0)
     micro = int(part.ljust(6, "0")[:6]) if part else 0
     zone = _zone(groups["zone"]) if groups["zone"] else None
     return time(hour, minute, second, micro, tzinfo=zone)
@@ -352,4 +363,4 @@ def _time(found: re.Match[str]) -> time:
 def _zone(text: str) -> tzinfo:
     if text[-1].isdigit():
         return time_zone(text)
-    return timezone(timedelta(hours=_ZONES_H.get(text, -6)))  # else CST beside CDT
+    return timezone(timedelta(hours=ZONES_H.get(text, -6)))  # else CST beside CDT

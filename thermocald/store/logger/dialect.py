@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
-from thermocald.store.logger.clock import is_date_like, parse_moment
+from thermocald.store.logger.clock import date_orders, parse_moment
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -38,7 +38,7 @@ _STATED = re.compile(
     r"|[(\[{<]\s*[o*]?(?P<bracket>[CFK])\.?\s*[)\]}>,]"
     r"|(?P<word>celsius|f\w?[ah]r?h?r?[ae]n?h?ei[td]|fahr(?![^\W\d_])|kelvin)"
     r"|(?P<sign>[℃℉])|(?P<chinese>[华華]氏)"
-    r"|temp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
+    r"|te?mp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
@@ -63,7 +63,7 @@ def without_unit(text: str) -> str:
     while found := _STATED.search(text):
         begin = found.start("temp") if found["temp"] else found.start()
         text = f"{text[:begin]} {text[found.end() :]}"
-    return " ".join(text.split()).strip(" _.,/-()[]{}")
+    return " ".join(text.split()).replace("_ _", "_").strip(" _.,/-()[]{}")
 
 
 def to_celsius(values: Array, unit: str) -> Array:
@@ -100,7 +100,7 @@ _DECIMAL = re.compile(r"[+-]?\d+([.,])\d+\s*[^\d\s.,:]{0,4}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
-    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º']?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
+    r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º']?\s*[CFK]|[°º℃℉]|deg\s?[CF]|%)?)?"
     r"|unavailable|unknown|none|null|n/?an?|-+|err(?:or)?",
     re.IGNORECASE,
 )
@@ -175,12 +175,7 @@ def open_log(
     if not any(map(str.strip, begin + end)):
         raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
-    try:
-        mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)
-    except DataError:
-        if not ours:
-            raise
-        mark = ","
+    mark = separator or ("," if ours else _detect_separator(path, begin + end))
     start, last = list(_parse_rows(path, begin, mark)), _split_lines(end, mark)
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
@@ -202,6 +197,7 @@ def open_log(
         )
     above = tuple(" ".join(row) for _, row in start[:first])
     is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
+    rows = rows[: len(rows) - is_cut]
     kinds = tuple(_kind(column) for column in zip(*rows, strict=True))
     return LoggerFile(
         path, names, start[first][0], encoding, mark, found, rows, kinds, above, is_cut, is_assumed
@@ -239,7 +235,10 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)  # as vcgencmd writes it
+    # `temp=` of vcgencmd, a head of NumPy
+    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)
+    if mark == " ":
+        plain = (line.removeprefix("# ") for line in plain)
     reader = csv.reader(plain, delimiter=mark, skipinitialspace=True)
     try:
         for row in reader:
@@ -268,7 +267,7 @@ def _detect_encoding(path: Path) -> str:
     most words of a log that this program knows.
     """
     if not path.is_file():
-        raise DataError(f"{path}: is not a file")
+        raise DataError(f"{path}: {'is not a file' if path.exists() else 'does not exist'}")
     if path.stat().st_size > _LARGEST_BYTES:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; split it")
     try:
@@ -342,7 +341,7 @@ def _is_time(field: str) -> bool:
         parse_moment(field)
     except ValueError:
         # month before day, not decided yet; or days of a spreadsheet
-        return is_date_like(field) or re.fullmatch(r"[45]\d{4}[.,]\d{5,}", field) is not None
+        return bool(date_orders(field)) or re.fullmatch(r"[45]\d{4}[.,]\d{5,}", field) is not None
     return True
 
 
@@ -390,7 +389,7 @@ def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
 
 TEMPERATURE_NAME = re.compile(
     r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
-    r"|\bt\d*\b|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
+    r"|\bt\d*\b|\btt_|\btmp|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
     re.IGNORECASE,
 )
 OTHER_NAME = re.compile(
@@ -423,7 +422,7 @@ def _kind_of(value: str) -> str:
     try:
         found = parse_moment(value)
     except ValueError:
-        if is_date_like(value):
+        if date_orders(value):
             return "moment" if ":" in value else "date"
         return "number" if number else "text"
     if isinstance(found, datetime):

@@ -17,10 +17,12 @@ from thermocald.names import channel_fault
 from thermocald.numbers import column_label
 from thermocald.store.logger.clock import (
     ORDERS,
+    ZONES_H,
     DeviceClock,
     are_serials,
     date_orders,
     device_clock,
+    lacks_zone,
     parse_moment,
 )
 from thermocald.store.logger.dialect import (
@@ -39,8 +41,6 @@ if TYPE_CHECKING:
     from thermocald.store.logger.dialect import LoggerFile
 
 
-LABEL = "entity_id"
-"""Home Assistant's column with the sensor of each row: one table has all sensors."""
 _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
 
@@ -132,17 +132,38 @@ def require_columns(
 def channel_name(name: str) -> str:
     """Return a recording's name for a column, without the unit, which is °C there."""
     quantity = without_unit(column_label(name))
-    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
-    plain = plain[:48]
+    plain = (re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature")[:48]
     return f"{plain} of the log" if channel_fault(plain) else plain
 
 
 def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
+    """Return the columns that make up a time: it, or a date and a time, and perhaps the zone."""
     if options.times:
         return require_columns(file.path, file.names, options.times, "--time-column")
+    found = _guess_time_columns(file)
+    words = {name: set(filter(None, file.column(name))) for name in file.names}
+    zones = [name for name, said in words.items() if said and said <= ZONES_H.keys()]
+    return (*found, *zones[:1]) if lacks_zone(file.column(found[-1])[0]) else found
+
+
+def label_columns(file: LoggerFile) -> list[str]:
+    """Return the columns that name the sensor of a row, if one table has all sensors.
+
+    That is `entity_id` of Home Assistant; of InfluxDB, the words that differ between the rows.
+    """
+    if "_value" in file.names:
+        return [n for n in file.of_kind("text", "empty") if len(set(file.column(n))) > 1]
+    return [name for name in ("entity_id",) if name in file.names]
+
+
+def _guess_time_columns(file: LoggerFile) -> tuple[str, ...]:
     numeric, seconds = file.of_kind("number", "seconds"), file.of_kind("seconds")
     serial = [n for n in numeric if TIME_NAME.search(n) and are_serials(file.column(n))]
-    found = serial or [n for n in OUR_TIMES if n in numeric] or file.of_kind("moment")
+    # a column of one time is the start of a query or a mission
+    moments = sorted(
+        file.of_kind("moment"), key=lambda n: (n != "_time", len(set(file.column(n))) < 2)
+    )
+    found = serial or [n for n in OUR_TIMES if n in numeric] or moments
     if found := found or list(filter(TIME_NAME.search, seconds)):
         return (found[0],)
     dates, clocks = file.of_kind("date"), file.of_kind("time")
@@ -243,7 +264,7 @@ def _read_in_orders(
 def find_temperature_columns(
     file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
-    if options.temperatures and LABEL not in file.names:
+    if options.temperatures and not label_columns(file):
         return require_columns(file.path, file.names, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
     numeric = [n for n in file.of_kind("number", "seconds") if n not in times]

@@ -53,6 +53,7 @@ _IN_NAME = re.compile(
     r"(\d{4})[-_.]?(\d\d)[-_.]?(\d\d)(?:[_T -]| at )?"
     r"(\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?:[_.-]?(\d{3}))?"
 )
+_SECONDS_IN_NAME = re.compile(r"(?<!\d)(?:1[5-9]|2\d)\d{8}(?:\d{3}|\.\d+)?(?!\d)")  # since 1970
 _EXIF_IFD = 0x8769
 _TIME_TAGS = ((0x9003, 0x9291, 0x9011), (0x9004, 0x9292, 0x9012), (0x0132, 0x9290, 0x9010))
 """Tags of time, fraction of a second and zone: when taken, digitised, last changed."""
@@ -99,7 +100,7 @@ def find_photographs(paths: list[Path]) -> list[Path]:
     if not found:
         raise DataError(
             f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))}); convert others, "
-            "such as HEIC, to JPEG"
+            "such as HEIC, to JPEG; folders in it are not searched"
         )
     return list(dict.fromkeys(found))
 
@@ -223,7 +224,7 @@ def known_photograph(path: Path, source: str = "exif") -> Photograph | None:
 def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:
     for when, part, offset in _TIME_TAGS:
         text = str(details.get(when) or "").strip("\0 ")
-        if not text or text.startswith("0000"):
+        if not re.search("[1-9]", text):  # blanks or zeros: the camera's clock is not set
             continue
         fraction = re.sub(r"\D", "", str(details.get(part) or ""))
         zone = str(details.get(offset) or "").strip("\0 ")
@@ -242,12 +243,15 @@ def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:
 
 
 def _name_moment(path: Path) -> datetime:
-    found = _IN_NAME.search(path.stem)
-    if found is None:
+    if found := _IN_NAME.search(path.stem):
+        *parts, fraction = found.groups(default="")
+        text = "{}-{}-{}T{}:{}:{}".format(*parts) + (fraction and f".{fraction}")
+    elif found := _SECONDS_IN_NAME.search(path.stem):
+        text = found[0]
+    else:
         raise DataError(f"{path}: no time in the name, as in IMG_20260614_120301.jpg")
     try:
-        *parts, fraction = found.groups(default="")
-        moment = parse_moment("{}-{}-{}T{}:{}:{}".format(*parts) + (fraction and f".{fraction}"))
+        moment = parse_moment(text)
     except ValueError as cause:
         raise DataError(f"{path}: the name: {cause}") from cause
     assert isinstance(moment, datetime)
@@ -308,7 +312,7 @@ def read_series(
             f"({iso(times[0])} to {iso(times[-1])})"
         )
     spec, about_camera = _camera_of(photographs[0], camera, pitch, distance, testfield is None)
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    interval = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 1.0
     span = f"{iso(times[0])} to {iso(times[-1])}, every {interval:.4g} s"
     temperatures = f"{np.nanmin(at_frame):.2f} to {np.nanmax(at_frame):.2f} °C"
     notes = [

@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import replace
 from datetime import datetime
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,12 +38,12 @@ from thermocald.store.logger.dialect import (
     to_celsius,
 )
 from thermocald.store.logger.options import (
-    LABEL,
     LogOptions,
     channel_name,
     find_date_order,
     find_temperature_columns,
     find_time_columns,
+    label_columns,
     quoted,
     require_columns,
 )
@@ -58,13 +58,13 @@ from thermocald.store.recording.sense import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
-_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*)$", re.IGNORECASE)
+_ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*|[a-z]+/[\w/]+)$", re.IGNORECASE)
+_UNCLEAR = re.compile(r"(?<![^\W_])(?:[A-Z]{1,2}[SD]T|MSK|МСК|HKT|SGT)(?![^\W_])")
 """A line above the table that states the time zone; cities behind it may have summer time."""
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
@@ -74,13 +74,17 @@ _CHANGES = "last_changed"
 _LONGEST_PAUSE_S = 86400.0
 _NO_READING = {
     -127.0, -196.6, -99.0, -99.9, -999.0, -999.9, -9999.0, 999.0, 999.9, 3276.7, 9999.0, 9999.99,
+    -6999.0, 6999.0, -7999.0, 7999.0,
 }  # fmt: skip
 """Numbers that stand for none: -196.6 is the -127 of the DS18B20 in °F, 3276.7 a full register."""
+_TENTHS = re.compile(r"([+-]\d{3})(\d),\d")
+"""A temperature of NOAA's integrated surface data: tenths, and a code of quality."""
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _LATEST_S = 1e11
-_SECONDS = re.compile(r"(.*):([0-5]\d)(\D*)", re.ASCII)
-"""A time with its last two digits, probably the seconds."""
+_HOURS = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d[0-2]\d")
+_SECONDS = re.compile(r"(.*?):([0-5]\d(?:\.\d+)?)(\D*(?:[+-]\d\d:?\d\d)?)", re.ASCII)
+"""A time with its last two digits before a zone, probably the seconds."""
 _MOST_REPEATED = 0.1  # of the rows
 
 
@@ -124,14 +128,16 @@ def read_log(
         + ("" if options.temperatures else " (guessed; set --temperature-column to change)"),
         *order_notes, *notes, *table.left_out(),
     ]  # fmt: skip
-    times, channels, repeated = _sort_by_time(times, channels)
+    times, channels, repeated, others = _sort_by_time(times, channels)
     if repeated:
         text = f"{counted(repeated, 'row')} with the time of the row before: left out"
         without = "; the times have no seconds: take the logger's own file, not a spreadsheet's"
         rough = (
             repeated > _MOST_REPEATED * len(steps) and not (times % 60).any() and steps.min() >= 0
         )
-        notes.append(f"doubtful: {text}{without}" if rough else f"log: {text}")
+        several = "; its reading is another: are sensors below one another? Make a file of each"
+        end = several if others > 0.5 * repeated else without if rough else ""
+        notes.append(f"{'doubtful' if end else 'log'}: {text}{end}")
     return TemperatureLog(times, channels, tuple(notes))
 
 
@@ -143,6 +149,8 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
         for old, new in options.names.items()
         for column in require_columns(path, [*table.file.names, *sensors], [old], "--name")
     }
+    if sensors:
+        _separate_sensors(table, sensors, options)
     channels: dict[str, Array] = {}
     notes: list[str] = []
     for name in table.values:
@@ -152,28 +160,29 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
             channel += "_"
         channels[channel] = values
         notes += found
-    if not sensors:
-        return channels, notes
+    return channels, notes
+
+
+def _separate_sensors(table: _Table, sensors: Sequence[str], options: LogOptions) -> None:
+    """Make a column of each sensor with temperatures in a table that has all below one another."""
+    path = table.file.path
     asked = [name for name in options.temperatures if name not in table.file.names]
     names = require_columns(path, sensors, asked, "--temperature-column")
-    values, labels = next(iter(channels.values())), np.array(table.labels)
-    names = (
-        names
-        or tuple(filter(options.wanted.__contains__, sensors))
-        or tuple(
-            n
-            for n in sensors
-            if not OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
-        )
-    )
-    if not names:
+    names = names or tuple(filter(options.wanted.__contains__, sensors))
+    ((column, values),) = table.values.items()
+    labels = np.array(table.labels)
+    every = {n: np.where(labels == n, values, np.nan) for n in names or sensors}
+    table.values = {
+        name: readings
+        for name, readings in every.items()
+        if names or (np.isfinite(readings).any() and not OTHER_NAME.search(name))
+    }
+    table.units = dict.fromkeys(table.values, table.units[column])
+    if not table.values:
         raise DataError(
-            f"{path}: no sensor in column {LABEL!r} has temperatures: {quoted(sensors[:6])}; "
-            "export one that has"
+            f"{path}: no sensor in column {quoted(label_columns(table.file))} has temperatures: "
+            f"{quoted(sensors[:6])}; export one that has"
         )
-    return {
-        given.get(n) or channel_name(n): np.where(labels == n, values, np.nan) for n in names
-    }, notes
 
 
 def _hold_readings(
@@ -206,18 +215,24 @@ def _hold_readings(
     return np.concatenate(more), {n: np.concatenate(c) for n, c in repeated.items()}, notes
 
 
-def _sort_by_time(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str, Array], int]:
-    """Sort rows by time and join those of one time; return also the number left out."""
+def _sort_by_time(
+    times: Array, channels: dict[str, Array]
+) -> tuple[Array, dict[str, Array], int, int]:
+    """Sort rows by time and join those of one time; return also how many are left out.
+
+    The last number is that of rows left out whose readings are others, by more than 1 K.
+    """
     unique, place = np.unique(times, return_inverse=True)
-    kept, taken = {}, np.zeros(len(times), dtype=bool)
+    kept, taken, others = {}, *np.zeros((2, len(times)), dtype=bool)
     for name, values in channels.items():
         known = np.flatnonzero(np.isfinite(values))
         _, first = np.unique(place[known], return_index=True)
         kept[name] = np.full(len(unique), np.nan)
         kept[name][place[known[first]]] = values[known[first]]
         taken[known[first]] = True
+        others |= np.abs(values - kept[name][place]) > 1.0
     lost = int((~taken & np.any([np.isfinite(v) for v in channels.values()], axis=0)).sum())
-    return unique, kept, lost
+    return unique, kept, lost, int(others.sum())
 
 
 class _Table:
@@ -241,18 +256,20 @@ class _Table:
         # of each row: the moment from which its seconds count, -1 for 1970
         self._of, self._moments = array("i"), list[datetime]()
         self._minute = cache(self._find_minute)
-        self.values = {name: array("d") for name in names}
+        self.values: dict[str, Any] = {name: array("d") for name in names}
         self.units: dict[str, Counter[str]] = {name: Counter() for name in names}
         self._untimed: list[tuple[int, str]] = []
         self._words: dict[str, Counter[str]] = {name: Counter() for name in names}
         self.labels: list[str] = []
         columns = [(name, file.names.index(name)) for name in names]
-        label = file.names.index(LABEL) if LABEL in file.names else None
+        labels = list(map(file.names.index, label_columns(file)))
         self.are_serials = len(times) == 1 and are_serials(file.column(times[0]))
         bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
+        # 2026061412, the hours of a weather service
+        tail = "00" if all(map(_HOURS.fullmatch, file.column(times[0]))) else ""
         head = 0
         for line, row in file.rows():
-            text = " ".join(row[place] for place in self._places)
+            text = " ".join(row[place] for place in self._places) + tail
             seconds = _as_seconds(text) if bare else None
             at = (-1, seconds) if seconds is not None else self._find_moment(line, text)
             if at is None:
@@ -269,8 +286,8 @@ class _Table:
             self._lines.append(line)
             for name, place in columns:
                 self.values[name].append(self._value(line, name, row[place]))
-            if label is not None:
-                self.labels.append(row[label])
+            if labels:
+                self.labels.append(" ".join(row[place] for place in labels))
         self.times = self._utc(clock)
 
     def _is_other_head(self, row: list[str]) -> bool:
@@ -319,33 +336,11 @@ class _Table:
         found = _SECONDS.fullmatch(text)
         if found and (begin := self._minute(found[1], found[3])) >= 0:
             return begin, float(found[2])
-        moment = self._moment(line, text)
-        if moment is None:
-            return None
-        self._moments.append(moment)
-        return len(self._moments) - 1, 0.0
-
-    def _find_minute(self, before: str, after: str) -> int:
-        """Return the row of a minute's first moment, given the text around the seconds; else -1.
-
-        Parsing the time of each reading would take longer than all else.
-        """
-        try:
-            half = parse_moment(f"{before}:30{after}", self._order)
-        except ValueError:
-            return -1
-        # in some forms the last digits are minutes or a fraction
-        if not isinstance(half, datetime) or half.second != 30 or half.microsecond:
-            return -1
-        self._moments.append(half.replace(second=0))
-        return len(self._moments) - 1
-
-    def _moment(self, line: int, text: str) -> datetime | None:
-        """Return the time of a row, None for a row that has no readings."""
         try:
             moment = parse_serial(text) if self.are_serials else parse_moment(text, self._order)
         except ValueError as cause:
-            if not text[:1].isdigit():
+            # a footer may be `60 records`
+            if not text[:1].isdigit() or re.fullmatch(r"\d{1,5} \D*", text):
                 return None
             raise DataError(
                 f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
@@ -356,12 +351,32 @@ class _Table:
                 f"{self.file.path}, line {line}: {text[:40]!r} is only a date or a time; name "
                 "both columns (--time-column twice)"
             )
-        return moment
+        self._moments.append(moment)
+        return len(self._moments) - 1, 0.0
+
+    def _find_minute(self, before: str, after: str) -> int:
+        """Return the row of a minute's first moment, given the text around the seconds; else -1.
+
+        Parsing the time of each reading would take longer than all else.
+        """
+        try:
+            whole, half = (parse_moment(f"{before}:{s}{after}", self._order) for s in ("00", "30"))
+        except ValueError:
+            return -1
+        # in some forms the last digits are minutes, a fraction, or those of a zone
+        if not (isinstance(whole, datetime) and isinstance(half, datetime)):
+            return -1
+        if (half - whole).total_seconds() != 30.0:
+            return -1
+        self._moments.append(whole)
+        return len(self._moments) - 1
 
     def _value(self, line: int, name: str, text: str) -> float:
         """Return a reading in the unit of the file, NaN for none."""
         if not text:
             return np.nan
+        if found := _TENTHS.fullmatch(text):
+            text = f"{found[1]}.{found[2]}"
         plain = text.replace(",", ".") if self.file.decimal == "," else text
         if not plain[-1].isdigit() and (unit := UNIT_BEHIND.search(plain)):
             plain = plain[: unit.start()]
@@ -372,7 +387,7 @@ class _Table:
             value = np.nan
         if math.isfinite(value) and value not in _NO_READING:
             return value
-        if re.search(r"\d", text) and value not in _NO_READING:
+        if re.match(r"[^#]*\d", text) and value not in _NO_READING:
             raise DataError(
                 f"{self.file.path}, line {line}, column {name!r}: {text[:40]!r} is not a number"
             )
@@ -386,12 +401,16 @@ def _as_seconds(text: str) -> float | None:
         seconds = whole_seconds(float(text))
     except ValueError:
         return None
-    return seconds if seconds < _LATEST_S else None
+    # of 12 and 14 digits is a date with a time
+    return seconds if seconds < _LATEST_S and len(text.split(".")[0]) not in (12, 14) else None
 
 
 def _apply_header_zone(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
     """Return the logger's clock with the zone in the head of its times, and notes."""
     stated = stated_zones(header)
+    if not stated and (unclear := _UNCLEAR.search(header)) and not clock.forced:
+        where = f"doubtful: {unclear[0]!r} in the head of the times may be one of several zones"
+        return clock, [f"{where}: {clock.zone} is used, if --log-timezone does not give it"]
     if not stated:
         return clock, []
     note = f"log: the header gives the time zone {'/'.join(stated)}"
@@ -430,12 +449,7 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
         unit = "degC"
     elif unit != "degC" and options.unit is None:
         notes.append(f"log: {name!r} is converted from {unit}, the unit in {source}")
-    celsius = to_celsius(values, unit)
-    labels = np.array(table.labels or np.zeros(len(celsius)))
-    for sensor in np.unique(labels):
-        rows = np.flatnonzero(labels == sensor)
-        celsius[rows], doubts = _drop_unmeasured(table, name, rows, celsius[rows], options)
-        notes += doubts
+    celsius, doubts = _drop_unmeasured(table, name, to_celsius(values, unit), options)
     wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -444,20 +458,20 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
             f"temperatures of cameras lie between {_PLAUSIBLE_C[0]:g} and {_PLAUSIBLE_C[1]:g} °C. "
             "Another unit (--unit), or another column (--temperature-column)?"
         )
-    return celsius, notes
+    return celsius, [*notes, *doubts]
 
 
 def _drop_unmeasured(
-    table: _Table, name: str, rows: NDArray[np.int64], celsius: Array, options: LogOptions
+    table: _Table, name: str, celsius: Array, options: LogOptions
 ) -> tuple[Array, list[str]]:
-    """Return one sensor's rows (n,) °C, NaN for values given without a measurement, and notes.
+    """Return readings (n,) °C, NaN for values given without a measurement, and notes.
 
     Raises DataError if the unit changes midway and was not given.
     """
-    if changed := find_unit_change(table.times[rows], celsius):
+    if changed := find_unit_change(table.times, celsius):
         row, words = changed
         last = celsius[:row][np.isfinite(celsius[:row])][-1]
-        where = f"{table.where(rows[row])}, column {name!r}: the unit seems to change {words} here"
+        where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"
         if options.unit is None:
             raise DataError(
                 f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts "
@@ -475,7 +489,7 @@ def _drop_unmeasured(
         why = "leaping away and back" if sort else "given without a measurement"
         notes.append(
             f"doubtful: {counted(sum(s.stop - s.first for s in found), 'reading')} of {name!r} "
-            f"{why} (the first {celsius[first]:.4g} °C, {table.where(rows[first])}): {treated}"
+            f"{why} (the first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import RecordingError, ThermocaldError
+from thermocald.numbers import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -201,7 +202,7 @@ class Chunk:
             self.fail(
                 short,
                 None,
-                f"has {len(rows[short])} fields instead of {width}"
+                f"has {counted(len(rows[short]), 'field')} instead of {width}"
                 + ("; is the file cut off?" if len(rows[short]) < width else ""),
             )
         self._columns = dict(zip(table.columns, zip(*rows, strict=True), strict=True))

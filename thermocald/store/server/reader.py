@@ -26,7 +26,6 @@ from thermocald.store.database.epochs import (
     parse_series,
     series_row,
     unpack_covariance,
-    unpack_observations,
 )
 from thermocald.store.schema import COLUMN_NAMES, EPOCH_NUMBERS, EPOCH_TEXTS, sql_name
 from thermocald.store.series import Event, SeriesReader, StoredEpoch, StoredSeries
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     from psycopg.sql import Composable
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.database.epochs import KeptFrame
 
 
@@ -99,14 +97,6 @@ class ServerStore(Connected, SeriesReader):
             order = np.lexsort((columns["frame_time"], columns["epoch"]))
             columns = {name: column[order] for name, column in columns.items()}
         return {name: columns[name] for name in names}
-
-    def observations(self, series: StoredSeries, first: int, last: int) -> dict[int, Observations]:
-        rows = self._query(
-            "SELECT number, observations FROM epoch WHERE series = %s AND number BETWEEN %s AND %s "
-            "AND observations IS NOT NULL ORDER BY number, revision",
-            (_key(series), first, last),
-        )
-        return {number: unpack_observations(data) for number, data in rows}
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         rows = self._query(

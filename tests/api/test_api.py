@@ -167,6 +167,10 @@ def test_one_result_prints_documents_draws_and_reports(
             result.plot()
     else:
         result.plot().savefig(tmp_path / "drawn.png")
+    if name == "Correction":
+        for _ in range(2):  # the second counts anew
+            result.write(tmp_path / "corrected.csv")
+        assert result.points == 2
     if name == "Discovery":
         assert result.verdict == "effects_found"
         result.save(tmp_path / "found.yaml")
@@ -289,6 +293,11 @@ OF_A_CAMERA = {
     "sx, sy above 0": lambda c: resected(c, SEEN | {"sx": [0.0] * 4}),
     "no pose .too_few_targets.: 2": lambda c: c.at(35.0).project(POINT, resected(c, FEW)),
     "the pose: must be": lambda c: c.at(35.0).project(POINT, None),
+    "the pose: give one, not 2": lambda c: c.at(35.0).project(POINT, np.zeros((2, 6))),
+    "image points: must": lambda c: c.at(35.0).undistort(np.zeros((2, 4, 2))),
+    "px of 8.96 µm cannot be comp": lambda c: c.at(35.0).object_distance(
+        c.for_images(410, 308).at(35.0), 1e4
+    ),
     "no thermometer 'foo'; it knows": lambda c: tc.predict(c, 35.0, channels={"foo": 1.0}),
     "of board_temperature is nan": lambda c: c.at(35.0, channels={"board_temperature": np.nan}),
     "temperature_sd is -1": lambda c: c.at(35.0, temperature_sd=-1.0),
@@ -347,8 +356,11 @@ def test_what_no_camera_can_answer_is_refused(camera, message):
 def test_numbers_and_paths_are_taken_as_notebooks_hold_them(inside, M1, camera):
     """Scalars, rows and columns of NumPy, an iterator of files; functions are found by pickle."""
     assert tc.predict(camera, np.float64(35.0)).document["temperature"] == 35.0
-    lamp = np.array([[0.0, 1.0], [60.0, 2.0]])
-    assert len(tc.simulate("nexus5-cold", lamp=lamp, epochs=np.int64(3))) == 3
+    assert jsonable(tc.predict(camera, np.float32(35.0)).as_dict())["temperature"] == 35.0
+    lag = {"thermal_lag": {"tau": np.int64(75)}}
+    for lamp in (np.array([[0.0, 1.0], [60.0, 2.0]]), zip([0.0, 60.0], [1.0, 2.0], strict=True)):
+        given = {"lamp": lamp, "epochs": np.int64(3), "seed": np.int64(3), "effects": lag}
+        assert len(tc.simulate("nexus5-cold", **given)) == 3
     told = {"log": "logger.csv", "timezone": "UTC", "testfield": M1.testfield, "pixel_pitch": 0.001}
     assert len(tc.import_photographs(Path("photos").glob("*.jpg"), **told)) == 6
     assert pickle.loads(pickle.dumps(tc.study)) is tc.study
@@ -372,6 +384,7 @@ def test_one_image_point_is_an_array_of_one(camera):
     now = camera.at(35.0)
     for method in (now.undistort, now.rays, now.point_covariance):
         np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
+    np.testing.assert_array_equal(now.project(POINT[0], [0.0] * 6), now.project(POINT, [0.0] * 6))
 
 
 def test_a_copy_is_no_second_measurement(short, M2, inside, tmp_path):

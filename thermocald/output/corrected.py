@@ -123,6 +123,7 @@ class Correction(Result):
         Images that cannot be corrected are added to `refused`. Raises DataError if no image can be
         corrected, UsageError if one would be overwritten.
         """
+        lines: dict[Path, int] = {}
         for block in self._blocks(()):
             possible = self._possible(block)
             if not possible.lines:
@@ -137,6 +138,8 @@ class Correction(Result):
                 source = self.path.parent / row["image"]
                 written = out / row["image"].rsplit("/", 1)[-1]
                 try:
+                    if (first := lines.setdefault(written, line)) != line:
+                        raise ImageError(f"{written} is the corrected image of line {first}")
                     _write_corrected(source, written, maps, values)
                 except ImageError as cause:
                     self._refuse(line, str(cause))
@@ -158,6 +161,9 @@ class Correction(Result):
             )
 
     def _blocks(self, columns: tuple[str, ...]) -> Iterator[RowBlock]:
+        """Return the rows, none of which is counted yet."""
+        self.points, self.extrapolated_rows, self._moved, self._left_over = 0, 0, 0.0, 0.0
+        self.images, self.refused = [], []
         return row_blocks(self.path, columns, self.clock, self.date_order, self.log)
 
     def _possible(self, block: RowBlock) -> RowBlock:

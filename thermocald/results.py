@@ -21,7 +21,7 @@ from thermocald.discovery.result import build_model, field_lines, mount_lines, s
 from thermocald.errors import DataError
 from thermocald.figures import draw_figure
 from thermocald.names import tell_apart
-from thermocald.numbers import percent, plain, typeset_powers, with_sd
+from thermocald.numbers import counted, percent, plain, typeset_powers, with_sd
 from thermocald.output import calibration as calibration_report
 from thermocald.output import discovery as discovery_report
 from thermocald.output.study import report as study_report
@@ -286,7 +286,7 @@ class Calibration(Photographs, Result):
             why = self.reason
             raise DataError(f"{path}: not written, the camera was not calibrated: {why}")
         comment = (
-            f"calibrated by thermocald from {len(self.photographs)} photographs, "
+            f"calibrated by thermocald from {counted(len(self.poses), 'photograph')}, "
             f"sigma0 {self.sigma0:.2f}"
         )
         known = replace(self.file, interior=self.interior)

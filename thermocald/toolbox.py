@@ -123,9 +123,9 @@ def convert_camera(
     """Convert a camera file, exactly if the formats' conventions allow it, else by a fit.
 
     The result states how well a fit agrees. to, format: the formats of out and of source, opencv,
-    ros, colmap, mrcal, kalibr, metashape, aicon or json; the source's is by default recognised from
-    its content. pixel_pitch: mm, needed if the file does not give it. Raises ConfigurationError,
-    which names the file, UsageError for an unknown format.
+    ros, colmap, mrcal, kalibr, metashape, aicon, json or yaml; the source's is by default
+    recognised from its content. pixel_pitch: mm, needed if the file does not give it. Raises
+    ConfigurationError, which names the file, UsageError for an unknown format.
 
     >>> print(tc.convert_camera("cold.json", "cold.xml", "metashape").statement)
     exact: both models give the same pixels

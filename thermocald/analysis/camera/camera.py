@@ -251,8 +251,8 @@ class Camera(Result):
     def write(self, path: Path | str, format: str = "", comment: str = "") -> str:  # noqa: A002
         """Write the camera for another program; return how exact the file is.
 
-        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; by default the one that
-        the file's name tells: `ros.yaml`, or a suffix of a single format (`.xml`, `.json`, …);
+        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json, yaml; by default the one
+        that the file's name tells: `ros.yaml`, or a suffix of a single format (`.xml`, `.json`, …);
         comment: a line for the file's head, by default the temperature. Raises UsageError if the
         name tells no format, or several, GeometryError for a model without rays.
 

@@ -189,6 +189,8 @@ def calibrate_observations(
         if not settings.free:
             held = "" if camera.interior else ", and no --camera gives it"
             raise GeometryError(f"the interior orientation is held (--free none){held}")
+        if "c" not in settings.free and not (camera.interior or camera.principal_distance):
+            raise GeometryError("the principal distance is held, and no --camera gives it")
         if not usable:
             raise GeometryError(_NO_TARGETS if seen else "none can be read")
         rows, together = _adjust_together(usable, testfield, camera, settings)

@@ -1,4 +1,4 @@
-"""The camera as every file format writes and reads it, and our own JSON format.
+"""The camera as every file format writes and reads it, and our own formats, JSON and YAML.
 
 Also reads the numbers and the YAML in a file's text; an error names the value that is wrong.
 """
@@ -15,7 +15,8 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.files import QuantityReader
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraSpec, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
 from thermocald.photogrammetry.linalg import unit_diagonal
 
@@ -231,4 +232,34 @@ def _decode_own(text: str) -> CameraRecord:
 OWN = Format(
     "json", ".json", "thermocald's own, with covariance", lambda _: BROWN, _encode_own, _decode_own,
     lambda text: f'"{_VERSION}"' in text[:200],
+)  # fmt: skip
+
+
+def _encode_yaml(record: CameraRecord) -> str:
+    interior = dict(zip(IOP_NAMES, record.values.tolist(), strict=True))
+    width, height = record.size
+    document = {
+        "name": record.name,
+        "width": width,
+        "height": height,
+        "pixel_pitch": record.pixel_pitch,
+        "principal_distance": interior["c"],
+        "interior": interior,
+    }
+    return record.head() + yaml_text(document)
+
+
+def _decode_yaml(text: str) -> CameraRecord:
+    camera = CameraSpec.read(QuantityReader("the camera", yaml_mapping(text)))
+    sensor, interior = camera.sensor, camera.interior
+    if interior is None:
+        raise ConfigurationError("the camera has no interior orientation")
+    size, values = (sensor.width, sensor.height), interior.as_array()
+    return CameraRecord(size, BROWN, values, camera.name, None, sensor.pixel_pitch)
+
+
+YAML = Format(
+    "yaml", ".yaml", "thermocald's own, without covariance", lambda _: BROWN,
+    _encode_yaml, _decode_yaml,
+    lambda text: "\ninterior:" in f"\n{text}" and not text.startswith("format: thermocald-"),
 )  # fmt: skip

@@ -237,15 +237,12 @@ class Calibration(Photographs, Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
-        document = self.as_dict()
-        lines: list[str] = []
-        if document["status"] == "ok":
-            used = sum(p["exterior"] is not None for p in document["photographs"])
-            lines.append(
-                f"calibrated from {used} of {document['n_photographs']} photographs: sigma0 "
-                f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
-                + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
-            )
+        if self.status == "ok":
+            lines = [
+                f"calibrated from {len(self.poses)} of {self.n_photographs} photographs: sigma0 "
+                f"{self.sigma0:.2f}, redundancy {self.redundancy}"
+                + (f"; {CAUSES_OF_SIGMA0}" if self.sigma0 > 1.0 + MATERIAL else "")
+            ]
             table = calibration_report.interior_table(self, self.file.sensor, str)
             rows = [("", *table.headings[1:]), *table.rows]
             width = [max(len(row[k]) for row in rows) for k in range(3)]
@@ -254,18 +251,12 @@ class Calibration(Photographs, Result):
             ]
             lines += self._notes
         else:
-            lines.append(f"not calibrated: {document['reason']}")
-        for p in document["photographs"]:
-            line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
-            if p["exterior"] is not None:
-                e = p["exterior"]
-                line += f", {plain(p['rms_px'], 'px', 2)}, at " + ", ".join(
-                    with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
-                )
-                line += " mm"
-            if p["reason"]:
-                line += f": {p['reason']}"
-            lines.append(line)
+            lines = [f"not calibrated: {self.reason}"]
+        for p in self.photographs:
+            line = f"{p.path}: {p.status}, {p.n_targets} targets"
+            if p.exterior is not None:
+                line += f", {plain(p.rms_px, 'px', 2)}, at {p.place} mm"
+            lines.append(line + (f": {p.reason}" if p.reason else ""))
         return lines
 
     def page(self, title: str = "") -> str:

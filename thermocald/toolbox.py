@@ -237,15 +237,13 @@ def correct(
     from thermocald.output.corrected import Correction
 
     require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0.0))
-    width, height = size or (1, 1)
-    require_within(width=(width, 1), height=(height, 1))
     thermal, path = _thermal(model), source_of(points)
+    if size is not None:
+        thermal = thermal.for_images(*size)
     clock = device_clock(timezone, ambiguous=ambiguous)
     options = _log_options(log_options)
     header, near = first_times(path, clock, options.date_order)
     table = read_model_log(thermal, source_of(log), options, near)
-    if size is not None:
-        thermal = thermal.for_images(*size)
     if temperature_sd is None:
         temperature_sd = thermal.reading_sd
     return Correction(

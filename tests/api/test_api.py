@@ -238,7 +238,7 @@ OUT_OF_BOUNDS = {
     "give finite": lambda M1: simulated(lamp=[(0, float("nan"))]),
     "in the order of time": lambda M1: simulated(lamp=[(9, 1), (0, 3)]),
     "temperature is nan": lambda M1: tc.predict(MODEL, np.nan),
-    "height is 0": lambda M1: tc.correct("x.csv", MODEL, log="M1", size=(9, 0)),
+    "size 9×0 px is impossible": lambda M1: tc.correct("x.csv", MODEL, log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1: tc.fit_calibrations({}),
     "sigma_px is 0": lambda M1: tc.check_testfield(FIELD, sigma_px=0.0),
     "roll is nan": lambda M1: tc.check_testfield(FIELD, roll=np.nan),
@@ -343,7 +343,7 @@ def test_every_argument_is_checked():
 
 @pytest.mark.parametrize("message", OUT_OF_BOUNDS)
 def test_an_argument_out_of_bounds_is_refused(inside, M1, message):
-    with pytest.raises((UsageError, DataError), match=message):
+    with pytest.raises((UsageError, DataError, ConfigurationError), match=message):
         OUT_OF_BOUNDS[message](M1)
 
 

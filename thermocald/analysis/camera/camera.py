@@ -142,7 +142,8 @@ class Camera(Result):
         >>> tc.load_camera("camera.yaml").at(35.0).object_error(10_000.0).shape
         (9,)
         """
-        _require_distance(distance_mm)
+        if not distance_mm > 0:
+            raise UsageError(f"distance_mm is {distance_mm}; it must be above 0")
         points = image_grid(self.sensor) if image_points is None else image_points
         covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
         variance = np.trace(covariance, axis1=1, axis2=2)
@@ -220,7 +221,6 @@ class Camera(Result):
 
     def object_distance(self, other: Camera, distance_mm: float) -> Array:
         """Return the distances (9,) mm on a plane between the image grids of this and another."""
-        _require_distance(distance_mm)
         if self.sensor != other.sensor:
             raise UsageError(f"cameras of {self.sensor} and {other.sensor} cannot be compared")
         grid = image_grid(self.sensor)
@@ -316,11 +316,6 @@ def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Arra
     if found.ndim not in (1, 2) or found.shape[-1] != columns:
         raise UsageError(f"{name}: must be an array (n, {columns}) of numbers")
     return np.atleast_2d(found)
-
-
-def _require_distance(distance_mm: float) -> None:
-    if not distance_mm > 0:
-        raise UsageError(f"distance_mm is {distance_mm}; it must be above 0")
 
 
 def _pose_values(given: Adjustment | ExteriorOrientation | ArrayLike) -> Array:

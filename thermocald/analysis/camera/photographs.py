@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.errors import GeometryError, ImageError, UsageError
+from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
 _IMAGES = frozenset(
@@ -79,6 +80,12 @@ class PhotographResult:
     def n_rejected(self) -> int:
         """The number of rejected targets."""
         return len(self.rejected)
+
+    @property
+    def place(self) -> str:
+        """X0, Y0, Z0 with their standard deviations, mm; empty without a pose."""
+        centre = () if self.exterior is None else self.exterior.centre.tolist()
+        return ", ".join(map(with_sd, centre, self.exterior_sd[3:].tolist()))
 
     @property
     def pose(self) -> dict[str, float] | None:
@@ -224,12 +231,18 @@ def calibrate_observations(
         each = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
         rows = [k for i, k in enumerate(rows) if i not in left_out]
         poses = dict(zip(rows, each, strict=True))
-    photographs = [
-        _photograph(name, seen[k], testfield.names, *poses[k])
-        if k in poses
-        else PhotographResult(name, *failures.get(k, _NO_POSE), len(seen[k]) if k in seen else 0)
-        for k, name in enumerate(names)
-    ]
+    photographs = []
+    for k, name in enumerate(names):
+        n = len(seen[k]) if k in seen else 0
+        if k not in poses:
+            photographs.append(PhotographResult(name, *failures.get(k, _NO_POSE), n))
+            continue
+        o, (used, v, exterior, sd) = seen[k], poses[k]
+        rms = float(np.sqrt(np.mean(v[used] ** 2)))
+        rejected = tuple(testfield.names[t] for t in o.targets[~used])
+        photographs.append(
+            PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, v, used)
+        )
     return replace(result, photographs=tuple(photographs))
 
 
@@ -255,7 +268,11 @@ def _adjust_together(
         except GeometryError as error:
             why = why or str(error)
             continue
-        found = _orient_all(usable, testfield, camera.sensor, trial)
+        found = dict[int, ExteriorOrientation]()
+        for k, o in usable.items():
+            with suppress(GeometryError):
+                seen = camera.sensor, testfield.points[o.targets], o.points
+                found[k] = approximate_orientation(*seen, interior=trial)[1]
         if len(found) > len(oriented):
             start, oriented = trial, found
         if len(oriented) == len(usable):
@@ -265,34 +282,6 @@ def _adjust_together(
     chosen = [usable[k] for k in oriented]
     return list(oriented), adjust_common_interior(
         camera.sensor, testfield, chosen, start, list(oriented.values()), settings
-    )
-
-
-def _orient_all(
-    usable: dict[int, Observations], testfield: TestField, sensor: Sensor, at: InteriorOrientation
-) -> dict[int, ExteriorOrientation]:
-    """Return the poses of the photographs that have one with an interior orientation."""
-    oriented = {}
-    for k, o in usable.items():
-        with suppress(GeometryError):
-            points = testfield.points[o.targets]
-            oriented[k] = approximate_orientation(sensor, points, o.points, interior=at)[1]
-    return oriented
-
-
-def _photograph(
-    name: str,
-    o: Observations,
-    targets: Sequence[str],
-    used: Mask,
-    residuals: Array,
-    exterior: ExteriorOrientation | None,
-    sd: Array,
-) -> PhotographResult:
-    rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
-    rejected = tuple(targets[t] for t in o.targets[~used])
-    return PhotographResult(
-        name, "ok", "", len(o), rejected, rms, exterior, sd, o.points, residuals, used
     )
 
 

@@ -144,10 +144,11 @@ class Camera(Result):
         """
         if not distance_mm > 0:
             raise UsageError(f"distance_mm is {distance_mm}; it must be above 0")
-        points = image_grid(self.sensor) if image_points is None else image_points
-        covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
-        variance = np.trace(covariance, axis1=1, axis2=2)
-        result: Array = np.sqrt(variance) * distance_mm / self.interior.c
+        points = image_grid(self.sensor) if image_points is None else _numbers(image_points, 2)
+        seen = directions(self.sensor, self.values, points)
+        _, J, by_place = partials(self.sensor, self.values, np.zeros(6), seen)
+        J = np.linalg.solve(by_place[..., :2], J[..., :10])  # of the tangents of the image point
+        result: Array = distance_mm * np.sqrt(np.einsum("nkp,pq,nkq->n", J, self.covariance, J))
         return result
 
     def resect(

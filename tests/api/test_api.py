@@ -143,6 +143,7 @@ RESULTS = {
     "Conversion": lambda *_: tc.convert_camera("cold.json", "cold.ior", "aicon"),
     "Correction": lambda epochs, camera, M1, M2: tc.correct("points.csv", camera, log="M1"),
     "Discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
+    "Calibration": lambda *_: tc.calibrate("photos", "M1/testfield.csv"),
     "FieldCheck": lambda epochs, camera, M1, M2: tc.check_testfield(M1.testfield),
     "Plan": lambda *_: Plan({"thermal_lag": {"thermal_lag or time_offset": 1}}, 1, 0.1),
     "Prediction": lambda epochs, camera, M1, M2: tc.predict(camera, log="M1"),
@@ -364,6 +365,14 @@ def test_numbers_and_paths_are_taken_as_notebooks_hold_them(inside, M1, camera):
     told = {"log": "logger.csv", "timezone": "UTC", "testfield": M1.testfield, "pixel_pitch": 0.001}
     assert len(tc.import_photographs(Path("photos").glob("*.jpg"), **told)) == 6
     assert pickle.loads(pickle.dumps(tc.study)) is tc.study
+
+
+def test_what_is_saved_at_home_is_found_there(epochs, camera, tmp_path, monkeypatch):
+    """A folder called ~ was made."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for write in (epochs.to_csv, camera.save, camera.at(35.0).report):
+        write("~/saved.yaml")
+        (tmp_path / "saved.yaml").unlink()
 
 
 def test_times_of_pandas_with_and_without_a_zone(camera):

@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-
 from thermocald.analysis import field as checks
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.photographs import Photographs
@@ -218,13 +216,8 @@ class Calibration(Photographs, Result):
         """
         if self.interior is None:
             raise DataError(f"the camera was not calibrated: {self.reason}")
-        return Camera(
-            self.file.sensor,
-            float("nan"),
-            self.interior.as_array(),
-            np.array(self.covariance[:10, :10]),
-            name=self.file.name,
-        )
+        values, Q = self.interior.as_array(), self.covariance[:10, :10]
+        return Camera(self.file.sensor, math.nan, values, Q, name=self.file.name)
 
     @property
     def poses(self) -> dict[str, ExteriorOrientation]:

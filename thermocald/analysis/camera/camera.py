@@ -147,8 +147,8 @@ class Camera(Result):
         points = image_grid(self.sensor) if image_points is None else _numbers(image_points, 2)
         seen = directions(self.sensor, self.values, points)
         _, J, by_place = partials(self.sensor, self.values, np.zeros(6), seen)
-        J = np.linalg.solve(by_place[..., :2], J[..., :10])  # of the tangents of the image point
-        result: Array = distance_mm * np.sqrt(np.einsum("nkp,pq,nkq->n", J, self.covariance, J))
+        K = np.linalg.solve(by_place[..., :2], J[..., :10])  # of the tangents of the image point
+        result: Array = distance_mm * np.sqrt(np.einsum("nkp,pq,nkq->n", K, self.covariance, K))
         return result
 
     def resect(

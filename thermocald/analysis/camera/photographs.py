@@ -176,7 +176,7 @@ def calibrate_photographs(
                 failures[k] = (found.status.word, found.status.reason)
         if advance is not None:
             advance(1)
-    names = [str(p) for p in paths]
+    names = [*map(str, paths)]
     return calibrate_observations(names, measured, failures, testfield, camera, settings)
 
 

@@ -236,26 +236,19 @@ OWN = Format(
 
 
 def _encode_yaml(record: CameraRecord) -> str:
-    interior = dict(zip(IOP_NAMES, record.values.tolist(), strict=True))
-    width, height = record.size
-    document = {
-        "name": record.name,
-        "width": width,
-        "height": height,
-        "pixel_pitch": record.pixel_pitch,
-        "principal_distance": interior["c"],
-        "interior": interior,
-    }
-    return record.head() + yaml_text(document)
+    (width, height), values = record.size, record.values.tolist()
+    interior = dict(zip(IOP_NAMES, values, strict=True))
+    document = {"name": record.name, "width": width, "height": height}
+    document |= {"pixel_pitch": record.pixel_pitch, "principal_distance": values[0]}
+    return record.head() + yaml_text({**document, "interior": interior})
 
 
 def _decode_yaml(text: str) -> CameraRecord:
     camera = CameraSpec.read(QuantityReader("the camera", yaml_mapping(text)))
-    sensor, interior = camera.sensor, camera.interior
-    if interior is None:
+    if camera.interior is None:
         raise ConfigurationError("the camera has no interior orientation")
-    size, values = (sensor.width, sensor.height), interior.as_array()
-    return CameraRecord(size, BROWN, values, camera.name, None, sensor.pixel_pitch)
+    s, values = camera.sensor, camera.interior.as_array()
+    return CameraRecord((s.width, s.height), BROWN, values, camera.name, None, s.pixel_pitch)
 
 
 YAML = Format(

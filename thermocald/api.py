@@ -226,8 +226,7 @@ def fit(
         if any(e.name == effect.name for e in listed):
             raise UsageError(f"effect {effect.name} is given twice")
         listed.append(effect)
-    if start is not None and T0 is None:
-        T0 = start.T0
+    T0 = start.T0 if start is not None and T0 is None else T0
     inputs = [one.observed(progress, jobs) for one in series]
     refuse_copies([(one.name, one.grid.points) for one in inputs])
     reduced = [reduce_series(one, strict=False) for one in inputs]

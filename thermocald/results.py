@@ -266,9 +266,8 @@ class Calibration(Photographs, Result):
 
         Raises DataError if nothing was estimated.
         """
-        if self.interior is None or not self.estimated:
-            why = self.reason
-            raise DataError(f"{path}: not written, the camera was not calibrated: {why}")
+        if not self.estimated:
+            raise DataError(f"{path}: not written, the camera was not calibrated: {self.reason}")
         comment = (
             f"calibrated by thermocald from {counted(len(self.poses), 'photograph')}, "
             f"sigma0 {self.sigma0:.2f}"

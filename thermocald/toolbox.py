@@ -221,7 +221,7 @@ def correct(
 ) -> Correction:
     """Correct image points or images for the camera's temperature when they were taken.
 
-    points: a CSV with time, x, y (px) or with time, image; `-` reads standard input. log: a
+    points: a CSV with time, x, y (px), or time, image; `-` reads standard input. log: a
     logger's file, a recording or a store. to: the temperature to correct to, °C, by default the
     model's T0. temperature_sd: of a reading, K, by default as the fit estimated it. size: width and
     height of binned images, px. timezone, ambiguous: for times without a zone. say: called with a
@@ -246,8 +246,9 @@ def correct(
     table = read_model_log(thermal, source_of(log), options, near)
     if temperature_sd is None:
         temperature_sd = thermal.reading_sd
+    of_images = "image" in header and "x" not in header
     return Correction(
-        path, "image" in header, thermal, table, clock, to, temperature_sd, extrapolate,
+        path, of_images, thermal, table, clock, to, temperature_sd, extrapolate,
         say or (lambda _: None), options.date_order,
     )  # fmt: skip
 

@@ -172,6 +172,11 @@ def test_one_result_prints_documents_draws_and_reports(
         for _ in range(2):  # the second counts anew
             result.write(tmp_path / "corrected.csv")
         assert result.points == 2
+        with pytest.raises(UsageError, match="would be overwritten"):
+            result.write("points.csv")
+        again = tc.correct(tmp_path / "corrected.csv", camera, log="M1")
+        with pytest.raises(DataError, match=r"column dx would stand twice.*corrected already"):
+            again.write(tmp_path / "again.csv")
     if name == "Discovery":
         assert result.verdict == "effects_found"
         result.save(tmp_path / "found.yaml")

@@ -155,7 +155,6 @@ def calibrate_photographs(
     advance: Callable[[int], None] | None,
 ) -> Photographs:
     """Measure and calibrate photographs; a file that is no image gets a status and a reason."""
-    measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
     copies, usable = find_copies(paths), dict[str, Observations]()
     for k, path in enumerate(paths):
@@ -168,15 +167,14 @@ def calibrate_photographs(
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
             failures[k] = (word, str(error).removeprefix(f"{path}: "))
-            measured.append(None)
         else:
-            measured.append(found.observations)
             usable[str(path)] = found.observations
             if not found.status.ok:
                 failures[k] = (found.status.word, found.status.reason)
         if advance is not None:
             advance(1)
     names = [*map(str, paths)]
+    measured = [usable.get(name) for name in names]
     return calibrate_observations(names, measured, failures, testfield, camera, settings)
 
 
@@ -188,8 +186,9 @@ def calibrate_observations(
     camera: CameraSpec,
     settings: AdjustmentSettings,
 ) -> Photographs:
-    """Calibrate from image points; failures: {position: (status, reason)} of unusable ones."""
-    failures = dict(failures)
+    """Calibrate from image points; failures: {position: (status, reason)} of unusable ones, to
+    which those without a pose are added.
+    """
     seen = {k: o for k, o in enumerate(measured) if o is not None}
     usable = {k: o for k, o in seen.items() if k not in failures}
     try:
@@ -340,5 +339,4 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
     if not sizes:
         decode_grey(images[0])
     width, height = sizes.most_common(1)[0][0]
-    pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
-    return CameraSpec("camera", Sensor(width, height, pitch))
+    return CameraSpec("camera", Sensor(width, height, pixel_pitch or _ASSUMED_PITCH))

@@ -128,9 +128,8 @@ class Photographs:
         """The interior orientation with `sd_` of estimated parameters, as in JSON documents."""
         if self.interior is None:
             return None
-        free, values = self._estimated, self.interior.as_array()
-        sds = np.sqrt(self.covariance.diagonal()[free])
-        return asdict(self.interior) | with_sds([IOP_NAMES[i] for i in free], values[free], sds)
+        sds = np.sqrt(self.covariance.diagonal()).tolist()
+        return asdict(self.interior) | {f"sd_{IOP_NAMES[i]}": sds[i] for i in self._estimated}
 
     @property
     def correlations(self) -> dict[str, Any] | None:

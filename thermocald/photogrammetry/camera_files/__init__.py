@@ -236,6 +236,8 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
     try:
         format_ = _read_text(path)[1].name
     except ConfigurationError:  # our own YAML without an interior orientation
+        format_ = YAML.name
+    if format_ == YAML.name:  # written by hand: its lines are named
         reader = QuantityReader(path, read_yaml(path, ConfigurationError))
         if "camera" in reader.mapping:
             reader = reader.inner("camera")

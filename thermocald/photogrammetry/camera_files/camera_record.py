@@ -19,6 +19,7 @@ from thermocald.files import QuantityReader
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraSpec, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
 from thermocald.photogrammetry.linalg import unit_diagonal
+from thermocald.result import with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -182,11 +183,9 @@ _VERSION = "thermocald-camera/1"
 
 
 def _encode_own(record: CameraRecord) -> str:
-    values: dict[str, float] = {}
-    for k, name in enumerate(IOP_NAMES):
-        values[name] = float(record.values[k])
-        if record.covariance is not None:
-            values[f"sd_{name}"] = float(np.sqrt(record.covariance[k, k]))
+    values = dict(zip(IOP_NAMES, record.values.tolist(), strict=True))
+    if record.covariance is not None:
+        values = with_sds(IOP_NAMES, record.values, np.sqrt(record.covariance.diagonal()))
     width, height = record.size
     document = {
         "format": _VERSION,

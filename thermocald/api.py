@@ -226,8 +226,7 @@ def fit(
         if any(e.name == effect.name for e in listed):
             raise UsageError(f"effect {effect.name} is given twice")
         listed.append(effect)
-    if start is not None and T0 is None:
-        T0 = start.T0
+    T0 = start.T0 if start is not None and T0 is None else T0
     inputs = [one.observed(progress, jobs) for one in series]
     refuse_copies([(one.name, one.grid.points) for one in inputs])
     reduced = [reduce_series(one, strict=False) for one in inputs]
@@ -372,12 +371,11 @@ def simulate(
 
     require_within(seed=(seed, 0), epochs=(epochs, 1))
     file_name(series, "series", UsageError)
-    if lamp is not None and (
-        not len(lamp)
-        or [t for t, _ in lamp] != sorted({t for t, _ in lamp})
-        or not all(math.isfinite(v) for pair in lamp for v in pair)
-    ):
-        raise UsageError(f"lamp is {list(lamp)}; give finite (from s, W) in the order of time")
+    steps = [] if lamp is None else [(float(t), float(watts)) for t, watts in lamp]
+    begins = [t for t, _ in steps]
+    finite = all(math.isfinite(v) for pair in steps for v in pair)
+    if lamp is not None and not (steps and finite and begins == sorted({*begins})):
+        raise UsageError(f"lamp is {steps}; give finite (from s, W) in the order of time")
     thermal, device, course_file = (
         None if p is None else source_of(p) for p in (model, camera, programme)
     )
@@ -397,10 +395,9 @@ def simulate(
     course = simulation.programme
     if epochs is not None:
         course = replace(course, epochs=epochs)
-    if lamp is not None:
-        times, watts = (list(column) for column in zip(*lamp, strict=True))
-        steps = Course.steps([*times, times[-1] + 1e9], watts)
-        course = replace(course, sources={"housing": steps})
+    if steps:
+        lit = Course.steps([*begins, begins[-1] + 1e9], [watts for _, watts in steps])
+        course = replace(course, sources={"housing": lit})
     simulation = replace(simulation, model=simulated, programme=course)
     if out is None:
         folder = Path(tempfile.mkdtemp(prefix="thermocald-"))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import os
 import stat
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -203,6 +204,7 @@ def checked(public: Public) -> Public:
 
     @functools.wraps(public)
     def called(*given: Any, **named: Any) -> Any:
+        given, named = tuple(map(_plain, given)), _plain(named)
         names = chain(named_in_order.args, repeat(named_in_order.varargs))  # *series is several
         for name, value in (*zip(names, given, strict=False), *named.items()):
             kind = kinds().get(name, Any)
@@ -235,6 +237,21 @@ def _in_words(kind: Any) -> str:
     return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{made}"
 
 
+def _plain(value: Any) -> Any:
+    """Return Python's number for one of NumPy, xarray, …, also in a mapping; NaN if masked.
+
+    A path in the home folder (`~/`) is returned with that folder.
+    """
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, str | os.PathLike) and str(value).startswith("~/"):
+        return os.path.expanduser(value)
+    if getattr(value, "ndim", None) != 0 or "time" in str(value.dtype):
+        return value
+    number = getattr(value, "tolist", value.item)()
+    return math.nan if number is None else number
+
+
 def _accepts(kind: Any, value: Any) -> bool:
     """Return whether a value and its elements are what an annotation says."""
     origin, inner = _parts(kind)
@@ -244,8 +261,6 @@ def _accepts(kind: Any, value: Any) -> bool:
         return False
     if origin is Any:
         return True
-    if getattr(value, "ndim", None) == 0:  # of NumPy, xarray, …
-        value = value.item()
     if isinstance(value, bool) and origin in (int, float):
         return False
     if not isinstance(value, _KINDS.get(origin, (origin,))[0]):

@@ -33,8 +33,9 @@ class Result(ABC):
     """The result of an analysis; `print` shows what the command prints."""
 
     def __init_subclass__(cls) -> None:
-        """Let the public methods of every result check their arguments."""
+        """Let every result print alike, and its public methods check their arguments."""
         super().__init_subclass__()
+        cls.__repr__ = Result.__repr__  # type: ignore[method-assign] # not that of its dataclass
         checked(cls)
 
     heading = "Results"

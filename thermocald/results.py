@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-
 from thermocald.analysis import field as checks
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.photographs import Photographs
@@ -21,7 +19,7 @@ from thermocald.discovery.result import build_model, field_lines, mount_lines, s
 from thermocald.errors import DataError
 from thermocald.figures import draw_figure
 from thermocald.names import tell_apart
-from thermocald.numbers import percent, plain, typeset_powers, with_sd
+from thermocald.numbers import counted, percent, plain, typeset_powers, with_sd
 from thermocald.output import calibration as calibration_report
 from thermocald.output import discovery as discovery_report
 from thermocald.output.study import report as study_report
@@ -218,13 +216,8 @@ class Calibration(Photographs, Result):
         """
         if self.interior is None:
             raise DataError(f"the camera was not calibrated: {self.reason}")
-        return Camera(
-            self.file.sensor,
-            float("nan"),
-            self.interior.as_array(),
-            np.array(self.covariance[:10, :10]),
-            name=self.file.name,
-        )
+        values, Q = self.interior.as_array(), self.covariance[:10, :10]
+        return Camera(self.file.sensor, math.nan, values, Q, name=self.file.name)
 
     @property
     def poses(self) -> dict[str, ExteriorOrientation]:
@@ -237,15 +230,12 @@ class Calibration(Photographs, Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
-        document = self.as_dict()
-        lines: list[str] = []
-        if document["status"] == "ok":
-            used = sum(p["exterior"] is not None for p in document["photographs"])
-            lines.append(
-                f"calibrated from {used} of {document['n_photographs']} photographs: sigma0 "
-                f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
-                + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
-            )
+        if self.status == "ok":
+            lines = [
+                f"calibrated from {len(self.poses)} of {self.n_photographs} photographs: sigma0 "
+                f"{self.sigma0:.2f}, redundancy {self.redundancy}"
+                + (f"; {CAUSES_OF_SIGMA0}" if self.sigma0 > 1.0 + MATERIAL else "")
+            ]
             table = calibration_report.interior_table(self, self.file.sensor, str)
             rows = [("", *table.headings[1:]), *table.rows]
             width = [max(len(row[k]) for row in rows) for k in range(3)]
@@ -254,18 +244,12 @@ class Calibration(Photographs, Result):
             ]
             lines += self._notes
         else:
-            lines.append(f"not calibrated: {document['reason']}")
-        for p in document["photographs"]:
-            line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
-            if p["exterior"] is not None:
-                e = p["exterior"]
-                line += f", {plain(p['rms_px'], 'px', 2)}, at " + ", ".join(
-                    with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
-                )
-                line += " mm"
-            if p["reason"]:
-                line += f": {p['reason']}"
-            lines.append(line)
+            lines = [f"not calibrated: {self.reason}"]
+        for p in self.photographs:
+            line = f"{p.path}: {p.status}, {p.n_targets} targets"
+            if p.exterior is not None:
+                line += f", {plain(p.rms_px, 'px', 2)}, at {p.place} mm"
+            lines.append(line + (f": {p.reason}" if p.reason else ""))
         return lines
 
     def page(self, title: str = "") -> str:
@@ -282,11 +266,10 @@ class Calibration(Photographs, Result):
 
         Raises DataError if nothing was estimated.
         """
-        if self.interior is None or not self.estimated:
-            why = self.reason
-            raise DataError(f"{path}: not written, the camera was not calibrated: {why}")
+        if not self.estimated:
+            raise DataError(f"{path}: not written, the camera was not calibrated: {self.reason}")
         comment = (
-            f"calibrated by thermocald from {len(self.photographs)} photographs, "
+            f"calibrated by thermocald from {counted(len(self.poses), 'photograph')}, "
             f"sigma0 {self.sigma0:.2f}"
         )
         known = replace(self.file, interior=self.interior)

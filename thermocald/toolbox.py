@@ -123,9 +123,9 @@ def convert_camera(
     """Convert a camera file, exactly if the formats' conventions allow it, else by a fit.
 
     The result states how well a fit agrees. to, format: the formats of out and of source, opencv,
-    ros, colmap, mrcal, kalibr, metashape, aicon or json; the source's is by default recognised from
-    its content. pixel_pitch: mm, needed if the file does not give it. Raises ConfigurationError,
-    which names the file, UsageError for an unknown format.
+    ros, colmap, mrcal, kalibr, metashape, aicon, json or yaml; the source's is by default
+    recognised from its content. pixel_pitch: mm, needed if the file does not give it. Raises
+    ConfigurationError, which names the file, UsageError for an unknown format.
 
     >>> print(tc.convert_camera("cold.json", "cold.xml", "metashape").statement)
     exact: both models give the same pixels
@@ -221,7 +221,7 @@ def correct(
 ) -> Correction:
     """Correct image points or images for the camera's temperature when they were taken.
 
-    points: a CSV with time, x, y (px) or with time, image; `-` reads standard input. log: a
+    points: a CSV with time, x, y (px), or time, image; `-` reads standard input. log: a
     logger's file, a recording or a store. to: the temperature to correct to, °C, by default the
     model's T0. temperature_sd: of a reading, K, by default as the fit estimated it. size: width and
     height of binned images, px. timezone, ambiguous: for times without a zone. say: called with a
@@ -237,19 +237,18 @@ def correct(
     from thermocald.output.corrected import Correction
 
     require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0.0))
-    width, height = size or (1, 1)
-    require_within(width=(width, 1), height=(height, 1))
     thermal, path = _thermal(model), source_of(points)
+    if size is not None:
+        thermal = thermal.for_images(*size)
     clock = device_clock(timezone, ambiguous=ambiguous)
     options = _log_options(log_options)
     header, near = first_times(path, clock, options.date_order)
     table = read_model_log(thermal, source_of(log), options, near)
-    if size is not None:
-        thermal = thermal.for_images(*size)
     if temperature_sd is None:
         temperature_sd = thermal.reading_sd
+    of_images = "image" in header and "x" not in header
     return Correction(
-        path, "image" in header, thermal, table, clock, to, temperature_sd, extrapolate,
+        path, of_images, thermal, table, clock, to, temperature_sd, extrapolate,
         say or (lambda _: None), options.date_order,
     )  # fmt: skip
 

@@ -26,8 +26,8 @@ def world(tmp_path_factory):
     for name, temperature in (("cold", 26.0), ("warm", 45.0)):
         camera.at(temperature).write(folder / f"{name}.json")
     first = M1.frame_time[3]
-    rows = f"{first},1000,900\n{first + 60},1500,1200\n"
-    (folder / "points.csv").write_text(f"time,x,y\n{rows}")
+    rows = f"{first},a.png,1000,900\n{first + 60},b.png,1500,1200\n"
+    (folder / "points.csv").write_text(f"time,image,x,y\n{rows}")
     photographs(folder)
     (folder / "log.csv").rename(folder / "logger.csv")
     board = Path(__file__).resolve().parents[3] / "shared" / "data" / "chessboard"

@@ -143,6 +143,7 @@ RESULTS = {
     "Conversion": lambda *_: tc.convert_camera("cold.json", "cold.ior", "aicon"),
     "Correction": lambda epochs, camera, M1, M2: tc.correct("points.csv", camera, log="M1"),
     "Discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
+    "Calibration": lambda *_: tc.calibrate("photos", "M1/testfield.csv"),
     "FieldCheck": lambda epochs, camera, M1, M2: tc.check_testfield(M1.testfield),
     "Plan": lambda *_: Plan({"thermal_lag": {"thermal_lag or time_offset": 1}}, 1, 0.1),
     "Prediction": lambda epochs, camera, M1, M2: tc.predict(camera, log="M1"),
@@ -167,6 +168,15 @@ def test_one_result_prints_documents_draws_and_reports(
             result.plot()
     else:
         result.plot().savefig(tmp_path / "drawn.png")
+    if name == "Correction":
+        for _ in range(2):  # the second counts anew
+            result.write(tmp_path / "corrected.csv")
+        assert result.points == 2
+        with pytest.raises(UsageError, match="would be overwritten"):
+            result.write("points.csv")
+        again = tc.correct(tmp_path / "corrected.csv", camera, log="M1")
+        with pytest.raises(DataError, match=r"column dx would stand twice.*corrected already"):
+            again.write(tmp_path / "again.csv")
     if name == "Discovery":
         assert result.verdict == "effects_found"
         result.save(tmp_path / "found.yaml")
@@ -234,7 +244,7 @@ OUT_OF_BOUNDS = {
     "give finite": lambda M1: simulated(lamp=[(0, float("nan"))]),
     "in the order of time": lambda M1: simulated(lamp=[(9, 1), (0, 3)]),
     "temperature is nan": lambda M1: tc.predict(MODEL, np.nan),
-    "height is 0": lambda M1: tc.correct("x.csv", MODEL, log="M1", size=(9, 0)),
+    "size 9×0 px is impossible": lambda M1: tc.correct("x.csv", MODEL, log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1: tc.fit_calibrations({}),
     "sigma_px is 0": lambda M1: tc.check_testfield(FIELD, sigma_px=0.0),
     "roll is nan": lambda M1: tc.check_testfield(FIELD, roll=np.nan),
@@ -289,6 +299,11 @@ OF_A_CAMERA = {
     "sx, sy above 0": lambda c: resected(c, SEEN | {"sx": [0.0] * 4}),
     "no pose .too_few_targets.: 2": lambda c: c.at(35.0).project(POINT, resected(c, FEW)),
     "the pose: must be": lambda c: c.at(35.0).project(POINT, None),
+    "the pose: give one, not 2": lambda c: c.at(35.0).project(POINT, np.zeros((2, 6))),
+    "image points: must": lambda c: c.at(35.0).undistort(np.zeros((2, 4, 2))),
+    "px of 8.96 µm cannot be comp": lambda c: c.at(35.0).object_distance(
+        c.for_images(410, 308).at(35.0), 1e4
+    ),
     "no thermometer 'foo'; it knows": lambda c: tc.predict(c, 35.0, channels={"foo": 1.0}),
     "of board_temperature is nan": lambda c: c.at(35.0, channels={"board_temperature": np.nan}),
     "temperature_sd is -1": lambda c: c.at(35.0, temperature_sd=-1.0),
@@ -334,7 +349,7 @@ def test_every_argument_is_checked():
 
 @pytest.mark.parametrize("message", OUT_OF_BOUNDS)
 def test_an_argument_out_of_bounds_is_refused(inside, M1, message):
-    with pytest.raises((UsageError, DataError), match=message):
+    with pytest.raises((UsageError, DataError, ConfigurationError), match=message):
         OUT_OF_BOUNDS[message](M1)
 
 
@@ -347,11 +362,22 @@ def test_what_no_camera_can_answer_is_refused(camera, message):
 def test_numbers_and_paths_are_taken_as_notebooks_hold_them(inside, M1, camera):
     """Scalars, rows and columns of NumPy, an iterator of files; functions are found by pickle."""
     assert tc.predict(camera, np.float64(35.0)).document["temperature"] == 35.0
-    lamp = np.array([[0.0, 1.0], [60.0, 2.0]])
-    assert len(tc.simulate("nexus5-cold", lamp=lamp, epochs=np.int64(3))) == 3
+    assert jsonable(tc.predict(camera, np.float32(35.0)).as_dict())["temperature"] == 35.0
+    lag = {"thermal_lag": {"tau": np.int64(75)}}
+    for lamp in (np.array([[0.0, 1.0], [60.0, 2.0]]), zip([0.0, 60.0], [1.0, 2.0], strict=True)):
+        given = {"lamp": lamp, "epochs": np.int64(3), "seed": np.int64(3), "effects": lag}
+        assert len(tc.simulate("nexus5-cold", **given)) == 3
     told = {"log": "logger.csv", "timezone": "UTC", "testfield": M1.testfield, "pixel_pitch": 0.001}
     assert len(tc.import_photographs(Path("photos").glob("*.jpg"), **told)) == 6
     assert pickle.loads(pickle.dumps(tc.study)) is tc.study
+
+
+def test_what_is_saved_at_home_is_found_there(epochs, camera, tmp_path, monkeypatch):
+    """A folder called ~ was made."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for write in (epochs.to_csv, camera.save, camera.at(35.0).report):
+        write("~/saved.yaml")
+        (tmp_path / "saved.yaml").unlink()
 
 
 def test_times_of_pandas_with_and_without_a_zone(camera):
@@ -372,6 +398,7 @@ def test_one_image_point_is_an_array_of_one(camera):
     now = camera.at(35.0)
     for method in (now.undistort, now.rays, now.point_covariance):
         np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
+    np.testing.assert_array_equal(now.project(POINT[0], [0.0] * 6), now.project(POINT, [0.0] * 6))
 
 
 def test_a_copy_is_no_second_measurement(short, M2, inside, tmp_path):

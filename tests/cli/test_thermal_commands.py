@@ -112,13 +112,18 @@ def test_a_series_in_fahrenheit_is_doubted(misfits, tmp_path):
 
 @pytest.mark.parametrize("kind", ["jpg", "png"])
 def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
-    """At the start and in the heat, binned by 8; one that is unreadable has its line."""
+    """At the start and in the heat, binned by 8; one that is unreadable has its line.
+
+    So has one of another folder that would replace a corrected image of its name.
+    """
     grey = np.random.default_rng(1).integers(0, 255, (308, 410), np.uint8)
     for name in "ab":
         tags = {MODEL: "imx219", TAKEN: "2026:06:14 12:00:00"}
         save_photograph(tmp_path / f"{name}.{kind}", tags, grey)
     (tmp_path / f"c.{kind}").write_bytes(b"no picture")
-    rows = [f"{times_of(misfits)[k]:.2f},{n}.{kind}" for k, n in ((0, "a"), (40, "c"), (45, "b"))]
+    shutil.copytree(tmp_path, tmp_path / "more")
+    listed = ((0, "a"), (40, "c"), (45, "b"), (46, "more/b"))
+    rows = [f"{times_of(misfits)[k]:.2f},{n}.{kind}" for k, n in listed]
     (tmp_path / "i.csv").write_text("\n".join(["time,image", *rows, ""]))
 
     def correct(out, size="410x308"):
@@ -128,8 +133,9 @@ def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
         )  # fmt: skip
 
     result = correct(tmp_path / "out")
-    assert "1 of 3 rows were not corrected: line 3" in str(result.exception)
+    assert "2 of 4 rows were not corrected: lines 3, 5" in str(result.exception)
     told = json.loads(result.stdout)
+    assert told["refused"][1]["reason"].endswith(f"b.{kind} is the corrected image of line 4")
     assert "is not an image" in told["refused"][0]["reason"]
     cold, hot = told["images"]
     assert hot["temperature"] > cold["temperature"] + 5

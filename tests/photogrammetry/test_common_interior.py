@@ -228,6 +228,9 @@ def test_every_photograph_of_a_small_board_takes_part():
         assert {p.status for p in r.photographs} == {r.status} == {"ok"}
         errors.append((r.interior.c - 3.0) / np.sqrt(r.covariance[0, 0]))
     assert rms(errors) < 1.7
+    held = calibrate_observations(names, seen, {}, board, camera, AdjustmentSettings(free=("A1",)))
+    assert held.interior is None
+    assert "principal distance is held, and no --camera gives it" in held.reason
 
 
 def test_a_photograph_that_begins_with_the_mirrored_pose_takes_part():

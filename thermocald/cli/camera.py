@@ -67,7 +67,7 @@ def calibrate(
         raise DataError(f"no photograph has a result: {result.reason}")
 
 
-_FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
+_FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json, yaml"
 
 
 def convert(

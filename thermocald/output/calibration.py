@@ -231,12 +231,6 @@ def _outcome(p: PhotographResult, mark: str) -> str:
 
 
 def _photographs(result: Photographs) -> Table:
-    def place(p: PhotographResult) -> str:
-        if p.exterior is None:
-            return "–"
-        centre = zip(p.exterior.as_array()[3:], p.exterior_sd[3:], strict=True)
-        return ", ".join(with_sd(float(v), float(sd)) for v, sd in centre)
-
     return Table.of(
         "Each photograph",
         result.photographs,
@@ -246,7 +240,7 @@ def _photographs(result: Photographs) -> Table:
             "targets": lambda p: str(p.n_targets),
             "left out": lambda p: str(len(p.rejected)),
             "RMS px": lambda p: plain(p.rms_px, digits=3),
-            "X0, Y0, Z0 mm ± sd": place,
+            "X0, Y0, Z0 mm ± sd": lambda p: p.place or "–",
         },
     )
 

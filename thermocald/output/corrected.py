@@ -19,7 +19,7 @@ from thermocald.analysis.thermal.correction import (
 )
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import new_file, write_parts
-from thermocald.numbers import counted
+from thermocald.numbers import counted, listed
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
 from thermocald.result import Result
 from thermocald.store.logger.clock import iso
@@ -105,13 +105,14 @@ class Correction(Result):
         if self.of_images:
             self._write_images(Path(out), advance or (lambda _: None))
         else:
+            _require_other(Path(out), self.path)
             write_parts(Path(out), self.rows())
 
     def rows(self) -> Iterator[str]:
         """Yield the corrected CSV of points, a block of rows at a time.
 
         Rows of standard input are corrected as they arrive. Rows that cannot be corrected are added
-        to `refused`. Raises DataError if no row can be corrected.
+        to `refused`. Raises DataError if no row can be corrected, or a column would stand twice.
         """
         for block in self._blocks(("x", "y")):
             yield self._corrected(self._possible(block))
@@ -123,6 +124,7 @@ class Correction(Result):
         Images that cannot be corrected are added to `refused`. Raises DataError if no image can be
         corrected, UsageError if one would be overwritten.
         """
+        lines: dict[Path, int] = {}
         for block in self._blocks(()):
             possible = self._possible(block)
             if not possible.lines:
@@ -137,12 +139,13 @@ class Correction(Result):
                 source = self.path.parent / row["image"]
                 written = out / row["image"].rsplit("/", 1)[-1]
                 try:
+                    if (first := lines.setdefault(written, line)) != line:
+                        raise ImageError(f"{written} is the corrected image of line {first}")
                     _write_corrected(source, written, maps, values)
                 except ImageError as cause:
                     self._refuse(line, str(cause))
                 else:
-                    where = {"image": str(source), "corrected": str(written)}
-                    self.images.append(where | summary)
+                    self.images.append({"image": str(source), "corrected": str(written), **summary})
                 advance(1)
         self._require_any(len(self.images))
 
@@ -150,14 +153,16 @@ class Correction(Result):
         """Raise DataError if a row was refused."""
         if self.refused:
             count = len(self.refused) + self.points + len(self.images)
-            lines = ", ".join(str(r["line"]) for r in self.refused[:_MOST_NAMED])
+            lines = listed([str(r["line"]) for r in self.refused], _MOST_NAMED)
             raise DataError(
                 f"{self.path}: {len(self.refused)} of {count} rows were not corrected: line"
                 f"{'s' if len(self.refused) > 1 else ''} {lines}"
-                + (", …" if len(self.refused) > _MOST_NAMED else "")
             )
 
     def _blocks(self, columns: tuple[str, ...]) -> Iterator[RowBlock]:
+        """Return the rows, none of which is counted yet."""
+        self.points, self.extrapolated_rows, self._moved, self._left_over = 0, 0, 0.0, 0.0
+        self.images, self.refused = [], []
         return row_blocks(self.path, columns, self.clock, self.date_order, self.log)
 
     def _possible(self, block: RowBlock) -> RowBlock:
@@ -201,7 +206,13 @@ class Correction(Result):
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         if not self.points:
-            writer.writerow([*block.header, *_ADDED])
+            header = [*block.header, *_ADDED]
+            if twice := [name for name in header if name and header.count(name) > 1]:
+                raise DataError(
+                    f"{self.path}: column {twice[0]} would stand twice; rename it, unless these "
+                    "points are corrected already"
+                )
+            writer.writerow(header)
         moved = points - block.values
         for i, row in enumerate(block.rows):
             row = {**row, "x": f"{points[i, 0]:.5f}", "y": f"{points[i, 1]:.5f}"}
@@ -229,12 +240,16 @@ class Correction(Result):
         return float((squares / (2 * self.points)) ** 0.5) if self.points else float("nan")
 
 
+def _require_other(written: Path, source: Path) -> None:
+    if written.exists() and source.exists() and written.samefile(source):
+        raise UsageError(f"{written}: would be overwritten; give another --out")
+
+
 def _write_corrected(source: Path, written: Path, maps: Maps, values: Array) -> None:
     import cv2
 
     image = EncodedImage(source).as_it_is()
-    if written.exists() and written.samefile(source):
-        raise UsageError(f"{written}: would be overwritten; give another --out")
+    _require_other(written, source)
     width, height = maps.sensor.width, maps.sensor.height
     if image.shape[:2] != (height, width):
         raise ImageError(

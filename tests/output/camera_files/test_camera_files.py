@@ -27,15 +27,15 @@ TOLERANCE_PX = 1e-6
 SENSOR = Sensor(3280, 2464, 0.00112)
 PINHOLE = InteriorOrientation(c=3.05, x0=0.021, y0=-0.013)
 PLAIN = replace(PINHOLE, A1=-2.1e-3, A2=4.0e-4, A3=-2.0e-5, B1=4e-5, B2=-3e-5)
-FORMATS = set(camera_files.FORMATS)
+FORMATS, OURS = set(camera_files.FORMATS), {"json", "yaml"}
 CAMERAS = {
     "plain": (PLAIN, FORMATS - {"kalibr"}),
     "without A3": (replace(PLAIN, A3=0.0), FORMATS),
-    "affinity": (replace(PLAIN, C1=3e-4), {"json"}),
-    "shear": (replace(PLAIN, C2=3e-4), {"json"}),
-    "all": (replace(PLAIN, C1=3e-4, C2=-2e-4), {"json"}),
+    "affinity": (replace(PLAIN, C1=3e-4), OURS),
+    "shear": (replace(PLAIN, C2=3e-4), OURS),
+    "all": (replace(PLAIN, C1=3e-4, C2=-2e-4), OURS),
     "pinhole with affinity": (replace(PINHOLE, C1=3e-4), FORMATS),
-    "pinhole with both": (replace(PINHOLE, C1=2e-3, C2=-1e-3), {"metashape", "aicon", "json"}),
+    "pinhole with both": (replace(PINHOLE, C1=2e-3, C2=-1e-3), OURS | {"metashape", "aicon"}),
 }
 """By name: the camera, and the formats whose convention holds it exactly."""
 

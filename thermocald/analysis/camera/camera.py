@@ -144,10 +144,11 @@ class Camera(Result):
         """
         if not distance_mm > 0:
             raise UsageError(f"distance_mm is {distance_mm}; it must be above 0")
-        points = image_grid(self.sensor) if image_points is None else image_points
-        covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
-        variance = np.trace(covariance, axis1=1, axis2=2)
-        result: Array = np.sqrt(variance) * distance_mm / self.interior.c
+        points = image_grid(self.sensor) if image_points is None else _numbers(image_points, 2)
+        seen = directions(self.sensor, self.values, points)
+        _, J, by_place = partials(self.sensor, self.values, np.zeros(6), seen)
+        K = np.linalg.solve(by_place[..., :2], J[..., :10])  # of the tangents of the image point
+        result: Array = distance_mm * np.sqrt(np.einsum("nkp,pq,nkq->n", K, self.covariance, K))
         return result
 
     def resect(
@@ -215,12 +216,14 @@ class Camera(Result):
         covariance = np.pad(self.covariance, (0, 6))
         if isinstance(pose, Adjustment):  # of camera and pose together
             values, covariance = pose.values, pose.covariance
-        points = np.atleast_2d(_numbers(image_points, 2))
+        points = _numbers(image_points, 2)
         sigmas = _numbers(np.broadcast_to(sigma, points.shape), 2, "sigma")
         return place_on(self.sensor, values, covariance, points, sigmas, plane)
 
     def object_distance(self, other: Camera, distance_mm: float) -> Array:
         """Return the distances (9,) mm on a plane between the image grids of this and another."""
+        if self.sensor != other.sensor:
+            raise UsageError(f"cameras of {self.sensor} and {other.sensor} cannot be compared")
         grid = image_grid(self.sensor)
         ours, theirs = (ideal_points(s.sensor, s.values, grid) for s in (self, other))
         result: Array = distance_mm * np.linalg.norm(ours - theirs, axis=1)
@@ -249,8 +252,8 @@ class Camera(Result):
     def write(self, path: Path | str, format: str = "", comment: str = "") -> str:  # noqa: A002
         """Write the camera for another program; return how exact the file is.
 
-        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; by default the one that
-        the file's name tells: `ros.yaml`, or a suffix of a single format (`.xml`, `.json`, …);
+        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json, yaml; by default the one
+        that the file's name tells: `ros.yaml`, or a suffix of a single format (`.xml`, `.json`, …);
         comment: a line for the file's head, by default the temperature. Raises UsageError if the
         name tells no format, or several, GeometryError for a model without rays.
 
@@ -306,14 +309,14 @@ class Camera(Result):
 
 
 def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Array:
-    """Return an array (..., columns) of numbers. Raises UsageError for anything else."""
+    """Return an array (n, columns) of numbers. Raises UsageError for anything else."""
     try:
         found = floats(given)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.empty(0)
-    if found.ndim == 0 or found.shape[-1] != columns:
+    if found.ndim not in (1, 2) or found.shape[-1] != columns:
         raise UsageError(f"{name}: must be an array (n, {columns}) of numbers")
-    return found
+    return np.atleast_2d(found)
 
 
 def _pose_values(given: Adjustment | ExteriorOrientation | ArrayLike) -> Array:
@@ -325,7 +328,10 @@ def _pose_values(given: Adjustment | ExteriorOrientation | ArrayLike) -> Array:
             raise UsageError(f"there is no pose ({given.status}): {given.reason}")
         given = given.exterior
     six = given.as_array() if isinstance(given, ExteriorOrientation) else given
-    return _numbers(six, 6, "the pose")
+    found = _numbers(six, 6, "the pose")
+    if len(found) != 1:
+        raise UsageError(f"the pose: give one, not {len(found)}")
+    return found.reshape(6)
 
 
 def _draw(sensor: Sensor, points: Array, vectors: Array, title: str) -> Figure:

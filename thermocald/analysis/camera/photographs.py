@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.errors import GeometryError, ImageError, UsageError
+from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
 _IMAGES = frozenset(
@@ -81,6 +82,12 @@ class PhotographResult:
         return len(self.rejected)
 
     @property
+    def place(self) -> str:
+        """X0, Y0, Z0 with their standard deviations, mm; empty without a pose."""
+        centre = () if self.exterior is None else self.exterior.centre.tolist()
+        return ", ".join(map(with_sd, centre, self.exterior_sd[3:].tolist()))
+
+    @property
     def pose(self) -> dict[str, float] | None:
         """The exterior orientation with `sd_` of each parameter, as in JSON documents."""
         if self.exterior is None:
@@ -121,9 +128,8 @@ class Photographs:
         """The interior orientation with `sd_` of estimated parameters, as in JSON documents."""
         if self.interior is None:
             return None
-        free, values = self._estimated, self.interior.as_array()
-        sds = np.sqrt(self.covariance.diagonal()[free])
-        return asdict(self.interior) | with_sds([IOP_NAMES[i] for i in free], values[free], sds)
+        sds = np.sqrt(self.covariance.diagonal()).tolist()
+        return asdict(self.interior) | {f"sd_{IOP_NAMES[i]}": sds[i] for i in self._estimated}
 
     @property
     def correlations(self) -> dict[str, Any] | None:
@@ -148,7 +154,6 @@ def calibrate_photographs(
     advance: Callable[[int], None] | None,
 ) -> Photographs:
     """Measure and calibrate photographs; a file that is no image gets a status and a reason."""
-    measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
     copies, usable = find_copies(paths), dict[str, Observations]()
     for k, path in enumerate(paths):
@@ -161,15 +166,14 @@ def calibrate_photographs(
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
             failures[k] = (word, str(error).removeprefix(f"{path}: "))
-            measured.append(None)
         else:
-            measured.append(found.observations)
             usable[str(path)] = found.observations
             if not found.status.ok:
                 failures[k] = (found.status.word, found.status.reason)
         if advance is not None:
             advance(1)
-    names = [str(p) for p in paths]
+    names = [*map(str, paths)]
+    measured = [usable.get(name) for name in names]
     return calibrate_observations(names, measured, failures, testfield, camera, settings)
 
 
@@ -181,14 +185,17 @@ def calibrate_observations(
     camera: CameraSpec,
     settings: AdjustmentSettings,
 ) -> Photographs:
-    """Calibrate from image points; failures: {position: (status, reason)} of unusable ones."""
-    failures = dict(failures)
+    """Calibrate from image points; failures: {position: (status, reason)} of unusable ones, to
+    which those without a pose are added.
+    """
     seen = {k: o for k, o in enumerate(measured) if o is not None}
     usable = {k: o for k, o in seen.items() if k not in failures}
     try:
         if not settings.free:
             held = "" if camera.interior else ", and no --camera gives it"
             raise GeometryError(f"the interior orientation is held (--free none){held}")
+        if "c" not in settings.free and not (camera.interior or camera.principal_distance):
+            raise GeometryError("the principal distance is held, and no --camera gives it")
         if not usable:
             raise GeometryError(_NO_TARGETS if seen else "none can be read")
         rows, together = _adjust_together(usable, testfield, camera, settings)
@@ -222,12 +229,18 @@ def calibrate_observations(
         each = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
         rows = [k for i, k in enumerate(rows) if i not in left_out]
         poses = dict(zip(rows, each, strict=True))
-    photographs = [
-        _photograph(name, seen[k], testfield.names, *poses[k])
-        if k in poses
-        else PhotographResult(name, *failures.get(k, _NO_POSE), len(seen[k]) if k in seen else 0)
-        for k, name in enumerate(names)
-    ]
+    photographs = []
+    for k, name in enumerate(names):
+        n = len(seen[k]) if k in seen else 0
+        if k not in poses:
+            photographs.append(PhotographResult(name, *failures.get(k, _NO_POSE), n))
+            continue
+        o, (used, v, exterior, sd) = seen[k], poses[k]
+        rms = float(np.sqrt(np.mean(v[used] ** 2)))
+        rejected = tuple(testfield.names[t] for t in o.targets[~used])
+        photographs.append(
+            PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, v, used)
+        )
     return replace(result, photographs=tuple(photographs))
 
 
@@ -253,7 +266,11 @@ def _adjust_together(
         except GeometryError as error:
             why = why or str(error)
             continue
-        found = _orient_all(usable, testfield, camera.sensor, trial)
+        found = dict[int, ExteriorOrientation]()
+        for k, o in usable.items():
+            with suppress(GeometryError):
+                seen = camera.sensor, testfield.points[o.targets], o.points
+                found[k] = approximate_orientation(*seen, interior=trial)[1]
         if len(found) > len(oriented):
             start, oriented = trial, found
         if len(oriented) == len(usable):
@@ -263,34 +280,6 @@ def _adjust_together(
     chosen = [usable[k] for k in oriented]
     return list(oriented), adjust_common_interior(
         camera.sensor, testfield, chosen, start, list(oriented.values()), settings
-    )
-
-
-def _orient_all(
-    usable: dict[int, Observations], testfield: TestField, sensor: Sensor, at: InteriorOrientation
-) -> dict[int, ExteriorOrientation]:
-    """Return the poses of the photographs that have one with an interior orientation."""
-    oriented = {}
-    for k, o in usable.items():
-        with suppress(GeometryError):
-            points = testfield.points[o.targets]
-            oriented[k] = approximate_orientation(sensor, points, o.points, interior=at)[1]
-    return oriented
-
-
-def _photograph(
-    name: str,
-    o: Observations,
-    targets: Sequence[str],
-    used: Mask,
-    residuals: Array,
-    exterior: ExteriorOrientation | None,
-    sd: Array,
-) -> PhotographResult:
-    rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
-    rejected = tuple(targets[t] for t in o.targets[~used])
-    return PhotographResult(
-        name, "ok", "", len(o), rejected, rms, exterior, sd, o.points, residuals, used
     )
 
 
@@ -349,5 +338,4 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
     if not sizes:
         decode_grey(images[0])
     width, height = sizes.most_common(1)[0][0]
-    pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
-    return CameraSpec("camera", Sensor(width, height, pitch))
+    return CameraSpec("camera", Sensor(width, height, pixel_pitch or _ASSUMED_PITCH))

@@ -24,7 +24,6 @@ cameras"; Luhmann, T. et al. (2014): Close-Range Photogrammetry and 3D Imaging, 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -34,6 +33,7 @@ import numpy as np
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, distort, image_to_px
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
+from thermocald.result import with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,8 +69,7 @@ def image_grid(sensor: Sensor, shape: tuple[int, int] = _GRID) -> Array:
     """Return image points (n, 2) px that cover the whole image, its edges included."""
     x = np.linspace(-0.5, sensor.width - 0.5, shape[0])
     y = np.linspace(-0.5, sensor.height - 0.5, shape[1])
-    u, v = np.meshgrid(x, y)
-    return np.column_stack([u.ravel(), v.ravel()])
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def convert(
@@ -160,14 +159,13 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
     values (10,), covariance (10, 10). `exact` is 1 without affinity and shear, else 0.
     """
     family = opencv(5)
-    terms = family.from_brown(sensor, values).tolist()
+    terms = family.from_brown(sensor, values)
     J = _derivative(partial(family.from_brown, sensor), values)
-    found: dict[str, float] = {"width": sensor.width, "height": sensor.height}
-    for name, value, variance in zip(
-        family.parameters, terms, np.diag(J @ covariance @ J.T).tolist(), strict=True
-    ):  # in a weak epoch rounding may make a variance negative
-        found |= {name: value, f"sd_{name}": math.sqrt(variance) if variance >= 0 else math.nan}
-    return {**found, "exact": float(values[8] == 0 and values[9] == 0)}
+    with np.errstate(invalid="ignore"):  # in a weak epoch rounding may make a variance negative
+        sds = np.sqrt(np.diag(J @ covariance @ J.T))
+    size = {"width": sensor.width, "height": sensor.height}
+    exact = float(values[8] == 0 and values[9] == 0)
+    return {**size, **with_sds(family.parameters, terms, sds), "exact": exact}
 
 
 def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:

@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.files import QuantityReader, read_yaml, write_text
@@ -25,7 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     image_to_px,
 )
-from thermocald.photogrammetry.camera_files.camera_record import OWN, CameraRecord, Format
+from thermocald.photogrammetry.camera_files.camera_record import OWN, YAML, CameraRecord, Format
 from thermocald.photogrammetry.camera_files.formats import (
     AICON,
     COLMAP,
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 FORMATS: dict[str, Format] = {
-    format_.name: format_ for format_ in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN)
+    one.name: one for one in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN, YAML)
 }
 _LARGEST_FILE = 10_000_000
 _LARGEST_ASPECT = 2.0  # of fx and fy; that of anamorphic lenses
@@ -236,7 +235,9 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
     """
     try:
         format_ = _read_text(path)[1].name
-    except ConfigurationError:  # none of the formats: our own YAML
+    except ConfigurationError:  # our own YAML without an interior orientation
+        format_ = YAML.name
+    if format_ == YAML.name:  # written by hand: its lines are named
         reader = QuantityReader(path, read_yaml(path, ConfigurationError))
         if "camera" in reader.mapping:
             reader = reader.inner("camera")
@@ -252,17 +253,9 @@ def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str
     path: `.json`, with the covariance (10, 10), or `.yaml`; both can be given with `--camera`.
     comment: one line for the head of the file. Raises UsageError for another suffix.
     """
-    suffix, sensor, interior = path.suffix.lower(), camera.sensor, camera.interior
-    assert interior is not None
-    if suffix == ".json":
-        write(CameraModel(sensor, interior), path, "json", covariance, comment, camera.name)
-        return
-    if suffix not in (".yaml", ".yml"):
+    suffix = path.suffix.lower().replace(".yml", YAML.suffix)
+    if suffix not in (OWN.suffix, YAML.suffix):
         raise UsageError(f"{path}: not .json or .yaml; convert one of these for another program")
-    document = {
-        "name": camera.name,
-        **asdict(sensor),
-        "principal_distance": interior.c,
-        "interior": asdict(interior),
-    }
-    write_text(path, f"# {comment}\n{yaml.safe_dump(document, sort_keys=False)}")
+    assert camera.interior is not None
+    model, to = CameraModel(camera.sensor, camera.interior), suffix.lstrip(".")
+    write(model, path, to, covariance, comment, camera.name)

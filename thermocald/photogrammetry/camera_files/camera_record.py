@@ -1,4 +1,4 @@
-"""The camera as every file format writes and reads it, and our own JSON format.
+"""The camera as every file format writes and reads it, and our own formats, JSON and YAML.
 
 Also reads the numbers and the YAML in a file's text; an error names the value that is wrong.
 """
@@ -15,9 +15,11 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.files import QuantityReader
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraSpec, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
 from thermocald.photogrammetry.linalg import unit_diagonal
+from thermocald.result import with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -181,11 +183,9 @@ _VERSION = "thermocald-camera/1"
 
 
 def _encode_own(record: CameraRecord) -> str:
-    values: dict[str, float] = {}
-    for k, name in enumerate(IOP_NAMES):
-        values[name] = float(record.values[k])
-        if record.covariance is not None:
-            values[f"sd_{name}"] = float(np.sqrt(record.covariance[k, k]))
+    values = dict(zip(IOP_NAMES, record.values.tolist(), strict=True))
+    if record.covariance is not None:
+        values = with_sds(IOP_NAMES, record.values, np.sqrt(record.covariance.diagonal()))
     width, height = record.size
     document = {
         "format": _VERSION,
@@ -231,4 +231,27 @@ def _decode_own(text: str) -> CameraRecord:
 OWN = Format(
     "json", ".json", "thermocald's own, with covariance", lambda _: BROWN, _encode_own, _decode_own,
     lambda text: f'"{_VERSION}"' in text[:200],
+)  # fmt: skip
+
+
+def _encode_yaml(record: CameraRecord) -> str:
+    (width, height), values = record.size, record.values.tolist()
+    interior = dict(zip(IOP_NAMES, values, strict=True))
+    document = {"name": record.name, "width": width, "height": height}
+    document |= {"pixel_pitch": record.pixel_pitch, "principal_distance": values[0]}
+    return record.head() + yaml_text({**document, "interior": interior})
+
+
+def _decode_yaml(text: str) -> CameraRecord:
+    camera = CameraSpec.read(QuantityReader("the camera", yaml_mapping(text)))
+    if camera.interior is None:
+        raise ConfigurationError("the camera has no interior orientation")
+    s, values = camera.sensor, camera.interior.as_array()
+    return CameraRecord((s.width, s.height), BROWN, values, camera.name, None, s.pixel_pitch)
+
+
+YAML = Format(
+    "yaml", ".yaml", "thermocald's own, without covariance", lambda _: BROWN,
+    _encode_yaml, _decode_yaml,
+    lambda text: "\ninterior:" in f"\n{text}" and not text.startswith("format: thermocald-"),
 )  # fmt: skip

@@ -85,6 +85,10 @@ def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, meas
     silent = status()
     assert (silent.returncode, "the daemon hangs, or" in silent.stderr) == (1, True)
     daemon.kill()
+    # its number belongs to another process, at the latest after booting: it counted as running
+    live_state.LiveState(daemon.live)._write(
+        "status.json", json.dumps({**document, "pid": os.getpid()}).encode()
+    )
     killed = status()
     assert (killed.returncode, "was killed" in killed.stderr) == (1, True)
 
@@ -93,6 +97,9 @@ def test_the_daemon_of_a_store_is_found_also_as_one_of_several(tmp_path, monkeyp
     monkeypatch.setattr(live_state, "_RUN", tmp_path / "run")
     for name in ("thermocald", "thermocald-roof", "other"):
         store, folder = tmp_path / f"{name}.db", tmp_path / "run" / name
-        live_state.LiveState(folder).write_status({"store": {"path": str(store)}})
-        beside = tmp_path / "other.db.live"
+        beside = tmp_path / f"{name}.db.live"
+        for place in (folder, beside):  # one beside the store may be that of a killed daemon
+            live_state.LiveState(place).write_status({"store": {"path": str(store)}})
         assert live_state.find_state(store) == (beside if name == "other" else folder)
+        again = live_state.find_state(folder / "../.." / store.name)
+        assert again.resolve() == live_state.find_state(store)

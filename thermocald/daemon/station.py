@@ -244,7 +244,10 @@ class Station:
             done &= loop.join(max(0.1, left_s))
         for camera in self.cameras:
             if camera.run is not None:
-                done &= camera.run.pipeline.stop(max(0.1, deadline - time.monotonic()))
+                pipeline = camera.run.pipeline
+                # what waits of a recording could not be calibrated later: no frame is stored
+                stop = pipeline.finish if self.runtime.fast else pipeline.stop
+                done &= stop(max(0.1, deadline - time.monotonic()))
         for output in self.outputs:
             done &= output.stop(max(0.1, min(2.0, deadline - time.monotonic())))
         for name in self.thermometers.with_frames:

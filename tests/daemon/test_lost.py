@@ -144,7 +144,7 @@ def told(daemon) -> str:
     """Return what the exit status of `status`, its text and the page agree on."""
     done = call("status", "--store", daemon.store)
     answer = done.returncode, View(daemon.store, daemon.live).healthy()
-    waits = "epochs wait" in done.stdout + done.stderr
+    waits = " waiting" in done.stdout + done.stderr
     words = {(0, (True, "")): "well", (1, (False, "the store cannot be written")): "out"}
     return words.get(answer, "") if waits == (done.returncode == 1) else ""
 

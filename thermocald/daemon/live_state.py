@@ -194,7 +194,8 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
     if store["state"] == "results_only":
         found.append("store: its disk is nearly full: results are stored, observations are not")
     elif store["state"] != "ok":
-        found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
+        waiting = counted(store["waiting"], "epoch")
+        found.append(f"store: {store['state']}: {store['why']} ({waiting} waiting)")
     if store["lost"]:
         lost = counted(store["lost"], "epoch")
         found.append(f"{lost} lost, taken but not stored: {store['lost_why']}")
@@ -215,9 +216,6 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
             if device["why"]:
                 found.append(f"{kind} {name}: {device['why']}")
     for name, camera in cameras.items():
-        if camera["deferred"] > camera["caught_up"]:
-            found.append(
-                f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "
-                "calibrated"
-            )
+        if (left := camera["deferred"] - camera["caught_up"]) > 0:
+            found.append(f"camera {name}: {counted(left, 'epoch')} still to be calibrated")
     return found

@@ -38,7 +38,7 @@ def test_an_epoch_that_the_file_refuses_is_lost_for_everybody(daemon, measured):
     daemon.run(**measured)
     daemon.more(4)
     daemon.until(lambda: daemon.status().get("store", {}).get("lost") == 1)
-    view = View(daemon.store, daemon.live)
+    view = View(daemon.store, lambda: daemon.live)
     well, why = view.healthy()
     assert not well
     assert "an epoch was lost: epoch 2 of rpi" in why
@@ -143,7 +143,7 @@ def fill(folder: Path) -> Path:
 def told(daemon) -> str:
     """Return what the exit status of `status`, its text and the page agree on."""
     done = call("status", "--store", daemon.store)
-    answer = done.returncode, View(daemon.store, daemon.live).healthy()
+    answer = done.returncode, View(daemon.store, lambda: daemon.live).healthy()
     waits = " waiting" in done.stdout + done.stderr
     words = {(0, (True, "")): "well", (1, (False, "the store cannot be written")): "out"}
     return words.get(answer, "") if waits == (done.returncode == 1) else ""

@@ -69,8 +69,9 @@ def test_one_clear_error_of_the_kind_that_the_caller_wants(tmp_path, text, messa
         assert str(tmp_path / "file.yaml") in str(caught.value)
 
 
-def test_a_path_with_nul_is_an_error_in_words():
-    assert not is_database(Path("x\0y"))
+def test_a_path_with_nul_is_an_error_in_words_and_no_pipe_is_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    assert not any(map(is_database, (Path("x\0y"), tmp_path / "pipe")))
     for use in (
         tc.open, tc.load_camera, tc.read_testfield, lambda path: tc.calibrate([path], path),
         read_yaml, lambda path: write_text(path, ""), lambda path: write_text(path / "file", ""),

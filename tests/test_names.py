@@ -65,7 +65,7 @@ def test_natural_names_are_read_back_unchanged_from_store_page_and_recording(tmp
     epoch = Epoch(1, 1e9, 1e9, values, observations=seen)
     with Store.open(tmp_path / "t.db", "append", durable=False) as store:
         store.append(store.create_series(head_of(*GOOD), FIELD), epoch)
-    page = "".join(View(tmp_path / "t.db", tmp_path).csv("cam", "M1")).splitlines()
+    page = "".join(View(tmp_path / "t.db", Path).csv("cam", "M1")).splitlines()
     row = dict(zip(*csv.reader(page), strict=True))
     assert {name: float(row[name]) for name in GOOD} == values
     write_recording(tmp_path / "M1", head_of(*GOOD), FIELD, [epoch])
@@ -78,7 +78,7 @@ def test_every_column_that_an_epoch_can_have_is_ours(tmp_path):
     recording, store = tmp_path / "M1", tmp_path / "s.db"
     tc.simulate("rpi-v2.1-heating", seed=1, epochs=12, out=recording)
     call("replay", recording, "--store", store)
-    page = next(View(store, tmp_path).csv("rpi-v2.1", "M1")).splitlines()[0]
+    page = next(View(store, Path).csv("rpi-v2.1", "M1")).splitlines()[0]
     exported = call("export", recording).stdout.splitlines()[0]
     known = {*row, *COLUMN_NAMES, *page.split(","), *exported.split(",")}
     known -= {"temperature", *read_head(recording).channels}

@@ -164,7 +164,7 @@ def is_ordinary(path: Path) -> bool:
 
 def is_database(path: Path) -> bool:
     """Return whether a file is an SQLite database."""
-    return _beginning(path) == _DATABASE
+    return is_ordinary(path) and _beginning(path) == _DATABASE
 
 
 def _beginning(path: Path) -> bytes:

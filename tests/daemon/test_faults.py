@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import numpy as np
 import pytest
@@ -17,10 +17,17 @@ from tests.commands import finish
 from tests.daemon.conftest import columns_of, make_photographs
 from tests.marks import mostly_slow
 from tests.recordings import read_rows
+from thermocald.acquisition.pipeline import AcquiredEpoch
+from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
+from thermocald.daemon.live_state import LiveState
+from thermocald.daemon.series_run import Runtime
 from thermocald.daemon.service import Service
 from thermocald.daemon.station import Station
+from thermocald.daemon.store_guard import StoreGuard
+from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
+from thermocald.hal import Frame
 from thermocald.store.database.store import Store
 
 
@@ -251,6 +258,34 @@ def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
     daemon.configure(**measured)
     with pytest.raises(StoreError, match="disk is gone"):
         Service(load_config(daemon.config), daemon.config, on_turn=reload).run()
+
+
+@pytest.fixture
+def line(daemon, measured):
+    """The camera of a station that is not started."""
+    daemon.configure(**measured)
+    with closing(StoreGuard(daemon.store)) as guard:
+        runtime = Runtime(guard, SteadyClock(), LiveState(daemon.live))
+        yield Station(load_config(daemon.config), runtime).cameras[0]
+
+
+def test_an_epoch_that_cannot_be_calibrated_later_is_not_waited_for(line):
+    """Until the daemon's end, its status said that epochs were still to be calibrated."""
+    line.run.pipeline.dropped += 1
+    frame, epoch = Frame(None, 0.0, 1.7e9, observations={}), Epoch(1, 1.7e9, 1.7e9, {})
+    line.run.keep(AcquiredEpoch(1, frame, True, epoch))
+    assert line.run.last["status"] == "frame_not_kept"
+    assert line.status()["deferred"] == 0
+
+
+def test_a_frame_stamped_before_the_new_time_was_followed_is_not_trusted(line, monkeypatch):
+    """After a suspend of 8 h, the epochs of the next minute then remained 8 h too early."""
+    frame, followed, seen = Frame(None, 0.0, 1.7e9, observations={}), [], []
+    monkeypatch.setattr(line.plan.camera, "capture", lambda: followed.append(True) or frame)
+    monkeypatch.setattr(line.runtime.clock, "trusted", lambda: bool(followed))
+    monkeypatch.setattr(line.run.pipeline, "submit", lambda _, trust: seen.append(trust))
+    line._capture()
+    assert seen == [False]
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])

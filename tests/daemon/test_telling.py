@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 from functools import partial
 
@@ -14,10 +15,12 @@ import pytest
 
 from tests.commands import call
 from thermocald.acquisition.device_loop import Link
+from thermocald.cli import main
 from thermocald.daemon import live_state
 from thermocald.daemon.systemd import set_up_logging
 from thermocald.errors import DeviceGone
 from thermocald.hal import VirtualClock, open_device
+from thermocald.output.dashboard.view import View
 
 
 def entry(journal: socket.socket) -> dict[str, str]:
@@ -85,14 +88,38 @@ def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, meas
     silent = status()
     assert (silent.returncode, "the daemon hangs, or" in silent.stderr) == (1, True)
     daemon.kill()
+    # its number belongs to another process, at the latest after booting: it counted as running
+    live_state.LiveState(daemon.live)._write(
+        "status.json", json.dumps({**document, "pid": os.getpid()}).encode()
+    )
     killed = status()
     assert (killed.returncode, "was killed" in killed.stderr) == (1, True)
+
+
+def test_a_page_that_is_started_before_its_daemon_finds_it(tmp_path, monkeypatch):
+    """Systemd starts both at once: at every boot, the page said for ever that no daemon ran."""
+    (tmp_path / "c.yaml").write_text(
+        "{store: {path: t.db}, dashboard: {enabled: true}, thermometers: [{name: t, driver: mock}]}"
+    )
+    views, serve = [], "thermocald.output.dashboard.serve"
+    monkeypatch.setattr(live_state, "_RUN", tmp_path / "run")
+    monkeypatch.setattr(serve, lambda store, live, *_: views.append(View(store, live)))
+    monkeypatch.setattr(sys, "argv", ["thermocald", "dashboard", "-c", str(tmp_path / "c.yaml")])
+    with pytest.raises(SystemExit, match="0"):
+        main()
+    assert views[0].status() == {}
+    started = live_state.LiveState(tmp_path / "run" / "thermocald")
+    started.write_status({"store": {"path": str(tmp_path / "t.db")}})
+    assert views[0].status()
 
 
 def test_the_daemon_of_a_store_is_found_also_as_one_of_several(tmp_path, monkeypatch):
     monkeypatch.setattr(live_state, "_RUN", tmp_path / "run")
     for name in ("thermocald", "thermocald-roof", "other"):
         store, folder = tmp_path / f"{name}.db", tmp_path / "run" / name
-        live_state.LiveState(folder).write_status({"store": {"path": str(store)}})
-        beside = tmp_path / "other.db.live"
+        beside = tmp_path / f"{name}.db.live"
+        for place in (folder, beside):  # one beside the store may be that of a killed daemon
+            live_state.LiveState(place).write_status({"store": {"path": str(store)}})
         assert live_state.find_state(store) == (beside if name == "other" else folder)
+        again = live_state.find_state(folder / "../.." / store.name)
+        assert again.resolve() == live_state.find_state(store)

@@ -18,9 +18,10 @@ from psycopg.rows import dict_row
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import succeed
 from tests.fleet.conftest import address, execute
-from thermocald.fleet.overview import fleet_lines, render_fleet
+from thermocald.fleet.overview import _calibration, _sensors, fleet_lines, render_fleet
+from thermocald.store.recording.head import Channel
 from thermocald.store.server.connection import grant
-from thermocald.store.server.fleet_reader import SPREAD, FleetReader
+from thermocald.store.server.fleet_reader import SPREAD, FleetCamera, FleetReader, RecentEpoch
 from thermocald.store.server.reader import ServerWriter
 
 # an epoch in two minutes for two days: temperatures of 16 K
@@ -110,6 +111,37 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     document = json.loads(run("fleet", f"{fleet}?station=gauge3", "--json", "-"))
     assert [c["station"] for c in document["cameras"]] == ["gauge3"]
     assert document["types"] == []
+
+
+BAD = {
+    "no reading in the last 20 epochs": [np.nan] * 20,
+    "has stopped: no reading in the last 10 epochs": [np.nan] * 10 + [20.0] * 10,
+    "reads -127 °C, which is impossible": [-127.0] + [20.0] * 19,
+    "reads 85 °C, the value of a DS18B20 that has not measured": [85.0] * 20,
+    "has read exactly 21.5 °C for 19 h": [21.5] * 20,
+    "": [20.0, 21.5] * 10,
+}
+
+
+@pytest.mark.parametrize(("trouble", "readings"), BAD.items())
+def test_a_thermometer_without_fault_alone_leaves_the_rates_to_a_warmer_camera(
+    head, trouble, readings
+):
+    """A dead one was told to be mended by warming up the camera."""
+    head, times = replace(head, channels={"t": Channel()}), 1.7e9 - 3600.0 * np.arange(20)
+    recent = [RecentEpoch(t, t, "ok", {"t": r}) for t, r in zip(times, readings, strict=True)]
+    camera = FleetCamera("s", "c", "w", head, {}, times[0], 20, 20, times[0], (21.5, 22.0), False,
+                         recent)  # fmt: skip
+    assert [*_sensors(camera)] == ([("sensor", f"t: {trouble}")] if trouble else [])
+    warm_up = [text for _, text in _calibration(camera, times[0]) if "21.5 to 22.0 °C" in text]
+    assert bool(warm_up) == (not trouble)
+
+
+def test_a_station_without_a_possible_epoch_is_shown(server):
+    """It was left out, and an overview of it alone said that nothing had been sent."""
+    with ServerWriter(address(server), "mill", STORE) as writer:
+        writer.report(0, 0, time.time())
+    assert run("fleet", server.address(name="thermocald")).startswith("mill: reports, but has no")
 
 
 def test_a_clock_that_was_years_ahead_hides_nothing(server):

@@ -93,7 +93,7 @@ def live(tmp_path, store_path):
 
 def client(store, live, token=None, host="127.0.0.1", base=LOOPBACK):
     """Return a call that asks the application in this process, and keeps cookies as a browser."""
-    transport = httpx.ASGITransport(build_application(store, live, token, host))
+    transport = httpx.ASGITransport(build_application(store, lambda: live, token, host))
     browser = httpx.AsyncClient(transport=transport, base_url=base)
     return lambda path, method="GET", **options: asyncio.run(
         browser.request(method, path, **options)
@@ -340,7 +340,7 @@ def test_open_to_others_it_wants_a_token(tmp_path):
     ):  # fmt: skip
         short.chmod(mode)
         with pytest.raises(ConfigurationError, match=reason):
-            serve(tmp_path / "t.db", tmp_path, "0.0.0.0", 8437, token)
+            serve(tmp_path / "t.db", lambda: tmp_path, "0.0.0.0", 8437, token)
 
 
 # --- the page in a real browser, with several cameras: all of it shows the chosen one ---------

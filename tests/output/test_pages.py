@@ -200,7 +200,13 @@ def _fleet(_):
     none = dict.fromkeys(("late", "sensor", "calibrate", "clock", "refused"), 0)
     summary = none | {"cameras": 12, "stations": 12, "sound": 9, "odd": 2, "twins": 1}
     return render_fleet(
-        {"summary": summary, "cameras": cameras, "servers": ["postgresql://db"], "types": [kind]}
+        {
+            "summary": summary,
+            "cameras": cameras,
+            "servers": ["postgresql://db"],
+            "types": [kind],
+            "absent": ["mill"],
+        }
     )
 
 

@@ -136,7 +136,7 @@ def dashboard(
     if config is None and live is None and not is_store(store):
         what = "is not a store" if store.exists() else "does not exist"
         raise StoreError(f"{store}: {what}; give the store that the daemon writes")
-    serve(store, live or find_state(store), host, port, token_file, names)
+    serve(store, lambda: live or find_state(store), host, port, token_file, names)
 
 
 def status(config: opt.Config = None, store: StoreOption = None, json: opt.Json = None) -> None:

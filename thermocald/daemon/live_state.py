@@ -8,6 +8,7 @@ points and residuals, and `<camera>.jpg`, its reduced frame. Under systemd the f
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import logging
 import os
@@ -44,6 +45,7 @@ class LiveState:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._failed: set[str] = set()
+        self._held = -1  # the folder, locked while this process lives
 
     @classmethod
     def beside(cls, store: Path) -> LiveState:
@@ -52,9 +54,22 @@ class LiveState:
         return cls(Path(runtime) if runtime else _beside(store))
 
     def write_status(self, status: Mapping[str, Any]) -> None:
-        """Replace status.json."""
+        """Replace status.json, and hold the folder."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if self._held < 0 or not os.path.samestat(os.fstat(self._held), self.folder.stat()):
+                self._release()
+                self._held = os.open(self.folder, os.O_RDONLY | os.O_CLOEXEC)
+                fcntl.flock(self._held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._release()  # tried again with the next status
         document = _without_secrets(jsonable({"format": FORMAT, **status}))
         self._write("status.json", json.dumps(document).encode())
+
+    def _release(self) -> None:
+        if self._held >= 0:
+            os.close(self._held)
+        self._held = -1
 
     def write_epoch(
         self, camera: str, row: Mapping[str, Any], calibrated: CalibratedEpoch | None,
@@ -99,6 +114,7 @@ class LiveState:
         """Delete status.json, when the daemon stops."""
         with contextlib.suppress(OSError):
             (self.folder / "status.json").unlink(missing_ok=True)
+        self._release()
 
     def _write(self, name: str, data: bytes) -> None:
         if name.endswith(".json"):  # room to grow in place: JSON allows trailing blanks
@@ -133,14 +149,10 @@ def _without_secrets(value: Any) -> Any:
 
 def find_state(store: Path) -> Path:
     """Return the live folder of the daemon that writes a store, running or not."""
-    beside = _beside(store)
-    if (beside / "status.json").exists():
-        return beside
-    wanted = str(store.absolute())
     for found in sorted(_RUN.glob("thermocald*/status.json")):  # thermocald-NAME: of the template
-        if read_json(found).get("store", {}).get("path") == wanted:
+        if Path(read_json(found).get("store", {}).get("path", "")).resolve() == store.resolve():
             return found.parent
-    return beside
+    return _beside(store)  # also while a killed one's, since started by systemd, is there
 
 
 def running_status(path: Path) -> dict[str, Any]:
@@ -152,11 +164,27 @@ def running_status(path: Path) -> dict[str, Any]:
     # the daemon's clock may be stepped, so the age is by the machine's clock alone
     age_s = time.time() - (folder / "status.json").stat().st_mtime
     document["age_s"] = max(0.0, age_s)
-    if not Path(f"/proc/{document.get('pid', 0)}").exists():
+    if not _is_held(folder):
         raise DataError(
             f"the daemon that wrote {path} was killed {age_s:.0f} s ago; start it again"
         )
     return document
+
+
+def _is_held(folder: Path) -> bool:
+    """Return whether a process holds a live folder.
+
+    Its number would not tell: another process may have a killed one's, at the latest after booting.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    else:
+        return False
+    finally:
+        os.close(handle)
 
 
 def status_warnings(document: Mapping[str, Any]) -> list[str]:
@@ -166,7 +194,8 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
     if store["state"] == "results_only":
         found.append("store: its disk is nearly full: results are stored, observations are not")
     elif store["state"] != "ok":
-        found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
+        waiting = counted(store["waiting"], "epoch")
+        found.append(f"store: {store['state']}: {store['why']} ({waiting} waiting)")
     if store["lost"]:
         lost = counted(store["lost"], "epoch")
         found.append(f"{lost} lost, taken but not stored: {store['lost_why']}")
@@ -187,9 +216,6 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
             if device["why"]:
                 found.append(f"{kind} {name}: {device['why']}")
     for name, camera in cameras.items():
-        if camera["deferred"] > camera["caught_up"]:
-            found.append(
-                f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "
-                "calibrated"
-            )
+        if (left := camera["deferred"] - camera["caught_up"]) > 0:
+            found.append(f"camera {name}: {counted(left, 'epoch')} still to be calibrated")
     return found

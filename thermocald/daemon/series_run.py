@@ -278,6 +278,7 @@ class SeriesRun:
             self._correct(path, calibrated)
         elif deferred and path is None:
             result = EpochResult("frame_not_kept", "calibration deferred, but no frame stored")
+            self.pipeline.dropped -= 1  # nothing is left to be done later
         elif deferred:
             result = EpochResult(NOT_CALIBRATED, "calibrated later, when there is time")
         strange = [name for name in epoch.temperatures if name not in series.head.channels]
@@ -382,6 +383,7 @@ class SeriesRun:
                         path = self.frames.root / frame
                         if path.is_file():
                             self._backlog.append(replace(stored.epoch, frame=path))
+                            self.pipeline.dropped += stored.epoch.number < self.first
             except StoreError as error:
                 log.warning("epochs with a deferred calibration cannot be read: %s", error)
         return self._backlog.pop(0) if self._backlog else None

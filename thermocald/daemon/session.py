@@ -133,10 +133,10 @@ class Sessions:
                 "configuration; choose another --series"
             )
         if (stored := self._guard.find(session.camera, session.series)) is not None:
-            if session.start not in ("", stored.start):
+            if session.start not in ("", was := stored.start):
+                given = f"with --start {was!r}; give" if was else "without --start; omit"
                 raise UsageError(
-                    f"series {stored.name!r} was begun with --start {stored.start!r}; give this "
-                    "--start, or choose another --series"
+                    f"series {stored.name!r} was begun {given} it, or choose another --series"
                 )
             if (taken := self._guard.last_epoch(stored)) >= session.epochs:
                 raise DataError(

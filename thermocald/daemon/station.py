@@ -131,6 +131,7 @@ class CameraLine:
             run.full or (runtime.fast and not run.pipeline.wait_for_room(patience_s))
         ):
             return
+        trusted = runtime.clock.trusted()
         frame = self.plan.camera.capture()
         mark, last = frame.fingerprint, self._fingerprint
         self._fingerprint = mark
@@ -150,7 +151,8 @@ class CameraLine:
             run = self.run
             if run is None or run.full:
                 return
-            run.pipeline.submit(frame, runtime.clock.trusted())
+            # a step may be followed between the frame's time stamp and now
+            run.pipeline.submit(frame, trusted and runtime.clock.trusted())
         if runtime.epochs and run.taken - run.first + 1 >= runtime.epochs:
             self.loop.stop()
 
@@ -244,7 +246,10 @@ class Station:
             done &= loop.join(max(0.1, left_s))
         for camera in self.cameras:
             if camera.run is not None:
-                done &= camera.run.pipeline.stop(max(0.1, deadline - time.monotonic()))
+                pipeline = camera.run.pipeline
+                # what waits of a recording could not be calibrated later: no frame is stored
+                stop = pipeline.finish if self.runtime.fast else pipeline.stop
+                done &= stop(max(0.1, deadline - time.monotonic()))
         for output in self.outputs:
             done &= output.stop(max(0.1, min(2.0, deadline - time.monotonic())))
         for name in self.thermometers.with_frames:

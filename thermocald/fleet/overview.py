@@ -90,7 +90,7 @@ def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
 def _complete(camera: FleetCamera, now: float) -> None:
     """Fill a camera's fields from its last epochs and its samples; now: s UTC."""
     recent = camera.recent
-    reference = next(iter(camera.head.channels), "")
+    reference = _reference(camera)
     known = [t for e in recent if math.isfinite(t := e.temperatures.get(reference, math.nan))]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
     sensor = camera.head.camera.sensor
@@ -106,6 +106,10 @@ def _complete(camera: FleetCamera, now: float) -> None:
     if known:
         camera.temperature = known[0]
     _find_rates(camera)
+
+
+def _reference(camera: FleetCamera) -> str:
+    return next(iter(camera.head.channels), "")
 
 
 def _find_rates(camera: FleetCamera) -> None:
@@ -199,15 +203,17 @@ def _late(camera: FleetCamera, now: float) -> Findings:
 
 
 def _sensors(camera: FleetCamera) -> Findings:
-    for i, channel in enumerate(camera.head.channels):
-        read = [e.temperatures.get(channel, math.nan) for e in camera.recent]
-        if len(read) >= _FEWEST and (trouble := _trouble(camera, read, reference=i == 0)):
+    for channel in camera.head.channels:
+        if trouble := _trouble(camera, channel):
             yield "sensor", f"{channel}: {trouble}"
 
 
-def _trouble(camera: FleetCamera, read: Sequence[float], *, reference: bool) -> str:
-    """Return what is wrong with a thermometer's last readings, newest first; empty if nothing."""
+def _trouble(camera: FleetCamera, channel: str) -> str:
+    """Return what is wrong with a thermometer's last readings; empty if nothing."""
+    read = [e.temperatures.get(channel, math.nan) for e in camera.recent]  # newest first
     known = [t for t in read if math.isfinite(t)]
+    if len(read) < _FEWEST:
+        return ""
     if not known:
         return f"no reading in the last {len(read)} epochs"
     if not any(map(math.isfinite, read[:_FEWEST])):
@@ -216,7 +222,7 @@ def _trouble(camera: FleetCamera, read: Sequence[float], *, reference: bool) -> 
         return f"reads {known[0]:g} °C, which is impossible"
     if len(known) >= _FEWEST and {*known} == {_POWER_ON_C}:
         return "reads 85 °C, the value of a DS18B20 that has not measured"
-    if reference and (since := _stuck_for(camera, known)) >= _STUCK_S:
+    if channel == _reference(camera) and (since := _stuck_for(camera, known)) >= _STUCK_S:
         return f"has read exactly {known[0]:g} °C for {short_duration(since)}"
     return ""
 
@@ -252,9 +258,9 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
             f"{low:.0f} to {high:.0f} °C"
         )
         yield "calibrate", text
-    if not camera.rates and math.isfinite(low):
+    if not (camera.rates or _trouble(camera, _reference(camera))) and math.isfinite(low):
         text = (
-            f"calibrated only from {low:.0f} to {high:.0f} °C, so that its rates are unknown; warm "
+            f"calibrated only from {low:.1f} to {high:.1f} °C, so that its rates are unknown; warm "
             "it up, or use its type's model (fit --type)"
         )
         yield "calibrate", text
@@ -304,6 +310,7 @@ _FINDINGS = {
                 "Refused rows: see the station's log for the reason."),
     "twins": ("twin", "with a twin", "Twins: give each station its own name and store."),
 }  # fmt: skip
+_ABSENT = "reports, but has no epoch from 2000 to now: check its daemon and clock"
 _MOST_LABELLED = 40
 _WIDTH = 80
 _MOST_WITHOUT = 40  # cameras without a finding that are printed
@@ -316,6 +323,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     Raises UsageError, ServerGone, ServerError, StoreVersionError.
     """
     cameras: list[FleetCamera] = []
+    absent: list[str] = []
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
     for address in addresses:
@@ -326,6 +334,8 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
             camera.state = stations.get(camera.station, camera.state)
             _complete(camera, now)
         cameras += selected
+        if not (address.camera or address.series):
+            absent += sorted({*stations} - {camera.station for camera in selected})
     types = camera_types(cameras)
     type_of = {name: kind for kind in types for name in kind["cameras"]}
     for camera in cameras:
@@ -341,6 +351,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
         "time": now,
         "cameras": [document_of(camera) for camera in cameras],
         "types": types,
+        "absent": absent,
         "summary": {
             "cameras": len(cameras),
             "stations": len({c.station for c in cameras}),
@@ -354,8 +365,9 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
 def fleet_lines(document: dict[str, Any]) -> list[str]:
     """Return the lines that `fleet` prints for a document."""
     cameras = document["cameras"]
+    absent = [f"{name}: {_ABSENT}" for name in document["absent"]]
     if not cameras:
-        return ["no epochs there yet; stations send theirs with `thermocald forward`"]
+        return absent or ["no epochs there yet; stations send theirs with `thermocald forward`"]
     summary = document["summary"]
     head = ", ".join([f"{_title(summary)}: {summary['sound']} without findings", *_counts(summary)])
     lines = textwrap.wrap(head, _WIDTH)
@@ -389,7 +401,7 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
             _WIDTH,
             subsequent_indent="  ",
         )
-    return lines
+    return lines + absent
 
 
 def _title(summary: Mapping[str, int]) -> str:
@@ -418,7 +430,7 @@ def render_fleet(document: Mapping[str, Any]) -> str:
         (f"{_name(c)}, {_FINDINGS[f['kind']][0]}", f["text"])
         for c in cameras
         for f in c["findings"]
-    )
+    ) + tuple((name, _ABSENT) for name in document["absent"])
     counts = _counts(summary)
     drawn = [
         (kind, [_drawing(f"type-{number}-{rate}", rate, kind, cameras) for rate in kind["rates"]])

@@ -14,7 +14,7 @@ from thermocald.addresses import hide, is_loopback
 from thermocald.errors import ConfigurationError, DriverMissing
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -24,7 +24,7 @@ _SHORTEST_TOKEN = 16
 
 def serve(
     store: Path,
-    live: Path,
+    live: Callable[[], Path],
     host: str,
     port: int,
     token_file: Path | None = None,
@@ -32,8 +32,9 @@ def serve(
 ) -> None:
     """Serve the page until stopped.
 
-    names: further host names under which the page may be opened. Raises ConfigurationError, also
-    if the port is in use; DriverMissing without the extra `dashboard`.
+    live: returns the daemon's live folder; names: further host names under which the page may be
+    opened. Raises ConfigurationError, also if the port is in use; DriverMissing without the extra
+    `dashboard`.
     """
     token = _read_token(token_file)
     if not is_loopback(host) and token is None:

@@ -129,7 +129,7 @@ _ALIVE_EVERY = 22
 
 
 def build_application(
-    store: Path, live: Path, token: str | None, host: str, names: Sequence[str] = ()
+    store: Path, live: Callable[[], Path], token: str | None, host: str, names: Sequence[str] = ()
 ) -> Starlette:
     """Return the application.
 

@@ -23,7 +23,7 @@ from thermocald.result import csv_text
 from thermocald.store.database.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -37,15 +37,18 @@ _LOST_S = 3600.0  # the daemon is unhealthy for this long after an epoch was los
 
 @dataclass(frozen=True)
 class View:
-    """A view of a store and a live folder, which every call opens anew: threads may share it."""
+    """A view of a store and a live folder, which every call opens anew: threads may share it.
+
+    live: returns the folder; a daemon that is started later may have another one.
+    """
 
     store: Path
-    live: Path
+    live: Callable[[], Path]
 
     def status(self) -> dict[str, Any]:
         """Return status.json with its age in s; empty if no daemon runs."""
         written = self.changed()
-        document = read_json(self.live / "status.json") if written else {}
+        document = read_json(self.live() / "status.json") if written else {}
         return document and {**document, "age_s": max(0.0, time.time() - written)}
 
     def shown(self) -> dict[str, Any]:
@@ -78,7 +81,7 @@ class View:
     def changed(self) -> float:
         """Return the time at which status.json was last written, s; 0 if there is none."""
         try:
-            return (self.live / "status.json").stat().st_mtime
+            return (self.live() / "status.json").stat().st_mtime
         except OSError:
             return 0.0
 
@@ -109,7 +112,7 @@ class View:
         pose = {n: row.get(n) for k in EOP_NAMES for n in (k, f"sd_{k}")}
         return {
             "format": "thermocald-current-camera/1", "camera": name,
-            "age_s": max(0.0, time.time() - (self.live / f"{name}.json").stat().st_mtime),
+            "age_s": max(0.0, time.time() - (self.live() / f"{name}.json").stat().st_mtime),
             **{key: row.get(key) for key in about}, **row["opencv"],
             "pixel_pitch_mm": row.get("pixel_pitch"),
             "interior": {n: row.get(n) for k in IOP_NAMES for n in (k, f"sd_{k}")},
@@ -214,7 +217,7 @@ class View:
         # a name from a request is checked before it becomes part of a path
         if camera not in self.status().get("cameras", {}):
             raise DataError(f"there is no camera {camera!r}")
-        return self.live / f"{camera}.{suffix}"
+        return self.live() / f"{camera}.{suffix}"
 
 
 def _means(values: NDArray[Any], bins: list[NDArray[np.int64]]) -> list[float | None]:

@@ -173,11 +173,11 @@ function showDevices() {
       const good = idle || ["open", "finished"].includes(device.device);
       state.append(element("span", idle ? "idle" : device.device, good ? "ready" : "failed"),
         (device.since ? ` since ${time(device.since)} UTC` : "") + (device.why ? `: ${device.why}` : ""));
-      const now = kind !== "cameras" ? Object.entries(device.last || {})
+      const now = kind !== "cameras" ? Object.entries((good && device.last) || {})
         .map(([channel, celsius]) => `${channel} ${measured(celsius, 2, "°C")}`).join(", ") :
         (good && !idle ? `${verdict(device, device.last)[0]}; ` : "") + `every ${device.period_s} s, ` +
         `99 % at most ${fixed(1000 * device.late_p99_s, 0)} ms late, ${device.skipped} skipped, ${device.lost} lost, ` +
-        `${device.deferred - device.caught_up} to calibrate later`;
+        `${Math.max(device.deferred - device.caught_up, 0)} to calibrate later`;
       const first = element("th", name);
       first.scope = "row";
       row.append(first, state, element("td", now));

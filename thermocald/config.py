@@ -77,7 +77,7 @@ class Section(BaseModel):
             if isinstance(value, bool) and any(
                 kind in (int, float) or get_args(kind)[:1] in ((int,), (float,)) for kind in kinds
             ):
-                message = f"is {value}, as YAML reads yes, no, on, off; a number is needed"
+                message = f"is {_short(value)}, as YAML reads yes, no, on, off; a number is needed"
                 raise _of_key(key, message)
         return data
 
@@ -134,7 +134,9 @@ def in_words(path: Path | str, error: ValidationError) -> str:
     """Return the first error as a message: file or place, if any, dotted key, value and bounds."""
     first = error.errors()[0]
     where = "".join(
-        f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in first["loc"]
+        f"[{part}]" if isinstance(part, int) else f".{_key(part)}"
+        for part in first["loc"]
+        if part != "[key]"  # pydantic's mark of an error in the key itself
     ).lstrip(".")
     place = f"{path}: " if str(path) else ""
     context = first.get("ctx", {})

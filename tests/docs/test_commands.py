@@ -226,6 +226,13 @@ def test_what_is_not_run_here_exists_and_is_run_elsewhere():
         assert text in (ROOT / file).read_text()
 
 
+def test_a_token_made_as_the_page_says_can_be_part_of_an_address(tmp_path):
+    (block,) = [b for b in all_blocks("bash") if "/dev/urandom" in b.text]
+    for _ in range(20):  # base64 has a + or / in nearly every second one
+        subprocess.run(["bash", "-c", block.text], check=True, cwd=tmp_path)
+        assert re.fullmatch(r"[\w-]{32}\n", (tmp_path / "token").read_text())
+
+
 def test_installed_files_exist():
     """What the commands that need root refer to."""
     text = (ROOT / "docs/how-to/install.md").read_text()

@@ -199,7 +199,7 @@ def study(
         result = _study(inputs or [], settings, exterior, free)
     written = [f"written: {result.report(report)}"] if report is not None else []
     if figures is not None:
-        written.append(f"written: {len(result.save_figures(figures))} figures in {figures}")
+        written.append(f"written: {len(result.save_figures(figures))} files in {figures}")
     show(result, json, result, *written)
 
 

@@ -218,7 +218,7 @@ class CalibrationConfig(Section):
     sigma_floor_px: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     """Lower bound of an image point's standard deviation."""
     target_offsets: bool = True
-    """In the series, estimate a constant offset per target, for an imperfect field."""
+    """In the series, estimate a constant offset per target, of up to 400 in view."""
     correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
     """Correlation between parameters above which an epoch's geometry counts as weak."""
     snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0005
@@ -245,7 +245,7 @@ class DeviceConfig(Section):
     name: Name
     """The device's name, unique in its list; letters, digits, _ . -."""
     driver: Annotated[str, Field(min_length=1)]
-    """An installed driver (entry point); `thermocald devices` lists them."""
+    """An installed [driver](drivers.md)."""
     driver_options: dict[str, Any] = Field(default_factory=dict, alias="options")
     """Options of the driver that have the name of a key of this section."""
 

@@ -35,7 +35,8 @@ def calibrate(
     ),
     pixel_pitch: opt.PixelPitch = None,
     camera_out: Path | None = typer.Option(
-        None, help="Write the camera: .json with covariance (every --camera reads it), or .yaml."
+        None,
+        help="Write the camera: .json with covariance, or .yaml, for calibrate and import.",
     ),
     report: Path | None = typer.Option(None, help="Write residuals and coverage to an HTML file."),
     free: opt.Free = opt.DEFAULT_FREE,

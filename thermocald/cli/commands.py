@@ -117,7 +117,7 @@ PANELS = {
         "reprocess": Entry("server", "Calibrate or analyse whole archives again"),
         "server": Entry("server", "Create a server's tables and grant access to them", True),
     },
-    "Look after": {
+    "Maintain": {
         "doctor": Entry("run", "Report what this machine lacks and how to fix it"),
         "check": Entry("run", "Check a recording, a configuration or a store for errors"),
         "backup": Entry("archive", "Copy a store that is in use, and verify the copy"),

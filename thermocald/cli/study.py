@@ -260,7 +260,7 @@ def discover(
         show(planned, json)
         return
     if recording is None:
-        raise UsageError("M1 is missing: the folder of the recording to explain")
+        raise UsageError("M1 is missing: the recording or store to explain")
     others = [tc.open(path) for path in verify or ()]
     found = tc.discover(tc.open(recording), verify=others, model=model, jobs=jobs, say=say)
     document = found.as_dict()

@@ -34,10 +34,10 @@ ONE_LINE = [
     # options that would do nothing
     ("fit a -o o --separator ;", "error: --separator needs --log"),
     ("replay p --timezone UTC", "error: --timezone needs --model"),
-    ("replay p --model m --log l --store s", "error: --store does nothing with --model"),
-    ("discover M1 --plan --report r", "--report does nothing with --plan"),
+    ("replay p --model m --log l --store s", "error: --store has no effect with --model"),
+    ("discover M1 --plan --report r", "--report has no effect with --plan"),
     ("camera at m --temperature 9 --to ros", "--to needs --out"),
-    ("testfield check f.csv --paper A4", "--paper does nothing with FIELD"),
+    ("testfield check f.csv --paper A4", "--paper has no effect with FIELD"),
     ("testfield print -o f --dictionary D", "--dictionary needs --charuco"),
     ("reprocess a -o o --do study --free c", "--free needs --do calib"),
     # the names are those of the help
@@ -53,6 +53,7 @@ ONE_LINE = [
     ("study M1 --report a.html --json ./a.html", "would be ./a.html"),
     ("fit 1 -o c.yaml --code a --json a.h", "--json: both would be a"),
     (f"correct p.csv {LOG} --out ./p.csv", "POINTS.csv and --out: both would be ./p.csv"),
+    ("export M3 -o M3/testfield.csv", "SOURCE and --output: both would be M3/testfield.csv"),
     ("fit M3 -o -", "--output -: cannot be standard output"),
     # its `--report / --no-report` shares its name with files of other commands
     ("session start --camera a --config no.yaml", "error: no.yaml: "),

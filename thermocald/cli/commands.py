@@ -167,7 +167,7 @@ class Command(TyperCommand):
         for table, here in ((_NEEDED, False), (_IDLE, True)):
             for name, others in table.get(command, {}).items():
                 for other in given.intersection(others.split()) if (name in given) is here else ():
-                    does = "does nothing with" if here else "needs"
+                    does = "has no effect with" if here else "needs"
                     raise UsageError(f"{options[other]} {does} {options[name]}")
         return super().invoke(ctx)
 
@@ -197,8 +197,9 @@ def _check_outputs(command: str, options: dict[str, Any], values: list[tuple[str
     ):  # inputs first
         kind, option = kinds[name], options[name]
         if kind is None:
-            if isinstance(given, Path) and given.is_file():
-                taken[os.path.realpath(given)] = option
+            if isinstance(given, Path):
+                read = (given, given / "testfield.csv")  # of a recording
+                taken |= {os.path.realpath(file): option for file in read if file.is_file()}
         # `--report / --no-report` is a switch, not a file
         elif isinstance(given, (str, Path)) and given not in ("", "-"):
             path = Path(given)

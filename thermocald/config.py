@@ -77,7 +77,7 @@ class Section(BaseModel):
             if isinstance(value, bool) and any(
                 kind in (int, float) or get_args(kind)[:1] in ((int,), (float,)) for kind in kinds
             ):
-                message = f"is {value}, as YAML reads yes, no, on, off; a number is needed"
+                message = f"is {_short(value)}, as YAML reads yes, no, on, off; a number is needed"
                 raise _of_key(key, message)
         return data
 
@@ -134,7 +134,9 @@ def in_words(path: Path | str, error: ValidationError) -> str:
     """Return the first error as a message: file or place, if any, dotted key, value and bounds."""
     first = error.errors()[0]
     where = "".join(
-        f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in first["loc"]
+        f"[{part}]" if isinstance(part, int) else f".{_key(part)}"
+        for part in first["loc"]
+        if part != "[key]"  # pydantic's mark of an error in the key itself
     ).lstrip(".")
     place = f"{path}: " if str(path) else ""
     context = first.get("ctx", {})
@@ -216,7 +218,7 @@ class CalibrationConfig(Section):
     sigma_floor_px: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     """Lower bound of an image point's standard deviation."""
     target_offsets: bool = True
-    """In the series, estimate a constant offset per target, for an imperfect field."""
+    """In the series, estimate a constant offset per target, of up to 400 in view."""
     correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
     """Correlation between parameters above which an epoch's geometry counts as weak."""
     snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0005
@@ -243,7 +245,7 @@ class DeviceConfig(Section):
     name: Name
     """The device's name, unique in its list; letters, digits, _ . -."""
     driver: Annotated[str, Field(min_length=1)]
-    """An installed driver (entry point); `thermocald devices` lists them."""
+    """An installed [driver](drivers.md)."""
     driver_options: dict[str, Any] = Field(default_factory=dict, alias="options")
     """Options of the driver that have the name of a key of this section."""
 

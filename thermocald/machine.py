@@ -278,9 +278,8 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
         if finding.remedy:
             lines.append(f"{'':>9}{'':<{width}}  → {finding.remedy}")
     missing = [finding.name for finding in findings if finding.state == "missing"]
-    lines.append("")
-    lines.append(f"to mend: {', '.join(missing)}" if missing else "nothing is missing")
-    return lines
+    summary = f"to mend: {', '.join(missing)}" if missing else "nothing is missing"
+    return [*lines, "", summary]
 
 
 def machine_clock_trusted() -> bool:

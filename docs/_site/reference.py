@@ -131,7 +131,8 @@ def _bounds(low: Any, high: Any) -> str:
         return ""
     if high is None:
         return f", at least {low:g}"
-    return f", at most {high:g}" if low is None else f", {low:g} to {high:g}"
+    most = f"{high:g}" if high < 1e6 else f"{high:,.0f}"
+    return f", at most {most}" if low is None else f", {low:g} to {most}"
 
 
 # configuration
@@ -230,7 +231,7 @@ def _schema(part: dict[str, Any], definitions: dict[str, Any]) -> str:
     if above is not None:
         text += f" above {above:g}"
         if high is not None or below is not None:
-            text += f", up to {high:g}" if high is not None else f" and below {below:g}"
+            text += _bounds(None, high) if high is not None else f" and below {below:g}"
         return text
     return text + _bounds(low, high)
 

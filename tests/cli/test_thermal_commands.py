@@ -79,7 +79,7 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(misfits, tmp_path):
 
     def moved(*log):
         given = ("--model", misfits / "model.yaml", "--extrapolate", "--log", *log)
-        _, row = succeed("correct", tmp_path / "p.csv", *given).stdout.splitlines()
+        _, row = succeed("correct", tmp_path / "p.csv", *given, "-o", "-").stdout.splitlines()
         return float(row.split(",")[3])
 
     first = moved(misfits / "M3" / "epochs.csv")

@@ -167,7 +167,7 @@ class Page:
         assert self.finish(command) in (0, 130), command
 
     def compare(self, block: Block) -> None:
-        """Every line of the block was said, with numbers that agree to a tenth."""
+        """Every line of the block was said, with numbers that agree to 3 %."""
         said = " ".join(self.said().split())
         for line in block.text.splitlines():
             shown = " ".join(line.split())
@@ -175,7 +175,7 @@ class Page:
             expected = [float(n) for n in NUMBER.findall(shown)]
             found = [[float(n) for n in m.groups()] for m in re.finditer(pattern, said)]
             assert found, f"{self.page}:{block.line}: not said: {shown}\n{said[-2000:]}"
-            near = pytest.approx(expected, rel=0.1, abs=0.005)
+            near = pytest.approx(expected, rel=0.03, abs=0.005)
             assert any(numbers == near for numbers in found), (shown, found)
 
     def __enter__(self) -> Self:
@@ -224,6 +224,13 @@ def test_what_is_not_run_here_exists_and_is_run_elsewhere():
     assert {c.split()[1] for c in commands if c.startswith("make ")} - targets == set()
     for file, text in ELSEWHERE.values():
         assert text in (ROOT / file).read_text()
+
+
+def test_a_token_made_as_the_page_says_can_be_part_of_an_address(tmp_path):
+    (block,) = [b for b in all_blocks("bash") if "/dev/urandom" in b.text]
+    for _ in range(20):  # base64 has a + or / in nearly every second one
+        subprocess.run(["bash", "-c", block.text], check=True, cwd=tmp_path)
+        assert re.fullmatch(r"[\w-]{32}\n", (tmp_path / "token").read_text())
 
 
 def test_installed_files_exist():

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import re
 import signal
 import sys
 from typing import Any
@@ -143,14 +142,17 @@ def _keep_exit(lost: Any) -> None:
 
 def _print_usage_error(error: Any) -> int:
     """Print a usage error in one line, or the help for a group without a command."""
-    command = "thermocald" if error.ctx is None else error.ctx.command_path
+    # an option without its value has no context
+    command = error.ctx.command_path if error.ctx else f"thermocald {_command_name()}".strip()
     message = error.format_message()
     if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
         return int(error.exit_code)
+    if hasattr(error.__cause__, "errors"):  # pydantic's, of a value that is no number
+        from thermocald.config import in_words
+
+        message = in_words(max(error.param.opts, key=len), error.__cause__)
     message = message[0].lower() + message[1:]
-    named = r"^invalid value for '([^']+)'(?: / '[^']+')*: (?:Input )?"
-    message = re.sub(named, r"\1: ", message)
     text = f"{' '.join(message.split()).rstrip('.')}; see '{command} --help'"
     say(f"error: {text.replace('?; see', '? See')}")  # Did you mean …?
     return int(error.exit_code)

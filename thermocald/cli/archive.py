@@ -150,10 +150,9 @@ def backup(
     if to.endswith("/"):
         make_folder(Path(to))
     document = back_up(Path(store), Path(to), keep)
-    say(f"{document['backup']}: {document['epochs']} epochs, every row verified")
-    for path in document["deleted"]:
-        say(f"{path}: deleted; {keep} newer backups are left")
-    write_json(document, json)
+    copied = f"{document['backup']}: {document['epochs']} epochs, every row verified"
+    deleted = [f"{path}: deleted (--keep {keep})" for path in document["deleted"]]
+    show(document, json, copied, *deleted)
 
 
 _NAMES = {"csv": "observations.csv", "parquet": "observations.parquet"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import collections
+import os
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ def calibrate(
     ),
     pixel_pitch: opt.PixelPitch = None,
     camera_out: Path | None = typer.Option(
-        None, help="Write the camera: .json with covariance (every --camera reads it), or .yaml."
+        None, help="Write the camera, which every --camera reads: .json with covariance, or .yaml."
     ),
     report: Path | None = typer.Option(None, help="Write residuals and coverage to an HTML file."),
     free: opt.Free = opt.DEFAULT_FREE,
@@ -196,13 +196,11 @@ def predict(
 def _channels(given: list[str]) -> dict[str, float]:
     found = {}
     for text in given:
-        name, equals, value = text.partition("=")
         try:
+            name, value = text.split("=")
             found[name] = float(value)
         except ValueError:
-            equals = ""
-        if not equals:
-            raise UsageError(f"--channel {text}: write NAME=°C, such as board_temperature=48.5")
+            raise UsageError(f"--channel {text}: write NAME=°C, such as lens=48.5") from None
     return found
 
 
@@ -215,8 +213,8 @@ def correct(
         metavar="POINTS.csv",
         help="Columns time, x, y (px) and any others; or time, image; - is standard input.",
     ),
-    out: Path | None = typer.Option(
-        None, "--out", "-o", help="CSV file (points) or folder (images) to write."
+    out: str = typer.Option(
+        "-", "--out", "-o", help="CSV file (points; - is standard output) or folder (images)."
     ),
     to: float | None = expert(None, help="Temperature to correct to, °C; default: the model's T0."),
     temperature_sd: float | None = expert(
@@ -246,18 +244,16 @@ def correct(
             points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
             size=size, timezone=timezone, ambiguous=ambiguous, extrapolate=extrapolate, say=say,
         )  # fmt: skip
-        if done.of_images and out is None:
+        if done.of_images and out == "-":
             raise UsageError("--out is missing: the folder for the corrected images")
         say_warning(thermal)
-        if out is not None:
+        if out != "-":
             with progress(None, "correcting images") as advance:
-                done.write(out, advance)
-        elif json == "-":
-            collections.deque(done.rows(), 0)
+                done.write(Path(out), advance)
         else:
-            write_parts(done.rows(), "-")
+            write_parts(done.rows(), os.devnull if json == "-" else "-")
     write_json(done, json)
-    if json != "-" and out is not None:
+    if json != "-" and out != "-":
         typer.echo(f"{out}: {done}")
     done.require_all()
 

@@ -117,7 +117,7 @@ PANELS = {
         "reprocess": Entry("server", "Calibrate or analyse whole archives again"),
         "server": Entry("server", "Create a server's tables and grant access to them", True),
     },
-    "Look after": {
+    "Maintain": {
         "doctor": Entry("run", "Report what this machine lacks and how to fix it"),
         "check": Entry("run", "Check a recording, a configuration or a store for errors"),
         "backup": Entry("archive", "Copy a store that is in use, and verify the copy"),
@@ -147,23 +147,27 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Check numbers, options and outputs, then run the command."""
-        for parameter in self.get_params(ctx):
-            values = ctx.params.get(parameter.name)
-            for value in values if isinstance(values, tuple | list) else (values,):
-                if isinstance(value, float) and not math.isfinite(value):
-                    raise UsageError(f"{parameter.opts[0]}: {value} is no finite number")
-        if not ctx.params.get("dry_run"):
-            _check_outputs(ctx)
-        # an option that does nothing without another, or beside it
+        command = ctx.command_path.partition(" ")[2]
         options = {
             p.name: p.metavar if p.param_type_name == "argument" else max(p.opts, key=len)
             for p in self.params
         }
+        values = [
+            (name, value)
+            for name, given in ctx.params.items()
+            for value in (given if isinstance(given, tuple | list) else (given,))
+        ]
+        for name, value in values:
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UsageError(f"{options[name]}: {value} is no finite number")
+        if not ctx.params.get("dry_run"):
+            _check_outputs(command, options, values)
+        # an option that does nothing without another, or beside it
         given = {n for n in options if ctx.get_parameter_source(n).name == "COMMANDLINE"}
         for table, here in ((_NEEDED, False), (_IDLE, True)):
-            for name, others in table.get(_words(ctx), {}).items():
+            for name, others in table.get(command, {}).items():
                 for other in given.intersection(others.split()) if (name in given) is here else ():
-                    does = "does nothing with" if here else "needs"
+                    does = "has no effect with" if here else "needs"
                     raise UsageError(f"{options[other]} {does} {options[name]}")
         return super().invoke(ctx)
 
@@ -181,29 +185,31 @@ class Command(TyperCommand):
                 formatter.write_dl(sections[title])
 
 
-def _words(ctx: Any) -> str:
-    """Return the words of a command, without the program's name."""
-    words, above = [ctx.info_name], ctx.parent
-    while above is not None and above.parent is not None:
-        words, above = [above.info_name, *words], above.parent
-    return " ".join(words)
+def _check_outputs(command: str, options: dict[str, Any], values: list[tuple[str, Any]]) -> None:
+    """Raise OutputError for an output that cannot be written.
 
-
-def _check_outputs(ctx: Any) -> None:
-    """Raise OutputError for an output that cannot be written, UsageError for one given twice."""
-    command = _words(ctx)
-    written: dict[str, str] = {}
-    for name, given in ctx.params.items():
-        kind = _OUTPUTS.get(f"{command} {name}", _OUTPUTS.get(name))
+    Raises UsageError for an output that is another output, or a file that the command reads.
+    """
+    kinds = {name: _OUTPUTS.get(f"{command} {name}", _OUTPUTS.get(name)) for name in options}
+    taken: dict[str, str] = {}
+    for name, given in sorted(
+        values, key=lambda value: kinds[value[0]] is not None
+    ):  # inputs first
+        kind, option = kinds[name], options[name]
+        if kind is None:
+            if isinstance(given, Path):
+                read = (given, given / "testfield.csv")  # of a recording
+                taken |= {os.path.realpath(file): option for file in read if file.is_file()}
         # `--report / --no-report` is a switch, not a file
-        if kind is None or not isinstance(given, (str, Path)) or str(given) in ("", "-"):
-            continue
-        path, option = Path(given), f"--{name.replace('_', '-')}"
-        for file in map(path.with_suffix, (".h", ".py")) if name == "code" else (path,):
-            check_output(file, kind)
-            place = os.path.realpath(file)
-            if written.setdefault(place, option) != option and not place.startswith("/dev/"):
-                raise UsageError(f"{written[place]} and {option}: both would be {given}")
+        elif isinstance(given, (str, Path)) and given not in ("", "-"):
+            path = Path(given)
+            if str(path) == "-":
+                raise UsageError(f"{option} -: cannot be standard output; give a file or folder")
+            for file in map(path.with_suffix, (".h", ".py")) if name == "code" else (path,):
+                check_output(file, kind)
+                place = os.path.realpath(file)
+                if taken.setdefault(place, option) != option and not place.startswith("/dev/"):
+                    raise UsageError(f"{taken[place]} and {option}: both would be {given}")
 
 
 class Group(TyperGroup):

@@ -13,7 +13,7 @@ import typer
 from thermocald.cli.commands import expert
 
 Json = Annotated[
-    str | None, typer.Option("--json", help="Write the result as JSON; - is standard output.")
+    str | None, typer.Option("--json", metavar="FILE", help="Write JSON; - is standard output.")
 ]
 Config = Annotated[
     Path | None,

@@ -114,10 +114,9 @@ def forward(
     forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, **frames)
     if once:
         done = forwarder.send_waiting()
-        write_json({"sent": dict(done.sent), "refused": done.refused}, json)
-        if json != "-":
-            counts = ", ".join(f"{n} {table}s" for table, n in done.sent.items())
-            say(f"sent {counts}" + (f"; {done.refused} refused" if done.refused else ""))
+        counts = ", ".join(counted(n, table) for table, n in done.sent.items())
+        refused = f"; {done.refused} refused" if done.refused else ""
+        show({"sent": done.sent, "refused": done.refused}, json, f"sent {counts}{refused}")
         return
     log_to_stderr("INFO")
     ended = threading.Event()
@@ -232,9 +231,7 @@ def reprocess(
         places = [{"source": source_name(o.task[0])} for o in failed]
         summary = f"{count - len(failed)} of {count} series analysed"
     errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
-    write_json({**document, "failed": errors}, json)
-    if json != "-":
-        say(f"{out}: {summary}")
+    show({**document, "failed": errors}, json, f"{out}: {summary}")
     if not failed:
         return
     first = failed[0]

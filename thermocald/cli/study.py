@@ -199,7 +199,7 @@ def study(
         result = _study(inputs or [], settings, exterior, free)
     written = [f"written: {result.report(report)}"] if report is not None else []
     if figures is not None:
-        written.append(f"written: {len(result.save_figures(figures))} figures in {figures}")
+        written.append(f"written: {len(result.save_figures(figures))} files in {figures}")
     show(result, json, result, *written)
 
 
@@ -260,7 +260,7 @@ def discover(
         show(planned, json)
         return
     if recording is None:
-        raise UsageError("M1 is missing: the folder of the recording to explain")
+        raise UsageError("M1 is missing: the recording or store to explain")
     others = [tc.open(path) for path in verify or ()]
     found = tc.discover(tc.open(recording), verify=others, model=model, jobs=jobs, say=say)
     document = found.as_dict()

@@ -4,8 +4,10 @@ At a corner two straight edges meet. Blurred by the optics, its grey values foll
 that a bivariate normal variate lies in a quadrant, with the cosine between the edges' normals as
 the correlation. Position, both edge directions, blur, background, and contrast are estimated by
 Levenberg's method for many corners at once. The covariance is that of least squares with the
-variance of the fit's own residuals, which is correct if the noise is white. The noise of a JPEG is
-not, so that its standard deviations are too small, by a factor that cannot be known here.
+variance of the fit's own residuals. The errors of a JPEG are correlated from pixel to pixel: across
+an edge they cancel, along it they add up. The correlation ρ of neighbouring residuals of all
+corners enlarges the variance by (1 + ρ)/(1 − ρ), that of a mean of a first-order autoregression.
+With a JPEG of quality 30 to 95, error over standard deviation is 0.8 to 1.6, most often 1.0 to 1.3.
 
 If squares touch at a corner (chessboards, AprilGrids), the opposite quadrant is dark as well. The
 grey values decide whether it is added to the model.
@@ -249,7 +251,7 @@ def _inward_normals(found: Corners) -> list[Array]:
 def _minimise(pixels: _Pixels, p: Array) -> tuple[Array, Array, Single, Array]:
     """Minimise the squares by Levenberg's method from parameters (n, 7).
 
-    Returns the parameters, the sums of squares (n,), the partials (n, m, 7), the last steps (n, 7).
+    Returns the parameters, the residuals (n, m), the partials (n, m, 7), the last steps (n, 7).
     """
     px, py, grey, use, saddle = pixels
     weight, n = use.astype(float), len(p)
@@ -286,18 +288,18 @@ def _minimise(pixels: _Pixels, p: Array) -> tuple[Array, Array, Single, Array]:
         open_ = open_[np.abs(now[:, :2]).max(axis=1) >= _CONVERGED_PX]
         if len(open_) == 0:
             break
-    return p, chi, j, step
+    return p, r, j, step
 
 
 def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     """Fit corners together; return the observations, and {row: reason} of failed fits."""
     pixels, p, cut_off = _pixels(image, found)
-    p, chi, j, step = _minimise(pixels, p)
+    p, r, j, step = _minimise(pixels, p)
     m = pixels.use.sum(axis=1)
     jw = j * pixels.use[..., None].astype(float)
     normal_matrix = np.swapaxes(jw, 1, 2) @ j
     cofactors = scaled_solve(normal_matrix, np.eye(7)[None, :, :2], 1e-12)[:, :2]
-    variance = chi / np.maximum(m - 7, 1)
+    variance = np.sum(r * r, axis=1) / np.maximum(m - 7, 1)
     residual_sd = np.sqrt(variance)
     move = np.hypot(*(p[:, :2] - found.places).T)
     saturated = pixels.use & (pixels.grey >= np.iinfo(image.dtype).max)
@@ -319,6 +321,12 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     )
     reasons = first_reasons(tests)
     good = reasons == ""
+    # the pixels are in the order of rows, those that are not used at the end
+    beside = (np.diff(pixels.x, axis=1) == 1) & pixels.use[:, 1:]
+    products = np.sum(r[:, 1:] * r[:, :-1], axis=1, where=beside)
+    rho = products / np.maximum(variance * beside.sum(axis=1), 1e-12)
+    common = float(np.clip(np.median(rho[good]), 0.0, 0.9)) if good.any() else 0.0
+    variance *= (1 + common) / (1 - common)
     quality = {
         # without the width of the pixel
         "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),

@@ -30,6 +30,8 @@ from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.targets.corner import Corners
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
@@ -179,17 +181,20 @@ def detect_markers(
     Returns the corners (4, 2) px by number, good to about a pixel, and the width of the black
     border in cells. A number that is found twice is dropped. A large image is searched at half its
     size first, at full size if half of the markers or fewer were found, and then, for AprilTags,
-    with the wide border of Kalibr's AprilGrids.
+    with the wide border of Kalibr's AprilGrids, in the end smoothed.
     """
     grey = to_8_bit(image)
-    searches = [(scale, 1) for scale in ((2, 1) if grey.size > LARGE_PIXELS else (1,))]
+    views: list[tuple[int, Callable[[Any], Any]]] = [(1, np.asarray)]
+    if grey.size > LARGE_PIXELS:
+        views = [(2, halved), *views]
+    searches = [(1, *view) for view in views]
     if name.startswith("DICT_APRILTAG"):
-        searches += [(scale, 2) for scale, _ in searches]
+        # noise and a JPEG's blocks leave only inner outlines of wide borders
+        searches += [(2, *view) for view in (*views, (1, lambda g: cv2.GaussianBlur(g, (0, 0), 2)))]
     best: dict[int, Array] = {}
     best_border = 1
-    for scale, border in searches:
-        searched = halved(grey) if scale > 1 else grey
-        found, numbers, _ = detector(name, border).detectMarkers(searched)
+    for border, scale, view in searches:
+        found, numbers, _ = detector(name, border).detectMarkers(view(grey))
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:
             for number, corners in zip(numbers.ravel().tolist(), found, strict=True):

@@ -30,7 +30,7 @@ from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.targets.corner import Corners
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
@@ -173,6 +173,17 @@ def halved(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
+def _searches(
+    grey: NDArray[np.uint8], wide_too: bool
+) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+    """Yield border, scale and image of the searches for markers; wide_too: with wide borders."""
+    views = [(2, halved(grey)), (1, grey)] if grey.size > LARGE_PIXELS else [(1, grey)]
+    for border in (1, 2) if wide_too else (1,):
+        yield from ((border, scale, view) for scale, view in views)
+    if wide_too:  # noise and a JPEG's blocks leave only inner outlines of wide borders
+        yield 2, 1, cv2.GaussianBlur(grey, (0, 0), 2.0)  # type: ignore[misc]
+
+
 def detect_markers(
     image: Image, name: str, expected: frozenset[int]
 ) -> tuple[dict[int, Array], int]:
@@ -184,17 +195,10 @@ def detect_markers(
     with the wide border of Kalibr's AprilGrids, in the end smoothed.
     """
     grey = to_8_bit(image)
-    views: list[tuple[int, Callable[[Any], Any]]] = [(1, np.asarray)]
-    if grey.size > LARGE_PIXELS:
-        views = [(2, halved), *views]
-    searches = [(1, *view) for view in views]
-    if name.startswith("DICT_APRILTAG"):
-        # noise and a JPEG's blocks leave only inner outlines of wide borders
-        searches += [(2, *view) for view in (*views, (1, lambda g: cv2.GaussianBlur(g, (0, 0), 2)))]
     best: dict[int, Array] = {}
     best_border = 1
-    for border, scale, view in searches:
-        found, numbers, _ = detector(name, border).detectMarkers(view(grey))
+    for border, scale, searched in _searches(grey, name.startswith("DICT_APRILTAG")):
+        found, numbers, _ = detector(name, border).detectMarkers(searched)
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:
             for number, corners in zip(numbers.ravel().tolist(), found, strict=True):

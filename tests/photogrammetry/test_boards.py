@@ -76,7 +76,7 @@ def test_an_aprilgrid_is_found_in_a_coarse_jpeg():
 
 
 def test_small_overexposed_markers_are_not_measured():
-    """Cut at full scale, the few pixels of their narrow surround were accepted: error/sd 8 to 19."""
+    """Cut at full scale, the few pixels of their narrow surround gave error/sd of 8 to 19."""
     field = boards.charuco(8, 6, 30.0, 22.0, "DICT_5X5_100")
     sheet = images.charuco_sheet(8, 6, 30.0, 22.0, "DICT_5X5_100", legacy=False)
     station = stood(field, (130.0, -30.0, 450.0), 2.9)

@@ -213,10 +213,9 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
     px, py = x.astype(float), y.astype(float)
-    dx, dy = px - corners[:, 0, None], py - corners[:, 1, None]
-    away = np.hypot(dx, dy)
-    normals = _inward_normals(found)
-    d1, d2 = (m[:, 0, None] * dx + m[:, 1, None] * dy for m in normals)
+    away = np.hypot(px - corners[:, 0, None], py - corners[:, 1, None])
+    placed = np.column_stack([corners, *_inward_angles(found)])
+    d1, d2 = _from_edges(placed, px, py)
     # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
     margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
     saddle = _is_saddle(grey, d1, d2, inside & (away <= along[:, None]))
@@ -237,22 +236,29 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
 
     background = share(depth < -1)
     contrast = share(depth > 1) - background
-    angles = (np.arctan2(v[:, 1], v[:, 0]) for v in normals)
     contrast = np.where(np.abs(contrast) < 1, 1.0, contrast)
-    p = np.column_stack([corners, *angles, np.full(n, 1.2), background, contrast])
+    p = np.column_stack([placed, np.full(n, 1.2), background, contrast])
     return _Pixels(px, py, grey, use, saddle), p, cut_off
 
 
-def _inward_normals(found: Corners) -> list[Array]:
-    """Return the normals (n, 2) of the two edges: across one side, towards the other."""
-    sides = found.before - found.places, found.after - found.places
-    normals = []
-    for edge, other in (sides, sides[::-1]):
-        across = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
-        length = np.linalg.norm(across, axis=-1, keepdims=True)
-        normal = across / np.where(length > 0, length, 1.0)
-        normals.append(normal * np.sign(np.sum(normal * other, axis=-1, keepdims=True)))
-    return normals
+def _inward_angles(found: Corners) -> list[Array]:
+    """Return the angles (n,) of both edges' normals: across one side, towards the other."""
+    sides = (found.before - found.places).T, (found.after - found.places).T
+    angles = []
+    for (x, y), (other_x, other_y) in (sides, sides[::-1]):
+        towards = np.sign(x * other_y - y * other_x)
+        angles.append(np.arctan2(towards * x, -towards * y))
+    return angles
+
+
+def _from_edges(p: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return the distances (n, m) of pixels x, y (n, m) from the lines of both edges, inwards.
+
+    p (n, 4): places and angles of the corners.
+    """
+    x0, y0, t1, t2 = p.T[:, :, None]
+    dx, dy = x - x0, y - y0
+    return np.cos(t1) * dx + np.sin(t1) * dy, np.cos(t2) * dx + np.sin(t2) * dy
 
 
 def _minimise(pixels: _Pixels, p: Array) -> tuple[Array, Array, Single, Array]:
@@ -306,9 +312,8 @@ def _correlation(pixels: _Pixels, p: Array, r: Array) -> float:
     """
     if not len(p):
         return 0.0
-    x, y, *angles = p[:, :4].T[:, :, None]
-    d1, d2 = (np.cos(t) * (pixels.x - x) + np.sin(t) * (pixels.y - y) for t in angles)
-    depth, contrast = _depth(d1, d2, pixels.saddle), p[:, 6, None]
+    depth = _depth(*_from_edges(p[:, :4], pixels.x, pixels.y), pixels.saddle)
+    contrast = p[:, 6, None]
     bins = np.rint(np.clip(2.0 * (depth + _REACH_PX), 0.0, 4.0 * _REACH_PX)).astype(np.int64)
     used = bins[pixels.use]
     sums = np.bincount(used, (r / contrast)[pixels.use], int(4 * _REACH_PX) + 1)

@@ -15,6 +15,7 @@ from tests.photogrammetry.exact_rendering import rms
 from tests.photogrammetry.fields import PI_CAMERA, draw_marker
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph, put_up
+from tests.photogrammetry.test_markers import jpeg
 from thermocald.errors import TestFieldError
 from thermocald.output.testfield.sheets import TRIM, Design, paper_size, print_testfield
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
@@ -63,6 +64,25 @@ def test_standard_deviations_of_an_aprilgrid_are_true_at_any_obliquity(stand):
         assert len(found) >= 60
         ratios.append((found.points - truth[found.targets]) / found.sigmas)
     assert 0.9 < rms(np.concatenate(ratios)) < 1.1
+
+
+def test_an_aprilgrid_is_found_in_a_coarse_jpeg():
+    """OpenCV finds the inner outlines of the wide borders: four corners were measured."""
+    field = boards.aprilgrid(4, 4, 40.0, 0.3)
+    station = stood(field, (0, 0, 300))
+    clean = drawn_exactly(field, 4, 4, 40.0, 0.3).render(LARGE, station, blur=0.6, finer=2)
+    frame = exact_rendering.noisy(clean, np.random.default_rng(1), 1.0)
+    assert len(measure(jpeg(frame, 30), field).observations) == 64
+
+
+def test_small_overexposed_markers_are_not_measured():
+    """Cut at full scale, the few pixels of their narrow surround gave error/sd of 8 to 19."""
+    field = boards.charuco(8, 6, 30.0, 22.0, "DICT_5X5_100")
+    sheet = images.charuco_sheet(8, 6, 30.0, 22.0, "DICT_5X5_100", legacy=False)
+    station = stood(field, (130.0, -30.0, 450.0), 2.9)
+    for gain in (1.35, 1.6):
+        frame = photograph([sheet], CAMERA, station, finer=2, paper=205 * gain, ink=35 * gain)
+        assert len(measure(frame, field).observations) < 5
 
 
 def test_the_tags_of_an_aprilgrid_are_the_published_ones():

@@ -164,6 +164,33 @@ def test_photographs_of_apriltags(shared):
         assert observed.sigmas.max() < 0.2
 
 
+def jpeg(frame, quality: int):
+    """Return a frame as a JPEG of this quality shows it."""
+    coded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
+
+
+@pytest.mark.parametrize("quality", [95, 85, 75, 50])
+def test_corners_of_a_jpeg_have_true_sds(quality):
+    """The errors of neighbouring pixels are correlated: error/sd was 1.3 to 1.9."""
+    z = []
+    for seed in range(3):
+        frame = noisy(_rendered("frontal"), np.random.default_rng(seed), 1.0)
+        observed, _ = measure_markers(jpeg(frame, quality), FIELD)
+        z.append((observed.points - _truth("frontal")[observed.targets]) / observed.sigmas)
+    assert 0.85 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < (1.2 if quality > 50 else 1.5)
+
+
+def test_a_sharpened_image_does_not_widen_sds():
+    """Its halos along all edges are no noise: with them error/sd would be 0.5."""
+    clean = _rendered("frontal")
+    frame = noisy(
+        1.5 * clean - 0.5 * cv2.GaussianBlur(clean, (0, 0), 1.5), np.random.default_rng(1)
+    )
+    plain = measure_markers(noisy(clean, np.random.default_rng(1)), FIELD)[0].sigmas
+    assert np.median(measure_markers(frame, FIELD)[0].sigmas) < 1.5 * np.median(plain)
+
+
 @pytest.mark.parametrize(("gain", "good"), [(1.32, 48), (1.36, 0), (2.0, 0)])
 def test_overexposed_corners_are_not_measured(gain, good):
     """Regression: cut at full scale, edges were 0.03 to 1 px off: error/sd 4 to 95."""

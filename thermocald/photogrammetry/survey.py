@@ -72,8 +72,7 @@ def measure_codes(image: Image, rows: dict[RingCode, int], grows: bool) -> Obser
     targets = np.array([rows.setdefault(code, len(rows)) for code in best], dtype=np.int64)
     fit = fit_circles(image, maps, np.ones(len(targets), dtype=bool))
     # the fit estimates how the initial outline has to be stretched
-    m11, m12, m22 = fit.parameters[:, 2:5].T
-    stretch = np.stack([1 + m11, m12, m12, 1 + m22], axis=-1).reshape(-1, 2, 2)
+    stretch = fit.parameters[:, [[2, 3], [3, 4]]] + np.eye(2)
     outlines = replace(maps, linear=maps.linear @ np.linalg.inv(stretch))
     seen = fit.observations(targets, fit.good)
     order = np.argsort(targets, kind="stable")

@@ -243,16 +243,11 @@ class Observations:
 
 def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any]:
     """Return observations as lists for JSON, by target name."""
-    lists: dict[str, Any] = {
-        "target": [field.names[row] for row in seen.targets.tolist()],
-        "x": seen.points[:, 0].tolist(),
-        "y": seen.points[:, 1].tolist(),
-        "sx": seen.sigmas[:, 0].tolist(),
-        "sy": seen.sigmas[:, 1].tolist(),
-    }
+    columns = dict(zip(("x", "y", "sx", "sy"), (*seen.points.T, *seen.sigmas.T), strict=True))
     if seen.covariances is not None:
-        lists["sxy"] = seen.covariances.tolist()
-    return lists
+        columns["sxy"] = seen.covariances
+    names = [field.names[row] for row in seen.targets.tolist()]
+    return {"target": names, **{name: values.tolist() for name, values in columns.items()}}
 
 
 def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Observations:

@@ -30,6 +30,8 @@ from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.targets.corner import Corners
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
@@ -171,6 +173,17 @@ def halved(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
+def _searches(
+    grey: NDArray[np.uint8], wide_too: bool
+) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+    """Yield border, scale and image of the searches for markers; wide_too: with wide borders."""
+    views = [(2, halved(grey)), (1, grey)] if grey.size > LARGE_PIXELS else [(1, grey)]
+    for border in (1, 2) if wide_too else (1,):
+        yield from ((border, scale, view) for scale, view in views)
+    if wide_too:  # noise and a JPEG's blocks leave only inner outlines of wide borders
+        yield 2, 1, cv2.GaussianBlur(grey, (0, 0), 2.0)  # type: ignore[misc]
+
+
 def detect_markers(
     image: Image, name: str, expected: frozenset[int]
 ) -> tuple[dict[int, Array], int]:
@@ -179,16 +192,12 @@ def detect_markers(
     Returns the corners (4, 2) px by number, good to about a pixel, and the width of the black
     border in cells. A number that is found twice is dropped. A large image is searched at half its
     size first, at full size if half of the markers or fewer were found, and then, for AprilTags,
-    with the wide border of Kalibr's AprilGrids.
+    with the wide border of Kalibr's AprilGrids, in the end smoothed.
     """
     grey = to_8_bit(image)
-    searches = [(scale, 1) for scale in ((2, 1) if grey.size > LARGE_PIXELS else (1,))]
-    if name.startswith("DICT_APRILTAG"):
-        searches += [(scale, 2) for scale, _ in searches]
     best: dict[int, Array] = {}
     best_border = 1
-    for scale, border in searches:
-        searched = halved(grey) if scale > 1 else grey
+    for border, scale, searched in _searches(grey, name.startswith("DICT_APRILTAG")):
         found, numbers, _ = detector(name, border).detectMarkers(searched)
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:

@@ -235,17 +235,11 @@ def _grown_ellipses(maps: LocalMap, beyond: Array) -> Array:
     eᵀ M e is 1 on the outline; M is zero if an axis vanishes. To choose pixels, the ellipse without
     the eccentricity is good enough.
     """
-    axes = maps.semi_axes
-    grown = axes + beyond
-    left = grown[:, 1] > 0
-    value = left[:, None] / np.where(left[:, None], grown, 1.0) ** 2
-    # M has the axes of J Jᵀ, and so is a combination of J Jᵀ and the identity.
-    square = axes * axes
-    spread = square[:, 0] - square[:, 1]
-    circle = spread < 1e-6 * square[:, 0]
-    slope = np.where(circle, 0.0, (value[:, 0] - value[:, 1]) / np.where(circle, 1.0, spread))
-    M: Array = slope[:, None, None] * (maps.linear @ np.swapaxes(maps.linear, 1, 2))
-    M[:, [0, 1], [0, 1]] += (value[:, 0] - slope * square[:, 0])[:, None]
+    squares, axes = np.linalg.eigh(maps.linear @ np.swapaxes(maps.linear, 1, 2))  # minor first
+    grown = np.sqrt(np.maximum(squares, 0.0)) + beyond[:, ::-1]
+    left = grown[:, :1] > 0
+    value = left / np.where(left, grown, 1.0) ** 2
+    M: Array = (axes * value[:, None]) @ np.swapaxes(axes, 1, 2)
     return M
 
 

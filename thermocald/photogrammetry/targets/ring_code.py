@@ -396,10 +396,10 @@ def find_coded(
     """
     row_of: dict[tuple[int, int], int] = {}
     named: dict[str, dict[int, int]] = {}
-    for row, code in enumerate(testfield.codes):
-        if testfield.kinds[row] == "circle" and is_ring(code):
+    for row in np.flatnonzero(testfield.circles).tolist():
+        if is_ring(code := testfield.codes[row]):
             row_of[parse(code)] = row
-        elif testfield.kinds[row] == "circle" and is_marker(code):
+        elif is_marker(code):
             dictionary, marker, corner = parse_marker(code)
             if corner is None:
                 named.setdefault(dictionary, {})[marker] = row

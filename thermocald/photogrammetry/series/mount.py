@@ -234,9 +234,9 @@ def estimate_movement(
     pauses = _apart(pauses, len(rows), SIDE)
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
     trajectory, jumps, hidden, touches = find_jumps(trajectory, M, g, scale, pauses)
-    steps = estimate_steps(M, g, jumps)
     touched = list(touches)
     M[touched], g[touched] = 0.0, 0.0
+    steps = estimate_steps(M, g, jumps)
     drift = find_drift(M, g)
     # what the free parameters do not follow is the mount's, however slow
     found = [

@@ -132,6 +132,13 @@ def test_a_knock_beside_a_switch_has_its_epoch(apart):
     assert rms(z, axis=0).max() < 1.4
 
 
+@pytest.mark.parametrize("how", [TREMBLES, {"knocked": 30}])
+def test_the_pose_of_a_series_is_as_uncertain_as_its_mount_moves(how):
+    """Regression: errors of the angles of an epoch were 3 to 40 standard deviations."""
+    _, z = adjusted(FIELD, [[52, k] for k in range(6)], 60, exterior="series", columns=EOP, **how)
+    assert 0.8 < rms(z, axis=0).max() < 1.4
+
+
 STAYS = 10**9
 
 

@@ -55,11 +55,10 @@ def find_jumps(
     after each gap. Returns the trajectory without any jumps and touches, what is known of the
     mount's jumps by their epochs, the covariance (k, k) of a step in a gap that shows none, and the
     displacement (k,) of each epoch in which the mount was elsewhere, as if touched, with its
-    variance over an epoch's.
+    variance over an epoch's; M and g of these are then 0.
     """
     jumps: dict[int, Step]
-    left, M, g = trajectory.copy(), M.copy(), g.copy()
-    jumps, hidden = {}, np.zeros(M.shape[1:])
+    left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
     # in a gap the camera drifts, too: only the perspective shows how far the mount moved
     for row in gaps:
         step = _step(left, row)
@@ -163,13 +162,11 @@ def _is_abrupt(change: Array) -> Mask:
 
     Where a camera warms up steeply, each change is large, but a little smaller than the last.
     """
-    usual, next_to = np.zeros_like(change), np.empty_like(change)
-    usual[1:-1] = (change[:-2] + change[2:]) / 2
-    next_to[1:-1] = np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
+    size, usual = np.abs(change), (change[:-2] + change[2:]) / 2
+    inner = np.abs(change[1:-1] - usual) > _ABRUPT * np.maximum(size[:-2], size[2:])
     # a camera that begins to warm up has a small change at an end
-    ends = np.abs(change[[[1, 2], [-2, -3]]]).max(axis=1)
-    next_to[[0, -1]] = (1.0 + _ABRUPT) / _ABRUPT * ends
-    return np.asarray(np.abs(change - usual) > _ABRUPT * next_to)
+    ends = size[[0, -1]] > (1.0 + _ABRUPT) * size[[[1, 2], [-2, -3]]].max(axis=1)
+    return np.concatenate([ends[:1], inner, ends[1:]])
 
 
 def _step(trajectory: Array, row: int) -> Array:

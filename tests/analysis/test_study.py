@@ -177,7 +177,7 @@ def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
     series.values[:, 3] = series.values[0, 3]
     found = study_series(with_temperature(series, temperature), SETTINGS)
     assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
-    text = " ".join(answer_sentences(study_camera("c", [found.series], SETTINGS)))
+    text = " ".join(answer_sentences(study_camera("c", [found.series], SETTINGS), 1e4))
     assert "while temperature (known in 140 of 150 epochs) changed by" in text
     # a constant parameter has no dependence
     assert "A1" not in found.channels[0].dependences
@@ -245,7 +245,9 @@ def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
     cycle = with_temperature(cycle, warm.thermometers[0].values[up_and_down])
     camera = study_camera("rpi", [cycle], StudySettings(sets=500))
     assert camera.series[0].deviations["c"].range > 0.006
-    sentences = answer_sentences(camera)
+    # regression: rates were those at 10 m where nothing was simulated
+    assert "; at 2 m " in answer_sentences(replace(camera, montecarlo=None), 2e3)[0]
+    sentences = answer_sentences(camera, 1e4)
     text = " ".join(sentences)
     assert "drawn normally about the series' mean with the correlations of an epoch's" in text
     assert "along its own path" in text
@@ -259,7 +261,7 @@ def test_a_nearly_steady_camera_is_described_by_numbers_that_hold(warm_up):
     """It moves by 4.5 standard deviations and back, and errs by less than 0.1 mm on the plane."""
     steady = warm_up(drift={}, kelvin=0.05, sds=SDS / 10)()
     steady.values[:, 1] += 6.3e-6 * (1 - np.abs(np.linspace(-1, 1, len(steady))))
-    text = " ".join(answer_sentences(study_camera("rpi", [steady], StudySettings(sets=500))))
+    text = " ".join(answer_sentences(study_camera("rpi", [steady], StudySettings(sets=500)), 1e4))
     farthest = np.hypot(*steady.path_px.T).max()
     assert float(re.search(r"stayed within (\S+) px", text)[1]) == pytest.approx(farthest, rel=0.05)
     assert re.search(r"errors of 0\.00\d\d+ cm on average and up to 0\.0\d\d+ cm", text)

@@ -28,15 +28,16 @@ def median_variance(squares: Array) -> float:
     return max(float(np.median(squares)) / MEDIAN_CHI2, 1e-12)
 
 
-def median_known(values: Array) -> Array:
-    """Return the median over the first axis, NaN ignored; NaN where all values are NaN.
+def median_known(values: Array, axis: int = 0) -> Array:
+    """Return the median along an axis, NaN ignored; NaN where all values are NaN.
 
     numpy's warning of the latter is avoided: to ignore warnings is not safe between threads.
     """
-    known = ~np.isnan(values).all(axis=0)
-    median = np.full(values.shape[1:], np.nan)
-    median[known] = np.nanmedian(values[:, known], axis=0) if known.any() else np.nan
-    return median
+    ordered = np.sort(values, axis=axis)  # NaN go to the end
+    count = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, ordered.shape[axis] - 1)
+    sides = (np.take_along_axis(ordered, at, axis) for at in (low, high))
+    return np.asarray(0.5 * sum(sides)).squeeze(axis)
 
 
 def unit_diagonal(N: Array, ridge: float = 0.0) -> tuple[Array, Array]:

@@ -64,7 +64,7 @@ from thermocald.thermal.thermometer import Thermometer, thermometers
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Mask
     from thermocald.physics.model import Distortion
@@ -148,17 +148,8 @@ def running_median(values: Array, half: int, *, itself: bool = True) -> Array:
     out = 0.5 * (ordered[(len(near) - 1) // 2] + ordered[len(near) // 2])
     few = np.isinf(ordered[-1])
     some = ordered[:, few]
-    out[few] = take_median(np.where(np.isinf(some), np.nan, some), 0)
+    out[few] = median_known(np.where(np.isinf(some), np.nan, some))
     return np.asarray(out)
-
-
-def take_median(values: ArrayLike, axis: int) -> Array:
-    """Return the median along an axis, ignoring NaN; NaN where all values are."""
-    ordered = np.sort(values, axis=axis)  # NaN go to the end
-    count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, ordered.shape[axis] - 1)
-    sides = (np.take_along_axis(ordered, at, axis) for at in (low, high))
-    return np.asarray(0.5 * sum(sides)).squeeze(axis)
 
 
 def find_spikes(misclosure: Array, seen: Mask) -> Mask:
@@ -170,8 +161,8 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
     # without the epoch itself: in a steady movement it would be its own median, and the usual
     # deviation would be zero
     d = misclosure - running_median(misclosure, _HALF, itself=False)
-    d -= take_median(d, 1)[:, None]  # the whole image may move
-    own = MAD_TO_SD * take_median(np.abs(d).reshape(len(d), -1), 1)
+    d -= median_known(d, 1)[:, None]  # the whole image may move
+    own = MAD_TO_SD * median_known(np.abs(d).reshape(len(d), -1), 1)
     size = np.max(np.abs(np.nan_to_num(d)), axis=2)
     finite = own[np.isfinite(own)]
     level = float(np.median(finite)) if len(finite) else 0.0
@@ -187,7 +178,7 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
     """
     root = np.sqrt(weights[..., :2])
     kept = np.where((seen & ~bad)[..., None], np.abs(np.nan_to_num(v)) * root, np.nan)
-    own = MAD_TO_SD * take_median(kept.reshape(len(kept), -1), 1)
+    own = MAD_TO_SD * median_known(kept.reshape(len(kept), -1), 1)
     around = running_median(np.where(bad[..., None], np.nan, v), _HALF)
     size = np.max(np.abs(np.nan_to_num(v - around)) * root, axis=2)
     level = MAD_TO_SD * float(np.median(kept[np.isfinite(kept)]))

@@ -21,11 +21,10 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
 from thermocald.errors import DataError
-from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.photogrammetry.linalg import mad_sd, median_known
 from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid, recut
 from thermocald.store.recording.reader import Recording
 from thermocald.thermal import criteria
-from thermocald.thermal.reduce import take_median
 from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.thermometer import estimate_reading_noise
 
@@ -215,9 +214,9 @@ def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.boo
         out[-short:] = _find_gross(p[-short:], seen[-short:], short)
     values = np.where(seen[..., None], p, np.nan)[:n]
     runs = values.reshape(-1, short, *p.shape[1:])
-    off = (runs - take_median(runs, 1)[:, None]).reshape(n, *p.shape[1:])
+    off = (runs - median_known(runs, 1)[:, None]).reshape(n, *p.shape[1:])
     # the whole image may move within a short mean
-    off = np.abs(off - take_median(off, 1)[:, None])
+    off = np.abs(off - median_known(off, 1)[:, None])
     known = np.isfinite(off)
     scale = float(mad_sd(off[known])) if known.any() else 0.0
     out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)

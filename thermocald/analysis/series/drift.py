@@ -19,7 +19,6 @@ from thermocald.analysis.series.course import LEVEL, Course
 from thermocald.analysis.statistics.dependence import dependence, holm, slope_noise
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
-from thermocald.photogrammetry.series.mount import STILL
 from thermocald.photogrammetry.series.target_noise import slow_errors
 from thermocald.thermal.thermometer import estimate_reading_noise
 
@@ -62,9 +61,9 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     found, ok = [], table.ok
     time = table.frame_time[ok]
     slow = table.slow_between_ends
-    movement = STILL if table.adjustment is None else table.adjustment.movement
+    whole = table.adjustment if table.sampled is None else None
     # an epoch in which the mount was touched is as uncertain as many others together
-    still = ~np.isin(np.flatnonzero(ok), () if table.sampled is not None else movement.touched)
+    still = ~np.isin(np.flatnonzero(ok), whole.movement.touched if whole else ())
     for name in names:
         column = IOP_NAMES.index(name)
         values, sds = table.values[ok, column], table.sd[ok, column]

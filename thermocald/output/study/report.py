@@ -68,7 +68,7 @@ def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
         chapters.append(
             Chapter(
                 camera.label,
-                _answer(camera),
+                _answer(camera, study.settings.distance_mm),
                 tuple(_sections(camera, study.settings)),
                 (f"{names}. Measured: {measured}.",),
                 (*map(as_sentence, _doubts(camera)), *_notes(camera)),
@@ -88,8 +88,9 @@ def save_figures(study: Study, folder: Path) -> list[Path]:
     return paths
 
 
-def _answer(camera: CameraStudy) -> Answer:
-    sentences = answer_sentences(camera) or ["The data do not show whether the camera changes."]
+def _answer(camera: CameraStudy, distance_mm: float) -> Answer:
+    sentences = answer_sentences(camera, distance_mm)
+    sentences = sentences or ["The data do not show whether the camera changes."]
     proof = dependence_figure(camera, ("c", "x0", "y0"))
     if proof is None and any(len(study.series) > 1 for study in camera.series):
         proof = principal_point_figure(camera)
@@ -220,7 +221,6 @@ _CLOSE = 0.9
 _TOGETHER = 0.9
 _NOISE_AGREES = 1.15
 _SIGNIFICANT = 0.05
-_DISTANCE_MM = 10_000.0
 _OF_SERIES = (
     "name", "camera", "source", "without_result", "image_noise_ratio", "field_movements",
     "exterior", "free", "doubts",
@@ -245,17 +245,17 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
     lines = []
     for camera in study.cameras:
         lines.append(camera.label)
-        lines += [f"  {s}" for s in (*answer_sentences(camera), *detail_sentences(camera))]
+        lines += [f"  {s}" for s in answer_sentences(camera, study.settings.distance_mm)]
+        lines += [f"  {s}" for s in detail_sentences(camera)]
         lines += [f"  {line}" for line in _doubts(camera)]
         lines += [f"  note: {note}" for note in _notes(camera)]
     return lines
 
 
-def answer_sentences(camera: CameraStudy) -> list[str]:
+def answer_sentences(camera: CameraStudy, distance_mm: float) -> list[str]:
     """Return the results in sentences, the rates first, without those the data do not support."""
     mc = camera.montecarlo
-    distance = mc.distance_mm if mc is not None else _DISTANCE_MM
-    sentences = [s for study in camera.series if (s := rates(study, distance))]
+    sentences = [s for study in camera.series if (s := rates(study, distance_mm))]
     sentences += [s for study in camera.series if (s := _change(study))]
     if mc is not None:
         sentences.append(

@@ -272,6 +272,7 @@ def result(
         for course, jump, V in movement.steps:
             changes = np.zeros((16, 16))
             of_step = V + np.outer(jump, jump) if held else V
+            changes[EOP, EOP] = of_step
             changes[own[:, None], own] = follows @ of_step @ follows.T
             slow.append((course, changes))
     if many and estimate.solved.any():
@@ -294,10 +295,13 @@ def result(
         ratio = np.median(found / usual[:inner]) if inner else 0.0
         excess[own] = np.append(found, ratio * usual[inner:])
         relative = with_excess(relative, excess[own])
+    covariance = among_all(relative, own)
+    if held:  # the pose is that of the series, about which the mount moves
+        covariance[:, EOP, EOP] += movement.swaying
     for course, changes in slow:
-        relative += course[:, None, None] ** 2 * changes[own[:, None], own]
+        covariance += course[:, None, None] ** 2 * changes
         trend += (line @ course) ** 2 * changes
-    relative[~sound] = 0.0
+    covariance[~sound] = 0.0
     known = sigma0[sound & np.isfinite(sigma0)]
     held_affinity = None
     if affinity and sound.any():
@@ -306,7 +310,7 @@ def result(
             series.field_variance,
         )  # fmt: skip
     return replace(
-        judge_epochs(series, estimate, among_all(relative, own), unit, pooled, sigma0, redundancy),
+        judge_epochs(series, estimate, covariance, unit, pooled, sigma0, redundancy),
         level_covariance=level,
         excess_sd=np.sqrt(excess),
         trend_sd=np.sqrt(np.diag(trend)),

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 
 
 _LARGE = 5.0  # robust standard deviations of the change between neighbours; noise reaches 4
-_CERTAIN = 30.0  # χ² with 6 degrees of freedom of a displacement, and of each further one
+_CERTAIN = 30.0  # χ² with 6 degrees of freedom of a displacement
 _SHOWN = 22.5  # χ² with 6 degrees of freedom, exceeded by chance in one of a thousand gaps
 _RETURNS = 5.0  # χ² by which a return must explain the epochs better than a step that stays
 _SWAYS = 40.0  # χ² of a return, as a mount that sways returns, too
 _COLUMN = 10.0  # χ² that each column of a course must explain
-_FREEDOM = (0, 3, 5)  # epochs beyond a bend that its columns need
+_FURTHER = 15.0  # χ² that each epoch must explain that is displaced by an amount of its own
+_FREEDOM = (3, 4, 6)  # epochs beyond a bend that its columns need
+_SEEN = 3  # epochs on either side that show that something else remains
 _BESIDE = 5  # epochs around a change in which a step may be instead
 _TOGETHER = 0.7  # epochs between a bend and a step that may be between the same two epochs
 SIDE = 8  # epochs before and after a gap that give its step
@@ -53,7 +55,7 @@ def find_jumps(
     after each gap. Returns the trajectory without any jumps and touches, what is known of the
     mount's jumps by their epochs, the covariance (k, k) of a step in a gap that shows none, and the
     displacement (k,) of each epoch in which the mount was elsewhere, as if touched, with its
-    variance over an epoch's.
+    variance over an epoch's; M and g of these are then 0.
     """
     jumps: dict[int, Step]
     left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
@@ -88,6 +90,7 @@ def find_jumps(
         for each, course, of_course in zip(away, there, variances, strict=True):
             touches[each] = left[each] - course, 1.0 + float(of_course)
             left[each] = course
+        M[away], g[away] = 0.0, 0.0
         if row and row not in jumps:
             left[row:] -= step
             if jump := _find_mover(row, step, variance, M, g):
@@ -149,7 +152,7 @@ def least_deviation(trajectory: Array) -> Array:
 
 def _without_drift(change: Array) -> Array:
     """Return changes (E - 1, k) between neighbours less the median of those around."""
-    padded = np.pad(change, ((SIDE, SIDE), (0, 0)), mode="edge")
+    padded = np.pad(change, ((SIDE, SIDE), (0, 0)), mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * SIDE + 1, axis=0)
     return change - np.median(windows, axis=-1)
 
@@ -159,12 +162,11 @@ def _is_abrupt(change: Array) -> Mask:
 
     Where a camera warms up steeply, each change is large, but a little smaller than the last.
     """
-    usual, next_to = np.empty_like(change), np.empty_like(change)
-    usual[1:-1] = (change[:-2] + change[2:]) / 2
-    usual[0], usual[-1] = 2 * change[1] - change[2], 2 * change[-2] - change[-3]
-    next_to[1:-1] = np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
-    next_to[0], next_to[-1] = np.abs(change[1]), np.abs(change[-2])
-    return np.asarray(np.abs(change - usual) > _ABRUPT * next_to)
+    size, usual = np.abs(change), (change[:-2] + change[2:]) / 2
+    inner = np.abs(change[1:-1] - usual) > _ABRUPT * np.maximum(size[:-2], size[2:])
+    # a camera that begins to warm up has a small change at an end
+    ends = size[[0, -1]] > (1.0 + _ABRUPT) * size[[[1, 2], [-2, -3]]].max(axis=1)
+    return np.concatenate([ends[:1], inner, ends[1:]])
 
 
 def _step(trajectory: Array, row: int) -> Array:
@@ -218,20 +220,24 @@ def _displacements(rows: Index, row: int) -> Iterator[tuple[range, int, list[Arr
     Each has the epochs elsewhere, the first that stays so or 0, the shapes (n,), and the χ² that it
     must explain beyond that of a step.
     """
-    inside = range(rows[0] + 1, rows[-1] + 1)
-    for stays in range(row - _BESIDE, row + _BESIDE + 1):
-        if stays in inside:
-            yield range(0), stays, [(rows >= stays).astype(float)], 0.0
+    first, last = rows[0], rows[-1] + 1
+    for stays in range(max(row - _BESIDE, first + 1), min(row + _BESIDE + 1, last)):
+        few = min(stays - first, last - stays) == 2  # which may be elsewhere each
+        yield range(0), stays, [(rows >= stays).astype(float)], _FURTHER * few
     for m in range(1, _BRIEF + 1):
-        for away in (range(row, row + m), range(row - m, row)):
-            if away.start not in inside or away.stop not in inside:
-                continue
+        for start in range(max(row - m, first), min(row, last - m) + 1):
+            away = range(start, start + m)
             each = [(rows == k).astype(float) for k in away]
-            for shapes in ([np.sum(each, axis=0)], each):
-                cost = _CERTAIN * (len(shapes) - 1)
-                yield away, 0, shapes, cost + _RETURNS
-                after = (rows >= away.stop).astype(float)
-                yield away, away.stop, [*shapes, after], cost + _SHOWN
+            cost = _FURTHER * (m - 1)
+            beside = min(start - first, last - away.stop)
+            if not beside:  # whether it returns is beyond the series
+                yield away, 0, each, cost
+                continue
+            for shapes, more in (([np.sum(each, axis=0)], 0.0), (each, cost)):
+                yield away, 0, shapes, more + _RETURNS
+                if beside >= _SEEN:
+                    after = (rows >= away.stop).astype(float)
+                    yield away, away.stop, [*shapes, after], more + _SHOWN
 
 
 def _courses(rows: Index) -> tuple[Array, Array, Array]:

@@ -235,8 +235,6 @@ def estimate_movement(
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
     trajectory, jumps, hidden, touches = find_jumps(trajectory, M, g, scale, pauses)
     steps = estimate_steps(M, g, jumps)
-    touched = list(touches)
-    M[touched], g[touched] = 0.0, 0.0
     drift = find_drift(M, g)
     # what the free parameters do not follow is the mount's, however slow
     found = [
@@ -267,7 +265,7 @@ def estimate_movement(
     return Movement(
         (axes * white) @ axes.T, (axes * slow) @ axes.T, max(f[3] for f in found), back @ back.T,
         first, tuple(moved), back @ hidden @ back.T,
-        back @ drift @ back.T, tuple(rows[sorted(touched)].tolist()),
+        back @ drift @ back.T, tuple(rows[sorted(touches)].tolist()),
     )  # fmt: skip
 
 

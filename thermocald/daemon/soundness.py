@@ -252,7 +252,9 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
         ]
     state = "a damaged store" if found.damaged else "an intact store"
     lines = [f"{path}: {state} of {len(series)} series, {found.epochs} epochs"]
-    lines += [f"  {s['camera']}/{s['series']}: up to epoch {s['last_epoch']}" for s in series]
+    for s in series:
+        last = "no epochs" if s["last_epoch"] is None else f"up to epoch {s['last_epoch']}"
+        lines.append(f"  {s['camera']}/{s['series']}: {last}")
     lines += [f"  {gap.text}" for gap in found.gaps[:_SHOWN]]
     if len(found.gaps) > _SHOWN:
         lines.append(f"  and {len(found.gaps) - _SHOWN} more gaps")

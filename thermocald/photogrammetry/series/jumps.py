@@ -164,9 +164,12 @@ def _is_abrupt(change: Array) -> Mask:
     """
     size, usual = np.abs(change), (change[:-2] + change[2:]) / 2
     inner = np.abs(change[1:-1] - usual) > _ABRUPT * np.maximum(size[:-2], size[2:])
-    # a camera that begins to warm up has a small change at an end
-    ends = size[[0, -1]] > (1.0 + _ABRUPT) * size[[[1, 2], [-2, -3]]].max(axis=1)
-    return np.concatenate([ends[:1], inner, ends[1:]])
+    abrupt = np.pad(inner, ((1, 1), (0, 0)))
+    # near an end it must exceed the next ones, as a camera that begins to warm up is slower there
+    for near, found in ((size, abrupt), (size[::-1], abrupt[::-1])):
+        inwards = np.maximum(near[1 : _SEEN + 2], near[2 : _SEEN + 3])
+        found[: _SEEN + 1] = near[: _SEEN + 1] > (1.0 + _ABRUPT) * inwards
+    return abrupt
 
 
 def _step(trajectory: Array, row: int) -> Array:

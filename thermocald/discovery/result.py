@@ -27,6 +27,7 @@ from thermocald.discovery.entries import (
 from thermocald.discovery.examination import Examination, examine_series
 from thermocald.discovery.gap import Gap, Stage, fit_first, measure_gap, measure_stage
 from thermocald.discovery.proposal import propose
+from thermocald.discovery.search import by_score
 from thermocald.discovery.unnamed import (
     NO_PROPOSAL,
     describe_misfit,
@@ -394,14 +395,15 @@ def _conclude_unexplained(
     """
     alone = examine(x.fitter, base, 0)
     described = describe_unnamed(x, alone)
+    nearest = {s.names[-1]: s for s in reversed(x.ranking)}  # the best of each name
     resembling: list[dict[str, Any]] = [
         {
-            "effect": s.names[0],
+            "effect": s.names[-1],
             "resembles": True,
             "score_difference": float(s.score - x.best.score),
             "misfit_px_left": None,
         }
-        for s in x.ranking[:4]
+        for s in sorted(nearest.values(), key=by_score)[:4]
     ]
     fits = base, base
     proposal = propose(x, described.where["parameters"], progress)
@@ -414,7 +416,7 @@ def _conclude_unexplained(
         entry = describe_proposal(described, proposal, x, estimate_first(x, best.terms)[1])
     else:
         before = measure_stage(x, "unnamed", base, known)
-        gaps = (measure_gap(x, base, 0, known, alone.excess), *before.gaps[1:])
+        gaps = (measure_gap(x, base, 0, known, alone), *before.gaps[1:])
         stages.append(replace(before, gaps=gaps))
         evidence = {
             **described.evidence,

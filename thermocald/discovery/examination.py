@@ -512,12 +512,14 @@ def _keep_named(
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
     """Drop the effects that do not predict blocks left out or do not pass the surrogate test.
 
-    Returns also the gains of the others in each block, and their tests.
+    A knee at the end of the recorded temperatures is dropped too: it is a straight line. Returns
+    also the gains of the others in each block, and their tests.
     """
-    kept = len(base.terms)
+    kept, (low, high) = len(base.terms), search.fitter.knee_range()
     while len(best.terms) > kept:
         blocks = measure_block_gains(search.fitter, best.fit, kept)
-        bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
+        ends = [bool({low, high} & set(dict(t.nonlinear).values())) for t in best.terms[kept:]]
+        bad = [i for i, g in enumerate(blocks) if ends[i] or not is_confirmed(g)]
         if bad:
             worst = min(bad, key=lambda i: float(blocks[i].sum()))
             search.progress(f"{best.names[kept + worst]} predicts no period left out: dropped")

@@ -217,7 +217,9 @@ class Discovery:
         names = [" or ".join([e.effect, *e.alternative_names]) for e in self.effects]
         if any(self.examination.as_slips):
             names.append("slip or a knock of the mount")
-        return f"{self.verdict}: {', and '.join(names)}" if names else self.verdict
+        if len(names) > 1 and any(" or " in name for name in names):
+            names = [f"{', '.join(names[:-1])}, and {names[-1]}"]
+        return f"{self.verdict}: {enumerated(names)}" if names else self.verdict
 
 
 def discover_series(

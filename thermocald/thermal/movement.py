@@ -289,7 +289,8 @@ def _list_jumps(evidence: ReducedSeries) -> Array | None:
     d = np.diff((evidence.values @ evidence.N.mean(axis=0) @ W)[evidence.n > 0], _FAST, axis=0)
     if len(d) < _KINKS:
         return None
-    return d[np.argsort(np.sum(d**2, axis=1))[: max(len(d) - _KINKS, len(d) // 2)]]
+    calm = np.argsort(np.sum(d**2, axis=1))[: max(len(d) - _KINKS, len(d) // 2)]
+    return np.asarray(d[calm])
 
 
 def detect_tremble(evidence: ReducedSeries) -> bool:

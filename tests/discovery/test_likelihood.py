@@ -65,6 +65,15 @@ def test_the_likelihood_is_that_of_the_dense_covariance(evidence_of, moves):
         assert fit.weightings[0].logdet == pytest.approx(larger, rel=1e-3)
 
 
+def test_a_knee_stays_within_the_recorded_temperatures(evidence_of):
+    """Above them it moves nothing, and normal equations are singular."""
+    (e,), _ = evidence_of("creep", seed=2, epochs=60, with_m2=False)
+    T, lab = e.history.temperature(), HypothesisFitter([e])
+    start = Term("softening", nonlinear=(("T_k", float(T.min() + 0.9 * np.ptp(T))),))
+    knee = dict(lab.refine(lab.fit([start]), 20).terms[0].nonlinear)["T_k"]
+    assert T.min() < knee < T.max()
+
+
 def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
     """A cycle is fitted to a recording without effects, at the best period."""
     lab = HypothesisFitter(evidence_of(px=0.2, seed=92, epochs=90, with_m2=False)[0])

@@ -19,6 +19,7 @@ from thermocald.thermal.movement import (
     estimate_mount_motion,
     find_combinations,
     guess_mount_motion,
+    leaves_kinks,
     measure_jumps,
     weight_jumps_down,
 )
@@ -38,6 +39,18 @@ def test_slow_drifts_in_weak_directions_are_movement(evidence_of):
     _, fit, _ = estimate_mount_motion(fitter, (), mount, start.coefficients, 5)
 
     assert start.chi2 - fit.chi2 > 0.8 * 8 * 2.0**2 * len(e.times) / 2
+
+
+@pytest.mark.parametrize(("course", "kinks"), [("kinked", True), ("walk", False), ("jumps", False)])
+def test_a_misfit_that_is_smooth_but_for_kinks_is_no_mount(evidence_of, course, kinks):
+    """The half-waves of a kink look like a tremble, beside which any effect would be adequate."""
+    (e,), _ = evidence_of(seed=7, epochs=180, with_m2=False)
+    jumps = 30.0 * np.random.default_rng(1).normal(size=len(e.times))
+    kinked = 2000.0 * np.abs(np.linspace(-1.0, 1.0, len(e.times)))
+    movement = {"kinked": kinked, "walk": jumps.cumsum(), "jumps": jumps}[course]
+    moved = e.values + np.outer(movement, find_combinations([e])[:, 5])
+    fitter = HypothesisFitter([e.with_values(moved)])
+    assert leaves_kinks(fitter, fitter.fit(())) is kinks
 
 
 def test_targets_seen_in_one_epoch_say_nothing():

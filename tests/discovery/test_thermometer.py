@@ -87,6 +87,15 @@ def test_a_coarse_thermometer_is_read_where_it_changes():
     assert find_passages(t, y, 0.0625) is None
 
 
+def test_the_errors_of_coarse_and_of_held_readings_are_finite():
+    """A coarse thermometer with a reading missing; one that holds fine values for two readings."""
+    t, y = read(3, 0.0)
+    coarse = np.where(np.arange(180) == 50, np.nan, np.round(2.0 * y) / 2.0)
+    for values in (coarse, y[(0.6 * np.arange(180)).astype(int)]):
+        sd = thermometers(t, {"T": values}, {"T": None})[1]["T"].sd
+        assert np.all((sd > 0.0) & (sd < 20.0))
+
+
 def test_the_noise_of_twenty_readings_with_two_kinks():
     """Up to eight of seventeen third differences include a kink and not only noise."""
     found = []

@@ -39,6 +39,7 @@ from thermocald.thermal.movement import (
     add_tremble,
     detect_tremble,
     find_combinations,
+    leaves_kinks,
     weight_leaps_down,
 )
 from thermocald.thermal.noise import (
@@ -462,7 +463,8 @@ def _examine_beside_mount(
 ) -> Examination | None:
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
-    It is then an influence that was not recorded; None also if the series contradict each other.
+    It is then an influence that was not recorded; None also if the series contradict each other or
+    if what is left is smooth but for kinks.
     guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of
     a strong one look like it.
     """
@@ -484,7 +486,7 @@ def _examine_beside_mount(
         best, blocks, tests = _keep_named(search, base, whole, jobs)
     if not is_convincing(base, best):
         best, blocks, tests = base, [], ()
-    if contradict(best):
+    if contradict(best) or leaves_kinks(fitter, best.fit):
         return None
     tried = iter(beside.as_slips)
     as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)
@@ -510,12 +512,14 @@ def _keep_named(
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
     """Drop the effects that do not predict blocks left out or do not pass the surrogate test.
 
-    Returns also the gains of the others in each block, and their tests.
+    A knee at the end of the recorded temperatures is dropped too: it is a straight line. Returns
+    also the gains of the others in each block, and their tests.
     """
-    kept = len(base.terms)
+    kept, (low, high) = len(base.terms), search.fitter.knee_range()
     while len(best.terms) > kept:
         blocks = measure_block_gains(search.fitter, best.fit, kept)
-        bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
+        ends = [bool({low, high} & set(dict(t.nonlinear).values())) for t in best.terms[kept:]]
+        bad = [i for i, g in enumerate(blocks) if ends[i] or not is_confirmed(g)]
         if bad:
             worst = min(bad, key=lambda i: float(blocks[i].sum()))
             search.progress(f"{best.names[kept + worst]} predicts no period left out: dropped")

@@ -18,10 +18,12 @@ from thermocald.thermal.scan import examine
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from thermocald.arrays import Array
     from thermocald.discovery.evidence import Displaced
     from thermocald.discovery.examination import Examination
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Term
+    from thermocald.thermal.scan import Adequacy
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -74,9 +76,14 @@ def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
     return replace(fit, coefficients=x)
 
 
-def image_chi2(evidence: ReducedSeries, fit: Fit, series: int) -> float:
-    """Return χ² of a series' misfit in the image, with the level estimated again."""
-    return float(evidence.squares(evidence.values - fit.parameters(series)).sum())
+def image_chi2(
+    evidence: ReducedSeries, fit: Fit, series: int, beyond: Array | float = 0.0
+) -> float:
+    """Return χ² of a series' misfit in the image, with the level estimated again.
+
+    beyond (E, P): movement in addition to the fit, px-scaled.
+    """
+    return float(evidence.squares(evidence.values - fit.parameters(series) - beyond).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +110,13 @@ def measure_stage(x: Examination, added: str, fit: Fit, known: int) -> Stage:
     return Stage(added, tuple(measure_gap(x, fit, s, known) for s in every))
 
 
-def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
+def measure_gap(
+    x: Examination, fit: Fit, series: int, known: int, bridge: Adequacy | None = None
+) -> Gap:
     """Measure the gap of one series at a fit.
 
-    known: number of effects of image space in the model; explained: χ² that a bridge explains
-    beside the model.
+    known: number of effects of image space in the model; bridge: a misfit that a smooth term
+    bridges beside the model.
     """
     e, in_model = x.fitter.series[series], x.image_places[:known]
     residuals = np.nan_to_num(e.residuals)
@@ -119,8 +128,9 @@ def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: fl
     free = max(coordinates - 2.0 * targets - e.rank - unused, 1.0)
     # the weights include correlated noise; the floor is that of single epochs
     k = e.correlation
-    total = within + k * max(fit.chi2_of(series) - explained, 0.0)
-    image = within + k * max(image_chi2(e, fit, series) - explained, 0.0)
+    excess, beyond = (bridge.excess, bridge.movement) if bridge else (0.0, 0.0)
+    total = within + k * max(fit.chi2_of(series) - excess, 0.0)
+    image = within + k * image_chi2(e, fit, series, beyond)
     moved, count = _measure_moved(e, x.displaced[series], "targets" in in_model)
     total, image, free = total + moved, image + moved, free + count
     chi2 = total / free

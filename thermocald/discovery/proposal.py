@@ -72,8 +72,7 @@ def propose(
     # without the projection's curvature along all movements
     series: list[ReducedSeries] = []
     for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):
-        bridge = a.trajectories.T @ a.amplitudes
-        series.append(relinearise(x.fitter, x.base.fit, s, bridge) or e)
+        series.append(relinearise(x.fitter, x.base.fit, s, a.movement) or e)
     fitter = HypothesisFitter(series)
     fit = fitter.fit(x.base.terms, x.base.fit.coefficients)
     base = replace(x.base, fit=fit, fitter=fitter)

@@ -27,6 +27,7 @@ from thermocald.discovery.entries import (
 from thermocald.discovery.examination import Examination, examine_series
 from thermocald.discovery.gap import Gap, Stage, fit_first, measure_gap, measure_stage
 from thermocald.discovery.proposal import propose
+from thermocald.discovery.search import by_score
 from thermocald.discovery.unnamed import (
     NO_PROPOSAL,
     describe_misfit,
@@ -216,7 +217,9 @@ class Discovery:
         names = [" or ".join([e.effect, *e.alternative_names]) for e in self.effects]
         if any(self.examination.as_slips):
             names.append("slip or a knock of the mount")
-        return f"{self.verdict}: {', and '.join(names)}" if names else self.verdict
+        if len(names) > 1 and any(" or " in name for name in names):
+            names = [f"{', '.join(names[:-1])}, and {names[-1]}"]
+        return f"{self.verdict}: {enumerated(names)}" if names else self.verdict
 
 
 def discover_series(
@@ -394,14 +397,15 @@ def _conclude_unexplained(
     """
     alone = examine(x.fitter, base, 0)
     described = describe_unnamed(x, alone)
+    nearest = {s.names[-1]: s for s in reversed(x.ranking)}  # the best of each name
     resembling: list[dict[str, Any]] = [
         {
-            "effect": s.names[0],
+            "effect": s.names[-1],
             "resembles": True,
             "score_difference": float(s.score - x.best.score),
             "misfit_px_left": None,
         }
-        for s in x.ranking[:4]
+        for s in sorted(nearest.values(), key=by_score)[:4]
     ]
     fits = base, base
     proposal = propose(x, described.where["parameters"], progress)
@@ -414,7 +418,7 @@ def _conclude_unexplained(
         entry = describe_proposal(described, proposal, x, estimate_first(x, best.terms)[1])
     else:
         before = measure_stage(x, "unnamed", base, known)
-        gaps = (measure_gap(x, base, 0, known, alone.excess), *before.gaps[1:])
+        gaps = (measure_gap(x, base, 0, known, alone), *before.gaps[1:])
         stages.append(replace(before, gaps=gaps))
         evidence = {
             **described.evidence,

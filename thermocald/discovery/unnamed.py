@@ -102,8 +102,7 @@ def _measure_movement(e: ReducedSeries, a: Adequacy) -> tuple[float, Array, floa
     Returns its RMS, px, its strongest pattern's course (E,) and share, and the parameters that move
     the image.
     """
-    rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
-    rest = rest - rest.mean(axis=0)
+    rest = a.movement - a.movement.mean(axis=0)
     seen = e.columns[e.weights[..., 0].any(axis=0)].reshape(-1, rest.shape[1])
     metric = seen.T @ seen / len(seen)
     moved = rest.T @ rest / len(rest)

@@ -91,14 +91,16 @@ def _answer(d: Discovery) -> Answer:
     more = []
     if d.effects:
         gaps = zip(_names(d), before.gaps, after.gaps, strict=True)
-        changes = [f"{a.rms_px:.3f} to {b.rms_px:.3f} px RMS on {name}" for name, a, b in gaps]
+        changes = [
+            f"{a.rms_px:.3f} to {b.rms_px:.3f} px RMS on {name}"
+            for name, a, b in gaps
+            if b.rms_px < a.rms_px  # a bridge closes no gap but that of M1, a defocus none
+        ]
         more += [f"Also found: {_statement(e)}." for e in closing[1:]]
         it = "it" if len(closing) == 1 else "all of them"
-        more.append(
-            f"With {it} the gap between model and measurement falls from "
-            f"{' and from '.join(changes)}{temperatures}; the noise of an image coordinate is "
-            f"{noise:.3f} px."
-        )
+        falls = f"With {it} the gap between model and measurement falls from "
+        more.append(f"{falls}{' and from '.join(changes)}{temperatures}; the" if changes else "The")
+        more[-1] += f" noise of an image coordinate is {noise:.3f} px."
     steps = [
         f"To distinguish {e.effect} from {a['effect']}: {a['experiment']}."
         for e in d.effects

@@ -29,6 +29,7 @@ GROWTH = 40.0  # least gain in -2 log L of noise that follows the temperature. S
 CLEAR = 10.0  # -2 log L by which one trajectory of the noise excludes another: odds of 1 to 150
 UNUSUAL = 1.7  # times a variance known to 13 %, from 170 second differences: five sd
 BEYOND = 1.15  # times the largest eigenvalue due to noise (Marchenko, Pastur). Scored
+KINKED = 100.0  # power of fast half-waves over that of jumps; a random walk has 2 to 10. Scored
 FEWEST = 60  # epochs for an estimate of a series' jumps: of their variance, to 25 %
 
 # -- the absolute test -------------------------------------------------------------------------

@@ -42,6 +42,7 @@ _NOISE_KNOWN = 0.05
 
 _RIDGE = 1e-12  # of a unit diagonal: constrains coefficients that no series determines
 
+_ENDS = 0.01  # share of the recorded temperatures at either end in which a knee is a straight line
 _PERIODS = 1.6  # least number of periods in a series; a scan begins at 1.8
 
 
@@ -380,6 +381,12 @@ class HypothesisFitter:
             out.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
         return out
 
+    def knee_range(self) -> tuple[float, float]:
+        """Return the recorded temperatures, °C, between which a knee shows."""
+        T = np.concatenate([e.history.temperature() for e in self.series])
+        margin = _ENDS * float(np.ptp(T))
+        return float(T.min()) + margin, float(T.max()) - margin
+
     def refine(
         self,
         fit: Fit,
@@ -401,6 +408,7 @@ class HypothesisFitter:
         searched = self.searched(fit.terms)
         # fewer periods than _PERIODS cannot be told from a slow drift
         longest = max(float(e.times[-1]) for e in self.series) / _PERIODS
+        (low, high), names = self.knee_range(), catalogue.names()
         if searched:
             for _ in range(max_iterations):
                 A, g, _ = self.normal_equations(fit, only)
@@ -414,6 +422,8 @@ class HypothesisFitter:
                         value = parameter.bounded(old, old + float(d))
                         if parameter.role == "period":
                             value = min(value, max(old, longest))
+                        elif parameter.role == "threshold" and terms[i].effect in names:
+                            value = float(np.clip(value, min(old, low), max(old, high)))
                         terms[i] = terms[i].with_value(name, value)
                     trial = self.fit(terms, fit.coefficients, 2, only)
                     gain = cost(fit) - cost(trial)

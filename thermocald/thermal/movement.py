@@ -279,20 +279,27 @@ def _subtract_fit(fitter: HypothesisFitter, fit: Fit, series: int) -> Array:
     return subtract_level(e.N, e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(series)))
 
 
-def detect_tremble(evidence: ReducedSeries) -> bool:
-    """Return whether all targets jump together from epoch to epoch.
+def _list_jumps(evidence: ReducedSeries) -> Array | None:
+    """Return the jumps (n, m) of all targets together, in `find_combinations`; None if few.
 
-    The test uses differences of an order so high that nothing that follows a temperature remains
-    but its kinks, and leaves the largest differences out: no effect is assumed, and no
-    thermometer's error matters.
+    Jumps are differences of an order so high that nothing that follows a temperature remains but
+    its kinks, without the largest ones: no effect is assumed, and no thermometer's error matters.
     """
     W = find_combinations([evidence])
     d = np.diff((evidence.values @ evidence.N.mean(axis=0) @ W)[evidence.n > 0], _FAST, axis=0)
     if len(d) < _KINKS:
-        return False
+        return None
     calm = np.argsort(np.sum(d**2, axis=1))[: max(len(d) - _KINKS, len(d) // 2)]
+    return np.asarray(d[calm])
+
+
+def detect_tremble(evidence: ReducedSeries) -> bool:
+    """Return whether all targets jump together from epoch to epoch."""
+    if (jumps := _list_jumps(evidence)) is None:
+        return False
+    m = jumps.shape[1]
     white = comb(2 * _FAST, _FAST) / evidence.correlation
-    return _find_directions(d[calm], white, np.zeros((len(W.T), len(W.T))), _FAST) is not None
+    return _find_directions(jumps, white, np.zeros((m, m)), _FAST) is not None
 
 
 def _find_directions(
@@ -332,26 +339,35 @@ def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> Redu
     return turned.with_values(evidence.values)
 
 
+def _measure_fast(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array]:
+    """Return the mean power (m, m) of a misfit's fast half-waves in combinations W (P, m), and W.
+
+    It is the unit matrix if there is image noise only; the thermometers' share is subtracted.
+    """
+    e = fitter.series[series]
+    W = find_combinations([e])
+    fast = waves(e.times, len(e.times) - 1)[:, _count_waves(e) :].T
+    z = fast @ (_subtract_fit(fitter, fit, series) @ W)
+    M = z.T @ z / len(fast)
+    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
+        carried = fast @ operator
+        noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
+        # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
+        taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
+        left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
+        along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
+        M -= left * np.outer(along, along)
+    return M, W
+
+
 def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
     """Return the series with the movement from epoch to epoch as a random movement of each epoch.
 
-    It is measured by the mean power of the fast half-waves of the fit's misfit, without the
-    thermometers' share; the slow ones are the mount's.
+    It is measured by the fast half-waves of the fit's misfit; the slow ones are the mount's.
     """
     out = []
     for s, e in enumerate(fitter.series):
-        W = find_combinations([e])
-        fast = waves(e.times, len(e.times) - 1)[:, _count_waves(e) :].T
-        z = fast @ (_subtract_fit(fitter, fit, s) @ W)
-        M = z.T @ z / len(fast)  # the unit matrix if there is image noise only
-        for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, s):
-            carried = fast @ operator
-            noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
-            # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
-            taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
-            left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
-            along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
-            M -= left * np.outer(along, along)
+        M, W = _measure_fast(fitter, fit, s)
         edge = (1.0 + np.sqrt(len(M) / (len(e.times) - _count_waves(e)))) ** 2
         factors, U = np.linalg.eigh(M)
         clear = factors > criteria.BEYOND * edge  # more than so few half-waves show by chance
@@ -361,6 +377,23 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries]:
         D = np.column_stack([D, W[:, more] * np.sqrt(rest[more] - 1.0)])
         out.append(replace(e, tremble=D) if D.shape[1] else e)
     return out
+
+
+def leaves_kinks(fitter: HypothesisFitter, fit: Fit) -> bool:
+    """Test whether the fast half-waves of a misfit are far larger than its jumps.
+
+    A mount that trembles or walks jumps from epoch to epoch. A misfit that is smooth but for kinks,
+    as that of a thermometer that lags, is no movement of a mount, however large a tremble would
+    explain it.
+    """
+    for s, e in enumerate(fitter.series):
+        if (jumps := _list_jumps(e)) is not None:
+            usual = jumps.T @ jumps / len(jumps) / comb(2 * _FAST, _FAST) + np.eye(jumps.shape[1])
+            root = symmetric_power(usual, -0.5, 1.0)
+            power = root @ _measure_fast(fitter, fit, s)[0] @ root
+            if np.linalg.eigvalsh(power)[-1] > criteria.KINKED:
+                return True
+    return False
 
 
 def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:

@@ -303,6 +303,11 @@ class Adequacy:
     misfit_px: float
 
     @property
+    def movement(self) -> Array:
+        """The misfit as a movement (E, P) in px-scaled columns."""
+        return np.asarray(self.trajectories.T @ self.amplitudes)
+
+    @property
     def adequate(self) -> bool:
         """Whether the misfit is insignificant or negligible."""
         return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX

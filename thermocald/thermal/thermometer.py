@@ -153,8 +153,8 @@ def find_passages(times: Array, readings: Array, resolution: float | None) -> Pa
     rows = np.flatnonzero(np.isfinite(readings) & np.isfinite(times))
     y, t = readings[rows], times[rows]
     first = np.flatnonzero(np.diff(y, prepend=np.inf) != 0.0)
-    if len(first) < 3 or len(y) < _STEADY * len(first):
-        return None
+    if step <= 0.0 or len(first) < 3 or len(y) < _STEADY * len(first):
+        return None  # without a step, values that are held are noise
     from scipy.interpolate import PchipInterpolator
 
     size = np.diff(first, append=len(y))
@@ -301,7 +301,7 @@ def smooth_channel(
     if noises is None:
         noise = estimate_reading_noise(times, readings, resolution)
     else:
-        noise = float(np.median(noises[own]))
+        noise = float(np.nanmedian(noises[own]))
     valid = np.isfinite(readings)
     t, y = times[own], readings[own]
     there = np.isfinite(y)

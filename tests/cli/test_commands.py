@@ -42,7 +42,7 @@ def test_a_store_below_proc_is_not_sound(tmp_path):
     assert "store.path: /proc/self/t.db: nothing can be stored there" in said
 
 
-def test_export_of_several_series_names_the_option(world, tmp_path):
+def test_a_store_of_two_series_tells_them_and_their_fields_apart(world, tmp_path):
     other, store = shutil.copytree(world / "short", tmp_path / "M2"), tmp_path / "t.db"
     head = (other / "recording.yaml").read_text()
     (other / "recording.yaml").write_text(head.replace("series: M1", "series: M2"))
@@ -52,6 +52,10 @@ def test_export_of_several_series_names_the_option(world, tmp_path):
     assert "several series fit" in said
     assert "export selects one with --series CAMERA/SERIES" in said
     finish("export", store, "--series", "M2")
+    field = (other / "testfield.csv").read_text()
+    X = next(row.split(",")[1] for row in field.splitlines()[1:])
+    (other / "testfield.csv").write_text(field.replace(f",{X},", f",{float(X) + 1.0},", 1))
+    assert "M2 with another test field; use" in refuse("replay", other, "--store", store, status=1)
     assert "stored epochs are not adj" in refuse("export", store, "--series", "M2", "--free", "c")
 
 

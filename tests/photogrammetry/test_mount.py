@@ -19,18 +19,18 @@ from thermocald.photogrammetry.series.variance_components import components
 
 def simulate(
     rng, field: TestField, epochs: int, px: float = 0.0, memory: float = 0.0, grows: float = 0.0,
-    warm_px: float = 8.0, off: float = np.inf, knocked: int = 10**9,
+    warm_px: float = 8.0, on: float = 0.0, off: float = np.inf, knocked: int = 10**9,
     touched: float | tuple[float, ...] = 0.0, first: int = 30, brief: int = 1,
 ):  # fmt: skip
     """Return observations and true values (E, 16) of a camera that warms up on a moving mount.
 
     px, memory: the mount's tremble in the image, and the correlation of neighbouring epochs; grows:
     by how much the noise in the middle is larger than at both ends, where it is 0.4 of the usual;
-    off: epoch from which it cools; knocked: first epoch after a knock of 0.3 px; touched, first,
+    on, off: epochs from which it warms and cools; knocked: first epoch after a knock of 0.3 px; touched, first,
     brief: shift of the image, from which epoch on, and for how many.
     """
     after = np.maximum(np.arange(epochs) - off, 0.0)
-    warmed = 1 - np.exp(-np.minimum(np.arange(epochs), off) / 25)
+    warmed = 1 - np.exp(-np.clip(np.arange(epochs) - on, 0.0, off - on) / 25)
     truth = scene.warming_up(warm_px * warmed * np.exp(-after / 25))
     at = linearise(scene.SENSOR, field, scene.TRUTH[:10], scene.TRUTH[10:])
     per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
@@ -186,6 +186,16 @@ def test_an_uneven_touch_is_uncertain_also_at_the_ends(touched, first):
         z = scene.ratios(r, truth, PRINCIPAL_POINT)
         assert np.abs(z[rows]).max() < 3.0
         assert rms(np.delete(z, rows, axis=0)) < 1.2
+
+
+@pytest.mark.parametrize("on", [1.0, 2.0, 2.5, 3.0])
+def test_a_camera_that_begins_to_warm_up_was_not_touched(on):
+    """Regression: its first epochs seemed displaced from the steep course of the later ones."""
+    for seed in range(3):
+        rng = np.random.default_rng([52, seed])
+        grid, _ = simulate(rng, FIELD, 60, warm_px=30.0, on=on)
+        r = scene.adjusted_series(FIELD, grid, exterior="auto")
+        assert r.movement.touched == r.movement.jumps == ()
 
 
 def test_the_variance_of_a_line_through_a_swaying_mount_is_true():

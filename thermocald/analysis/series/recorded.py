@@ -189,10 +189,13 @@ def _open_series(store: Store, recording: Recording, settings: AdjustmentSetting
         return store.create_series(
             recording.head, recording.testfield, settings=wanted, created_utc=time.time()
         )
-    if series.head != recording.head or series.testfield.names != recording.testfield.names:
+    ours, field = series.testfield, recording.testfield
+    same_field = ours.names == field.names and np.array_equal(ours.points, field.points)
+    if series.head != recording.head or not same_field:
+        of = "of another recording" if same_field else "with another test field"
         raise DataError(
-            f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
-            "use another store, or change `series` in recording.yaml"
+            f"{store.path}: holds a series {series.camera}/{series.name} {of}; use another store, "
+            "or change `series` in recording.yaml"
         )
     if series.settings.get("free") != wanted["free"]:
         raise UsageError(

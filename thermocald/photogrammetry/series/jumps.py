@@ -167,8 +167,8 @@ def _is_abrupt(change: Array) -> Mask:
     abrupt = np.pad(inner, ((1, 1), (0, 0)))
     # near an end it must exceed the next ones, as a camera that begins to warm up is slower there
     for near, found in ((size, abrupt), (size[::-1], abrupt[::-1])):
-        inwards = np.maximum(near[1 : _SEEN + 2], near[2 : _SEEN + 3])
-        found[: _SEEN + 1] = near[: _SEEN + 1] > (1.0 + _ABRUPT) * inwards
+        for k in range(_SEEN + 1):
+            found[k] = near[k] > (1.0 + _ABRUPT) * near[k + 1 : k + 1 + SIDE].max(axis=0)
     return abrupt
 
 

@@ -26,8 +26,8 @@ def simulate(
 
     px, memory: the mount's tremble in the image, and the correlation of neighbouring epochs; grows:
     by how much the noise in the middle is larger than at both ends, where it is 0.4 of the usual;
-    on, off: epochs from which it warms and cools; knocked: first epoch after a knock of 0.3 px; touched, first,
-    brief: shift of the image, from which epoch on, and for how many.
+    on, off: epochs from which it warms and cools; knocked: first epoch after a knock of 0.3 px;
+    touched, first, brief: shift of the image, from which epoch on, and for how many.
     """
     after = np.maximum(np.arange(epochs) - off, 0.0)
     warmed = 1 - np.exp(-np.clip(np.arange(epochs) - on, 0.0, off - on) / 25)

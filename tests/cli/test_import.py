@@ -134,7 +134,7 @@ def stop_the_clock(folder):
     ("change", "more", "reason"),
     [
         (None, "", "has no time zone: give it with --timezone"),
-        (None, "--timezone Europe/Berlin --camera-clock +05:00:00", "5.0 h apart"),
+        (None, "--timezone Europe/Berlin --camera-clock +05:00:00", "5 h apart"),
         (None, "--timezone Mars", "time zone 'Mars'"),
         (None, "--timezone UTC --pixel-pitch 0.002 --unit R", "--unit R"),
         (None, "--timezone UTC --temperature-column T", "there is no column 'T'"),

@@ -96,7 +96,7 @@ def test_without_a_daemon_it_is_checked_taken_interrupted_resumed_and_archived(c
     daemon.kill()
     had = count(daemon, "M7")
     told = daemon.command(*COLD, "--epochs", "5").said()
-    assert f"has {had} epochs; {5 - had} are still to be taken" in told
+    assert f"; {5 - had} of 5 remain to be taken" in told
     assert "48 targets" in told
     recording = read_recording(daemon.folder / "phone-1-M7")
     assert [epoch.number for epoch in recording.epochs] == list(range(1, 6))

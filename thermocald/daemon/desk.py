@@ -29,7 +29,7 @@ from thermocald.errors import (
     UsageError,
 )
 from thermocald.files import read_yaml
-from thermocald.numbers import percent, with_sd
+from thermocald.numbers import counted, percent, with_sd
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -62,7 +62,8 @@ def take_on_the_desk(
     if done >= epochs:
         return
     if done:
-        say(f"series {session.series} has {done} epochs; {epochs - done} are still to be taken")
+        taken, left = counted(done, "epoch"), epochs - done
+        say(f"series {session.series} has {taken}; {left} of {epochs} remain to be taken")
     set_up_logging("warning")
     # the session's devices alone; the camera has no other series to return to
     own = next(c for c in config.cameras if c.name == session.camera)

@@ -320,8 +320,8 @@ def images_of(given: Sequence[Path]) -> list[Path]:
         images += found
     if not images:
         raise UsageError("give at least one photograph")
-    if len(set(images)) < len(images):
-        raise UsageError("a photograph is given twice")
+    if twice := next((p for p in images if images.count(p) > 1), None):
+        raise UsageError(f"{twice} is given twice")
     return images
 
 

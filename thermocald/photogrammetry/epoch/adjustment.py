@@ -105,7 +105,8 @@ def weaknesses(
     """
     if correlation_bound is None:
         return []
-    sd = np.sqrt(covariance.diagonal())
+    variance = covariance.diagonal()  # negative by rounding where nothing determines a parameter
+    sd = np.sqrt(np.where(variance >= 0.0, variance, np.inf))
     reasons = uncertain(sensor, values, sd, free)
     if "c" in free and not _has_depth(points):
         _, axes, flat = plane_fit(points)

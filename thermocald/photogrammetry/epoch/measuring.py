@@ -18,6 +18,7 @@ import numpy as np
 
 from thermocald.arrays import floats
 from thermocald.errors import GeometryError, UsageError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
@@ -73,7 +74,9 @@ def resect(
     n, fewest = len(observations), _FEWEST - (start is not None)
     if n < fewest:
         return failed(
-            "too_few_targets", f"{n} control points; a pose needs at least {fewest}", observations
+            "too_few_targets",
+            f"{counted(n, 'control point')}; a pose needs at least {fewest}",
+            observations,
         )
     points = control.points[observations.targets]
     extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)

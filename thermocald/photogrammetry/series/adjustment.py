@@ -313,7 +313,7 @@ def result(
         judge_epochs(series, estimate, covariance, unit, pooled, sigma0, redundancy),
         level_covariance=level,
         excess_sd=np.sqrt(excess),
-        trend_sd=np.sqrt(np.diag(trend)),
+        trend_sd=np.sqrt(np.diag(trend).clip(0.0)),
         perspective_sd=np.sqrt(pooled) * perspective_cofactor_roots(system),
         field_ratio=float(np.sqrt(series.field_variance)),
         outer_noise=_outer_noise(series, estimate),

@@ -144,7 +144,7 @@ def image_px(covariance: Array, A: Array) -> float:
     RMS over targets, per coordinate.
     """
     E = A[..., EOP]
-    return float(np.sqrt(np.einsum("tki,ij,tkj->tk", E, covariance, E).mean()))
+    return float(np.sqrt(max(np.einsum("tki,ij,tkj->tk", E, covariance, E).mean(), 0.0)))
 
 
 FEWEST_EPOCHS = 20

@@ -27,7 +27,7 @@ import numpy as np
 
 from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
 from thermocald.names import file_name
-from thermocald.numbers import counted
+from thermocald.numbers import counted, short_duration
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.photogrammetry.field.testfield import TestField
@@ -389,7 +389,7 @@ def _pair(placed: Sequence[Photograph], times: Array, logged: TemperatureLog) ->
     if (gap := max(times[0] - log[-1], log[0] - times[-1])) > 0:
         raise DataError(
             f"photographs ({iso(times[0])} to {iso(times[-1])}) and log ({iso(log[0])} to "
-            f"{iso(log[-1])}) are {gap / 3600:.1f} h apart: is a time zone wrong "
+            f"{iso(log[-1])}) are {short_duration(gap)} apart: is a time zone wrong "
             "(--camera-timezone, --log-timezone), or a clock (--camera-clock, --log-clock)"
             + (", or are years written with two digits?" if gap > 3e7 else "?")
         )
@@ -430,8 +430,8 @@ def _camera_of(
     if pitch is None:
         pitch = photograph.pixel_pitch
         unknown = (
-            "the pixel pitch is unknown, as EXIF does not give it: set --pixel-pitch 0.00112 (mm), "
-            "or --camera FILE"
+            "the pixel pitch is unknown, as EXIF does not give it: set --pixel-pitch (mm; "
+            "0.00112 for a Raspberry Pi camera v2.1) or --camera FILE"
         )
         if pitch is None and not dry_run:
             raise UsageError(unknown)

@@ -64,8 +64,9 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _ZONE_LINE = re.compile(r"(?:time|zeit)\s*zone\W*([a-z]{3,4}[^a-z]*|[a-z]+/[\w/]+)$", re.IGNORECASE)
-_UNCLEAR = re.compile(r"(?<![^\W_])(?:[A-Z]{1,2}[SD]T|MSK|МСК|HKT|SGT)(?![^\W_])")
 """A line above the table that states the time zone; cities behind it may have summer time."""
+_UNCLEAR = re.compile(r"(?<![^\W_])(?:[A-Z]{1,2}[SD]T|MSK|МСК|HKT|SGT)(?![^\W_])")
+"""Letters that several time zones share, or that this program does not know."""
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
 """Lines above a table that state °F."""

@@ -245,7 +245,7 @@ class DeviceConfig(Section):
     name: Name
     """The device's name, unique in its list; letters, digits, _ . -."""
     driver: Annotated[str, Field(min_length=1)]
-    """An installed [driver](drivers.md)."""
+    """The name of an installed driver (entry point)."""
     driver_options: dict[str, Any] = Field(default_factory=dict, alias="options")
     """Options of the driver that have the name of a key of this section."""
 

@@ -148,10 +148,13 @@ def _print_usage_error(error: Any) -> int:
     if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
         return int(error.exit_code)
-    if hasattr(error.__cause__, "errors"):  # pydantic's, of a value that is no number
-        from thermocald.config import in_words
+    if getattr(error, "param", None) and error.message:  # not of a value that is missing
+        option, cause = max(error.param.opts, key=len), error.__cause__
+        message = f"{option}: {error.message}"
+        if hasattr(cause, "errors"):  # pydantic's, of a value that is no number
+            from thermocald.config import in_words
 
-        message = in_words(max(error.param.opts, key=len), error.__cause__)
+            message = in_words(option, cause)
     message = message[0].lower() + message[1:]
     text = f"{' '.join(message.split()).rstrip('.')}; see '{command} --help'"
     say(f"error: {text.replace('?; see', '? See')}")  # Did you mean …?

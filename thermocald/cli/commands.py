@@ -152,8 +152,10 @@ class Command(TyperCommand):
             p.name: p.metavar if p.param_type_name == "argument" else max(p.opts, key=len)
             for p in self.params
         }
+        # Typer below 0.22 makes them paths later
+        types = {p.name: getattr(getattr(p, "type", None), "name", "") for p in self.params}
         values = [
-            (name, value)
+            (name, Path(value) if value and types.get(name) == "path" else value)
             for name, given in ctx.params.items()
             for value in (given if isinstance(given, tuple | list) else (given,))
         ]
@@ -192,9 +194,8 @@ def _check_outputs(command: str, options: dict[str, Any], values: list[tuple[str
     """
     kinds = {name: _OUTPUTS.get(f"{command} {name}", _OUTPUTS.get(name)) for name in options}
     taken: dict[str, str] = {}
-    for name, given in sorted(
-        values, key=lambda value: kinds[value[0]] is not None
-    ):  # inputs first
+    inputs_first = sorted(values, key=lambda value: kinds[value[0]] is not None)
+    for name, given in inputs_first:
         kind, option = kinds[name], options[name]
         if kind is None:
             if isinstance(given, Path):

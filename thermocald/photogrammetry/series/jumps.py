@@ -38,6 +38,7 @@ SIDE = 8  # epochs before and after a gap that give its step
 _WINDOW = SIDE + 2  # epochs before and after a change that show what happened
 _BRIEF = SIDE - 1  # most epochs for which a mount is touched
 _MOST = 8  # jumps examined
+_MOST_TOUCHED = 2 * _BRIEF  # epochs, or an eighth of them
 _ABRUPT = 0.5  # of the larger change next to it, by which a jump differs from both
 _LOOSE = 9.0  # times the square of the image's change: variance of a step in any direction
 _EXCLUDED = 29.0  # χ² with 6 degrees of freedom by which the perspective must exclude a step
@@ -72,7 +73,8 @@ def find_jumps(
     change = _without_drift(np.diff(left, axis=0)) / pair
     noise = pair * np.maximum(mad_sd(change, axis=0), 1.0)
     touches: dict[int, tuple[Array, float]] = {}
-    examined = {*gaps}
+    examined, untouched = {*gaps}, (left.copy(), dict(jumps))
+    all_M, all_g, M, g = M, g, M.copy(), g.copy()
     while len(examined) < _MOST + len(gaps):
         every = np.diff(left, axis=0)
         size = np.where(_is_abrupt(every), np.abs(_without_drift(every)) / noise, 0.0)
@@ -95,6 +97,9 @@ def find_jumps(
             left[row:] -= step
             if jump := _find_mover(row, step, variance, M, g):
                 jumps[row] = jump
+    if len(touches) > max(_MOST_TOUCHED, len(left) // 8):
+        return *untouched, hidden, {}  # a few epochs that hardly differ seem to show the noise
+    all_M[:], all_g[:] = M, g
     return left, dict(sorted(jumps.items())), hidden, touches
 
 

@@ -152,7 +152,7 @@ class Command(TyperCommand):
             p.name: p.metavar if p.param_type_name == "argument" else max(p.opts, key=len)
             for p in self.params
         }
-        # Typer below 0.22 makes them paths later
+        # older versions of Typer make them paths later
         types = {p.name: getattr(getattr(p, "type", None), "name", "") for p in self.params}
         values = [
             (name, Path(value) if value and types.get(name) == "path" else value)

@@ -181,7 +181,7 @@ def _searches(
     for border in (1, 2) if wide_too else (1,):
         yield from ((border, scale, view) for scale, view in views)
     if wide_too:  # noise and a JPEG's blocks leave only inner outlines of wide borders
-        yield 2, 1, cv2.GaussianBlur(grey, (0, 0), 2.0)  # type: ignore[misc]
+        yield 2, 1, np.asarray(cv2.GaussianBlur(grey, (0, 0), 2.0), dtype=np.uint8)
 
 
 def detect_markers(

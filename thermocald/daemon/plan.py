@@ -210,12 +210,10 @@ def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]
 
     channels: those that the configuration names; their order does not matter.
     """
-    mine, field = plan.testfield, series.testfield
+    mine = plan.testfield
     had = series.head.channels
     what = ""
-    if mine is not None and not (
-        mine.names == field.names and np.array_equal(mine.points, field.points)
-    ):
+    if mine is not None and not mine.same_targets(series.testfield):
         what = "test field"
     elif new := [name for name in channels if name not in had]:
         what = f"thermometers ({', '.join(had) or 'none'}, not {', '.join(new)})"

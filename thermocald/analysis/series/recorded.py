@@ -189,8 +189,7 @@ def _open_series(store: Store, recording: Recording, settings: AdjustmentSetting
         return store.create_series(
             recording.head, recording.testfield, settings=wanted, created_utc=time.time()
         )
-    ours, field = series.testfield, recording.testfield
-    same_field = ours.names == field.names and np.array_equal(ours.points, field.points)
+    same_field = series.testfield.same_targets(recording.testfield)
     if series.head != recording.head or not same_field:
         of = "of another recording" if same_field else "with another test field"
         raise DataError(

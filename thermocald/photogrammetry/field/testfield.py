@@ -77,6 +77,10 @@ class TestField:
     def __repr__(self) -> str:
         return f"<TestField: {len(self)} targets>"
 
+    def same_targets(self, other: TestField) -> bool:
+        """Return whether another test field has the same targets at the same places."""
+        return self.names == other.names and np.array_equal(self.points, other.points)
+
     @classmethod
     def build(
         cls,

@@ -19,7 +19,7 @@ from thermocald.errors import ConfigurationError, RecordingError
 from thermocald.hal import load_driver, open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.field.testfield import TestField, same_targets
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import open_recording
@@ -213,7 +213,7 @@ def check_series(plan: CameraPlan, series: StoredSeries, channels: Iterable[str]
     mine = plan.testfield
     had = series.head.channels
     what = ""
-    if mine is not None and not mine.same_targets(series.testfield):
+    if mine is not None and not same_targets(mine, series.testfield):
         what = "test field"
     elif new := [name for name in channels if name not in had]:
         what = f"thermometers ({', '.join(had) or 'none'}, not {', '.join(new)})"

@@ -21,6 +21,7 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, project
 from thermocald.photogrammetry.epoch.adjustment import with_few_free
+from thermocald.photogrammetry.field.testfield import same_targets
 from thermocald.photogrammetry.linalg import median_known
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.normals import ObservationGrid
@@ -189,7 +190,7 @@ def _open_series(store: Store, recording: Recording, settings: AdjustmentSetting
         return store.create_series(
             recording.head, recording.testfield, settings=wanted, created_utc=time.time()
         )
-    same_field = series.testfield.same_targets(recording.testfield)
+    same_field = same_targets(series.testfield, recording.testfield)
     if series.head != recording.head or not same_field:
         of = "of another recording" if same_field else "with another test field"
         raise DataError(

@@ -77,10 +77,6 @@ class TestField:
     def __repr__(self) -> str:
         return f"<TestField: {len(self)} targets>"
 
-    def same_targets(self, other: TestField) -> bool:
-        """Return whether another test field has the same targets at the same places."""
-        return self.names == other.names and np.array_equal(self.points, other.points)
-
     @classmethod
     def build(
         cls,
@@ -154,6 +150,11 @@ class TestField:
             tuple(column[i] for i in r) for column in (self.names, self.kinds, self.codes)
         )
         return TestField(names, self.points[r], self.sigmas[r], self.diameters[r], kinds, codes)
+
+
+def same_targets(one: TestField, other: TestField) -> bool:
+    """Return whether two test fields have the same targets at the same places."""
+    return one.names == other.names and np.array_equal(one.points, other.points)
 
 
 @dataclass(frozen=True, slots=True)

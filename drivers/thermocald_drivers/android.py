@@ -8,7 +8,7 @@
         folder: /sdcard/DCIM/Camera
         width: 4032
         height: 3024
-        delete: true                  # delete the photograph on the phone after its transfer
+        delete: true                  # delete each photograph on the phone after its transfer
         refuse_unlocked: null         # null: focus, focal length, zoom; true: exposure too; false
         minimum_free_mb: 200          # less free storage is an error
         timeout_s: 15
@@ -26,8 +26,8 @@ The driver wakes and unlocks the phone (but enters no PIN), opens the camera app
 open, since a restart would focus again. A photograph is the single new JPEG in the folder; it is
 accepted when its size no longer changes, all bytes were received and it is complete (a vendor's
 data or a video may follow it). Its time is the EXIF time, corrected by the phone's clock offset as
-measured after each photograph; without one, the time of the trigger. A photograph that was taken
-more than 5 s before the trigger is rejected.
+measured after each photograph; without one, or with one that is later than the complete file, the
+time of the trigger. A photograph that was taken more than 5 s before the trigger is rejected.
 Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 """
 
@@ -146,11 +146,13 @@ class AndroidCamera(AdbPhone, Camera):
         self.shell(self.command)
         triggered = (triggered + time.time()) / 2.0
         path, jpeg, image = self._new_photograph(set(before))
-        tags = exif(jpeg) | focus_state(self.shell("dumpsys media.camera"))
-        self._require_lock(tags)
-        start = self._exposure_start(tags, triggered)
+        stored = time.time()
         if self.options.delete:
             self.shell(f"rm -f {quote(path)}")
+        self._require_size(image)
+        tags = exif(jpeg) | focus_state(self.shell("dumpsys media.camera"))
+        self._require_lock(tags)
+        start = self._exposure_start(tags, triggered, stored)
         middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         return Frame(
@@ -193,6 +195,7 @@ class AndroidCamera(AdbPhone, Camera):
         """Wait for the one new photograph to be complete; return its (path, bytes, image)."""
         o, deadline = self.options, time.monotonic() + self.options.timeout_s
         problem: DeviceError | None = None
+        found: tuple[str, bytes, support.Grey] | None = None
         last_size = -1
         while time.monotonic() < deadline:
             # an app hides a file until it is complete
@@ -216,18 +219,15 @@ class AndroidCamera(AdbPhone, Camera):
                 try:
                     image = support.decode_jpeg(jpeg)
                 except BadReading as error:
+                    found = None
                     problem = BadReading(f"{self.where}: partial photograph, {name}: {error}")
                     continue
-                height, width = image.shape
-                if (width, height) == (o.width, o.height):
-                    return f"{self.folder}/{name}", jpeg, image
-                # an app may replace its preview yet; after a good one, its size may be set back
-                problem = (BadReading if self._first else WrongDevice)(
-                    f"{self.where}: the photograph has {width}×{height} px, not "
-                    f"{o.width}×{o.height}; set the camera app to its full size, and do not turn "
-                    "the phone"
-                )
+                found = f"{self.folder}/{name}", jpeg, image
+                if image.shape == (o.height, o.width):
+                    return found
             time.sleep(POLL_S)
+        if found:  # of another size: an app may replace its preview until the end
+            return found
         if problem:
             raise problem
         if visible:
@@ -241,6 +241,15 @@ class AndroidCamera(AdbPhone, Camera):
             f"{self.where}: no new photograph in {self.folder} {self.options.timeout_s:g} s "
             "after the trigger; check that the camera app is open, and trigger: camera, volume, tap"
         )
+
+    def _require_size(self, image: support.Grey) -> None:
+        o, (height, width) = self.options, image.shape
+        if (width, height) != (o.width, o.height):
+            # after a good photograph, the size may be set back
+            raise (BadReading if self._first else WrongDevice)(
+                f"{self.where}: the photograph has {width}×{height} px, not {o.width}×{o.height}; "
+                "set the camera app to its full size, and do not turn the phone"
+            )
 
     def _require_lock(self, tags: dict[str, Any]) -> None:
         """Compare a photograph with the first; BadReading for a change that is refused."""
@@ -260,8 +269,11 @@ class AndroidCamera(AdbPhone, Camera):
                 "(refuse_unlocked: false accepts the change)"
             )
 
-    def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> float:
-        """Return the start of the exposure, s UTC on this machine's clock."""
+    def _exposure_start(self, tags: Mapping[str, Any], triggered: float, stored: float) -> float:
+        """Return the start of the exposure, s UTC on this machine's clock.
+
+        stored: when the photograph was complete; a later mark is not that of its exposure.
+        """
         offset, zone, uncertainty_s = self.clock_offset()  # the phone may set its clock at any time
         stated = exposure_start(tags, zone)
         if stated is None:
@@ -273,8 +285,8 @@ class AndroidCamera(AdbPhone, Camera):
                 f"{self.where}: the photograph was taken {triggered - start:.0f} s before the "
                 "trigger, and is that of an earlier one; the phone is slower than timeout_s"
             )
-        if abs(start - triggered) > CLOCKS_DIFFER_S:  # its zone or date is not the phone's
-            return triggered
+        if abs(start - triggered) > CLOCKS_DIFFER_S or start - uncertainty_s > stored:
+            return triggered  # its zone or date is not the phone's, or it is the file's
         spread_s = resolution_s + uncertainty_s
         if spread_s > COARSE_S:  # whole seconds: the trigger's time within them
             return min(max(triggered, start - uncertainty_s), start + spread_s)

@@ -20,12 +20,14 @@ drives the bus. `channel` names the temperature.
   have no identity: the driver checks the bits that a chip leaves at zero, in its limits as well
   (LM75B rev. 6.1, TMP75 SBOS288, TMP102 SBOS397H).
 * SHT3x: a single shot with high repeatability; each word has a CRC (SHT3x-DIS v6, 4.3 … 4.13).
-* BME280: a forced measurement; the chip warms itself and measures its board (BST-BME280-DS002 1.23,
-  4.2, 8.1).
+* BME280: a forced measurement without the filter; the chip warms itself and measures its board
+  (BST-BME280-DS002 1.23, 4.2, 8.1).
 
 MCP9808 and the LM75 family convert continuously. In shut-down they would repeat their last value
-forever, so the driver wakes them and waits for a conversion. Their power-up value (see `chips`) is
-read again after one conversion and then accepted only if a recent reading is within 5 K.
+forever, so the driver wakes them, sets the finest resolution and the highest rate (a TMP75 starts
+with 0.5 K, a TMP102 may convert every 4 s), and waits for a conversion. Their power-up value (see
+`chips`) is read again after one conversion and then accepted only if a recent reading is within
+5 K.
 """
 
 from __future__ import annotations
@@ -173,16 +175,22 @@ class _ConvertingThermometer(I2cThermometer):
 
     conversion_s: float
     TEMPERATURE, CONFIGURATION = 0x00, 0x01
-    SHUTDOWN = 1
+    shutdown, finest = 1, 0
+    """Bits of the configuration: shut-down; the finest resolution and the highest rate."""
 
     def _wake(self) -> None:
-        """Wake the chip from shut-down and wait for a conversion."""
-        configuration = self._read(self.CONFIGURATION, self.SHUTDOWN)
-        if not configuration & self.SHUTDOWN:
+        """End a shut-down or a coarser or slower mode, and wait for a conversion."""
+        old = self._read(self.CONFIGURATION, self.shutdown)
+        new = old & ~self.shutdown | self.finest
+        if old == new:
             return
-        self._write(self.CONFIGURATION, configuration & ~self.SHUTDOWN, self.SHUTDOWN)
-        if self._read(self.CONFIGURATION, self.SHUTDOWN) & self.SHUTDOWN:
-            raise BadReading(f"{self.where}: does not leave shut-down (locked registers?)")
+        for value in (new | self.shutdown, new):  # leaving shut-down starts a conversion
+            self._write(self.CONFIGURATION, value, self.shutdown)
+        got = self._read(self.CONFIGURATION, self.shutdown)
+        if (got ^ new) & (self.shutdown | self.finest):
+            raise BadReading(
+                f"{self.where}: does not leave shut-down or a coarse mode (locked registers?)"
+            )
         self._wait(self.conversion_s)
 
     def _measure(self) -> tuple[float, str]:
@@ -209,12 +217,13 @@ class Mcp9808Thermometer(_ConvertingThermometer):
     addresses = range(0x18, 0x20)
     range_c = (-40.0, 125.0)
     conversion_s = 0.25
-    TEMPERATURE, MANUFACTURER, DEVICE = 0x05, 0x06, 0x07
-    SHUTDOWN = 1 << 8
+    TEMPERATURE, MANUFACTURER, DEVICE, RESOLUTION = 0x05, 0x06, 0x07, 0x08
+    shutdown = 1 << 8
 
     def _identify(self) -> None:
         self._expect("the manufacturer", self._read(self.MANUFACTURER), 0x0054)
         self._expect("the device register", self._read(self.DEVICE) >> 8, 0x04)
+        self._write(self.RESOLUTION, 0b11, 0xFF)  # 0.0625 K, as at power-up
         self._wake()
 
     def _decode(self, word: int) -> float:
@@ -233,17 +242,18 @@ class Lm75Thermometer(_ConvertingThermometer):
     addresses = range(0x48, 0x50)
     range_c = (-55.0, 127.9375)
     LIMITS: ClassVar = {0x02: "the hysteresis", 0x03: "the limit"}
-    # bits of the temperature, bits of the limits, s per conversion
+    # bits of the temperature, bits of the limits, s per conversion, shut-down, finest
     VARIANTS: ClassVar = {
-        "lm75": (11, 9, 0.3),  # 9 bits; an LM75A or LM75B has 11, and 9 in its limits
-        "lm75b": (11, 11, 0.1),
-        "tmp75": (12, 12, 0.3),
-        "tmp102": (12, 12, 0.035),
+        "lm75": (11, 9, 0.3, 1, 0),  # 9 bits; an LM75A or LM75B has 11, and 9 in its limits
+        "lm75b": (11, 11, 0.1, 1, 0),
+        "tmp75": (12, 12, 0.3, 1, 0b11 << 5),  # 9 bits at power-up
+        "tmp102": (12, 12, 0.035, 1 << 8, 0b11 << 6),  # 8 Hz; 0.25 Hz would be 4 s old
     }
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.bits, self.limit_bits, self.conversion_s = self.VARIANTS[self.options.chip]
+        variant = self.VARIANTS[self.options.chip]
+        self.bits, self.limit_bits, self.conversion_s, self.shutdown, self.finest = variant
 
     def _identify(self) -> None:
         unused = (1 << (16 - self.limit_bits)) - 1
@@ -312,12 +322,14 @@ class Bme280Thermometer(I2cThermometer):
     chip = "BME280"
     addresses = (0x76, 0x77)
     range_c = (-40.0, 85.0)
-    CALIBRATION, IDENTITY = 0x88, 0xD0
+    CALIBRATION, IDENTITY, RESET = 0x88, 0xD0, 0xE0
     CONTROL_HUMIDITY, STATUS, CONTROL, DATA = 0xF2, 0xF3, 0xF4, 0xF7
     FORCED_X2_X1, MEASURING = 0b010 << 5 | 0b001 << 2 | 0b01, 1 << 3
 
     def _identify(self) -> None:
         self._expect("the identity", self._read(self.IDENTITY, 0xFF), 0x60)
+        self._write(self.RESET, 0xB6, 0xFF)  # an earlier program may have left the filter on
+        self._wait(0.01)
         self._calibration()
 
     def _calibration(self) -> tuple[int, ...]:

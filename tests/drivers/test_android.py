@@ -64,7 +64,9 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(bench, fake, offset):
 def test_without_fractions_or_in_another_zone_it_is_the_triggers(bench, fake):
     fake.shoot = shoot(subsecond=None)
     with bench.device() as device:
-        for fake.date in ("%.9f +0000", "%d.%%N +0000", "%.9f +0100"):
+        for fake.date in ("%.9f +0000", "%d.%%N +0000", "%.9f +0100", "%.9f +0000 late mark"):
+            if "mark" in fake.date:  # it is that of the file, 2 s after it was complete
+                fake.shoot = lambda fake: fake.add("IMG_2.jpg", photograph(fake.now() + 2.0))
             time.sleep((0.6 - time.time()) % 1)  # s that a whole second would be off
             called = time.time()
             assert called - 0.2 < device.capture().utc < time.time()
@@ -113,7 +115,7 @@ def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench,
 @pytest.mark.parametrize("refuse", [False, None, True])
 def test_exposure_that_moved_is_flagged_or_refused(bench, fake, refuse):
     fake.media_camera, fake.shoot = "", shoot(distance=None)
-    with bench.device(refuse_unlocked=refuse) as device:
+    with bench.device(refuse_unlocked=refuse, delete=True, timeout_s=0.3) as device:
         device.capture()
         assert any("cannot be checked" in w for w in device.warnings())  # the focus
         fake.shoot = shoot(iso=200)
@@ -123,6 +125,10 @@ def test_exposure_that_moved_is_flagged_or_refused(bench, fake, refuse):
         else:
             assert device.capture().settings["iso"] == 200.0
         assert any("refuse_unlocked" in w for w in device.warnings()) == (refuse is False)
+        fake.shoot = shoot(size=(48, 32))
+        with pytest.raises(errors.BadReading, match="48×32 px"):
+            device.capture()
+    assert not fake.files  # the refused ones are deleted too
 
 
 @THERMOMETER

@@ -72,14 +72,20 @@ def test_what_a_chip_holds_is_read_rightly_or_refused(bus, name, options, chip, 
             assert device.read().values == {"temperature": expected}
 
 
-def test_lm75_in_shut_down_is_woken(bus):
-    bus.chips[0x48] = chip = lm75(configuration=0x19)
-    with thermometer("lm75") as device:
-        chip.registers[1] = b"\x19"  # and again after a glitch on its supply
-        before = device.clock.monotonic()
+@pytest.mark.parametrize(
+    ("chip", "before", "after"),
+    [("lm75", b"\x19", b"\x18"),  # in shut-down
+     ("tmp75", b"\x00", b"\x60"),  # SBOS288: 9 bits, as at power-up
+     ("tmp102", b"\x60\x20", b"\x60\xe0"), ("tmp102", b"\x61\xa0", b"\x60\xe0")],  # 0.25 Hz
+)  # fmt: skip
+def test_a_mode_that_an_earlier_program_left_is_ended(bus, chip, before, after):
+    bus.chips[0x48] = one = lm75(configuration=before)
+    with thermometer("lm75", chip=chip) as device:
+        one.registers[1] = before  # and again after a glitch on its supply
+        begin = device.clock.monotonic()
         device.read()
-        assert chip.registers[1] == b"\x18"
-        assert device.clock.monotonic() - before >= 0.3
+        assert one.registers[1] == after
+        assert device.clock.monotonic() - begin >= device.conversion_s
 
 
 @pytest.mark.parametrize(
@@ -117,6 +123,7 @@ def test_a_chip_that_has_just_been_powered_is_read_again(bus, monkeypatch):
         # its first conversion ends while the driver waits
         monkeypatch.setattr(device, "_wait", lambda _: bus.chips[0x18].word(5, 0xC190))
         assert device.read().values == {"temperature": 25.0}
+    assert bus.chips[0x18].registers[8] == b"\x03"  # DS25095A 5.4: 0.0625 K
 
 
 def test_the_crc_is_that_of_the_data_sheet():

@@ -65,8 +65,8 @@ class Alert:
 class Measured:
     """A condition's value, NaN if the result does not have it, and its bounds.
 
-    back: distance inside a bound at which the value counts as back; step: added to a bound in
-    messages.
+    back: distance inside a bound at which the value counts as back; step: from a bound to the
+    threshold that was set.
     """
 
     value: float
@@ -119,15 +119,15 @@ class Drift(Condition):
         return f"drift_{self.drift}_{'sds' if self.px is None else 'px'}"
 
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
-        drift = _number(result.get(f"drift_{self.drift}_px"))
-        sd = _number(result.get(f"sd_drift_{self.drift}_px"))
+        drift = support.number_or_nan(result.get(f"drift_{self.drift}_px"))
+        sd = support.number_or_nan(result.get(f"sd_drift_{self.drift}_px"))
         start = "the start of the series"
         if self.from_mm is not None:
             start = f"{self.from_mm:g} mm"
-            pitch = _number(result.get("pixel_pitch"))
+            pitch = support.number_or_nan(result.get("pixel_pitch"))
             pitch = pitch if pitch > 0 else math.nan
-            drift = (_number(result.get(self.drift)) - self.from_mm) / pitch
-            sd = _number(result.get(f"sd_{self.drift}")) / pitch
+            drift = (support.number_or_nan(result.get(self.drift)) - self.from_mm) / pitch
+            sd = support.number_or_nan(result.get(f"sd_{self.drift}")) / pitch
         unit, value, high = " px", abs(drift), float(self.px or self.sds or math.nan)
         if self.px is None:
             unit, value = " sds", abs(drift) / sd if sd > 0 else math.nan
@@ -139,16 +139,15 @@ class Temperature(Condition):
     """A channel's temperature."""
 
     temperature: support.Text
-    above_c: support.Celsius | None = None
-    below_c: support.Celsius | None = None
+    above_c: support.Celsius = math.inf
+    below_c: support.Celsius = -math.inf
     hysteresis_k: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
 
     @model_validator(mode="after")
     def _something_between(self) -> Self:
-        low, high = self._limits
-        if math.isinf(low) and math.isinf(high):
+        if math.isinf(self.above_c) and math.isinf(self.below_c):
             raise ConfigurationError(f"temperature {self.temperature} needs above_c or below_c")
-        if high - low <= 2 * self.hysteresis_k:
+        if self.above_c - self.below_c <= 2 * self.hysteresis_k:
             raise ConfigurationError(
                 f"temperature {self.temperature}: above_c must exceed below_c by more than twice "
                 f"hysteresis_k ({2 * self.hysteresis_k:g} K)"
@@ -159,15 +158,10 @@ class Temperature(Condition):
     def name(self) -> str:
         return self.temperature
 
-    @property
-    def _limits(self) -> tuple[float, float]:
-        low, high = self.below_c, self.above_c
-        return -math.inf if low is None else low, math.inf if high is None else high
-
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
-        value = _number(result.get(self.temperature))
+        value = support.number_or_nan(result.get(self.temperature))
         words = f"{self.temperature} is {value:.1f} °C"
-        return Measured(value, *self._limits, self.hysteresis_k, words, " °C")
+        return Measured(value, self.below_c, self.above_c, self.hysteresis_k, words, " °C")
 
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -221,12 +215,6 @@ _KINDS: dict[str, type[Condition]] = {
     "drift": Drift, "temperature": Temperature, "no_result": NoResult, "lost": Lost,
     "free_disk_gb": FreeDisk,
 }  # fmt: skip
-
-
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return math.nan
-    return float(value)
 
 
 class AlertOptions(DriverOptions):
@@ -287,7 +275,7 @@ class AlertOutput(Output):
         self._last[device] = moment
         failed = 0 if result.get("status") in WITH_VALUES else self._in_a_row.get(device, 0) + 1
         self._in_a_row[device] = failed
-        utc = _number(result.get("frame_time"))
+        utc = support.number_or_nan(result.get("frame_time"))
         epoch = moment[1] if isinstance(moment[1], int) else None
         before, self._lost = self._lost, int(result.get("lost", self._lost))
         self._unstored = self._unstored + 1 if result.get("stored") is False else 0
@@ -304,8 +292,8 @@ class AlertOutput(Output):
             if out == was_out or not (out or low + found.back <= value <= high - found.back):
                 continue
             self._out ^= {key}
-            limit = high if value > high or math.isinf(low) else low
-            bound = f" (limit {limit + found.step:g}{found.unit})"
+            limit = (high if value > high or math.isinf(low) else low) + found.step
+            bound = f" (limit {limit:g}{found.unit})"
             text = found.words + (bound if out else ": within its limits again")
             one = Alert(
                 device, condition.name, "out" if out else "in", f"{device}: {text}", value, limit,

@@ -153,7 +153,7 @@ class AndroidCamera(AdbPhone, Camera):
         tags = exif(jpeg) | focus_state(self.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered, stored)
-        middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
+        middle = start + tags.get("exposure_s", 0.0) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         return Frame(
             image=image,
@@ -302,6 +302,9 @@ def exif(jpeg: bytes) -> dict[str, Any]:
             found = {name: _plain(base.get_ifd(EXIF_IFD).get(tag)) for tag, name in TAGS.items()}
     except (OSError, ValueError, SyntaxError) as error:
         raise BadReading(f"these {len(jpeg)} bytes are not a photograph") from error
+    exposure_s = found["exposure_s"]
+    if not (isinstance(exposure_s, float) and 0.0 < exposure_s < LATEST_S):  # damaged
+        found["exposure_s"] = None
     return {name: value for name, value in found.items() if value is not None}
 
 

@@ -128,10 +128,9 @@ class RelayOutput(HeatingOutput):
                 self.handle.off()
             super().close()
 
-    def measure(self, result: Mapping[str, Any]) -> float | None:
+    def measure(self, result: Mapping[str, Any]) -> float:
         self._stop_watchdog()
-        value = result.get(self.channel)
-        return float(value) if isinstance(value, int | float) else None
+        return support.number_or_nan(result.get(self.channel))
 
     def switch(self, heat: bool) -> None:
         with self._lock:

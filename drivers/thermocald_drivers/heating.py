@@ -107,19 +107,17 @@ class HeatingOutput(Output):
                 "again"
             )
 
-    def measure(self, result: Mapping[str, Any]) -> float | None:
-        """Return the temperature °C at an epoch; None if it is unknown."""
+    def measure(self, result: Mapping[str, Any]) -> float:
+        """Return the temperature °C at an epoch; NaN if it is unknown."""
         raise NotImplementedError
 
     def switch(self, heat: bool) -> None:
         """Switch the heating on or off."""
         raise NotImplementedError
 
-    def _decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
+    def _decide(self, elapsed_s: float, temperature_c: float) -> bool:
         """Return whether to heat now; set `tripped` (a sentence) when the limit is reached."""
         limit = self.options.limit_c
-        if temperature_c is None or not math.isfinite(temperature_c):
-            temperature_c = math.nan
         if temperature_c >= limit:
             self.tripped = f"{self.channel} {temperature_c:.2f} °C reached the limit {limit:g} °C"
         steps = self.options.programme
@@ -127,7 +125,7 @@ class HeatingOutput(Output):
         hold_c = next(
             (s.hold_c for s, end in zip(steps, ends, strict=True) if elapsed_s < end), None
         )
-        if known := not math.isnan(temperature_c):
+        if known := math.isfinite(temperature_c):
             self._known_at = elapsed_s
         self._unknown = 0 if known else self._unknown + 1
         half = self.options.hysteresis_k / 2
@@ -167,9 +165,9 @@ class AndroidLoadOutput(AdbPhone, HeatingOutput):
             self.switch(False)
         super().close()
 
-    def measure(self, result: Mapping[str, Any]) -> float | None:  # noqa: ARG002 - asks the phone
-        found = battery(self.shell("dumpsys battery"))
-        return None if found is None else found[0] * found[1]
+    def measure(self, result: Mapping[str, Any]) -> float:  # noqa: ARG002 - asks the phone
+        number, scale = battery(self.shell("dumpsys battery")) or (math.nan, 1.0)
+        return number * scale
 
     def switch(self, heat: bool) -> None:
         """Stop the load, or renew it after half of its lease."""

@@ -333,6 +333,7 @@ class Bme280Thermometer(I2cThermometer):
         self._calibration()
 
     def _calibration(self) -> tuple[int, ...]:
+        """Return dig_T1 … dig_T3."""
         table = bytes(self.handle.read_i2c_block_data(self.address, self.CALIBRATION, 6))
         if table in (bytes(6), b"\xff" * 6):
             raise BadReading(f"{self.where}: the calibration registers are empty")
@@ -349,14 +350,9 @@ class Bme280Thermometer(I2cThermometer):
         if chips.is_idle_word("bme280", raw):
             raise BadReading(f"{self.where}: 0x{raw:05x}, the temperature was not measured")
         # read each time: the chip may have been exchanged between two readings
-        return bme280_celsius(raw, self._calibration()), ""
-
-
-def bme280_celsius(raw: int, calibration: tuple[int, ...]) -> float:
-    """Convert a raw temperature to °C; calibration: dig_T1 … dig_T3 (data sheet 8.1)."""
-    t1, t2, t3 = calibration
-    first = (raw / 16384.0 - t1 / 1024.0) * t2
-    return (first + (raw / 131072.0 - t1 / 8192.0) ** 2 * t3) / 5120.0
+        t1, t2, t3 = self._calibration()
+        first = (raw / 16384.0 - t1 / 1024.0) * t2  # data sheet 8.1
+        return (first + (raw / 131072.0 - t1 / 8192.0) ** 2 * t3) / 5120.0, ""
 
 
 def crc8(data: bytes) -> int:

@@ -128,7 +128,6 @@ class _KernelThermometer(support.CheckedThermometer):
         ]
 
     def open(self) -> None:
-        self.handle = None
         found = list(self.devices(self.sysfs))
         matches = [folder for folder, name, address in found if self.chip in (name, address)]
         where = f"{self.sysfs / self.folder}: {self.chip!r}"

@@ -60,9 +60,9 @@ def crc8(data: bytes) -> int:
 
 def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
     """Return (°C, scratchpad) of a `w1_slave` file; raises BadReading if it fails a check."""
-    if not content.strip():
+    if not content:
         raise BadReading(f"{where}: the file is empty: no answer, or one whose CRC failed")
-    match = _FILE.fullmatch(content.strip())
+    match = _FILE.fullmatch(content)
     if match is None:
         raise BadReading(f"{where}: {content!r} is not a w1_slave file")
     pad, milli = bytes.fromhex(match["pad"]), int(match["milli"])
@@ -182,9 +182,7 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         rom = self.sensors[channel]
         for _ in range(self.options.attempts):
             try:
-                content = (self.root / rom / "w1_slave").read_text(
-                    encoding="ascii", errors="replace"
-                )
+                content = support.read_line(self.root / rom / "w1_slave")
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
                 idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
                 return self.judge(channel, f"1-wire {rom}", value, idle)

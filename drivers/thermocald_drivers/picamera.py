@@ -288,15 +288,8 @@ def frame_settings(metadata: Mapping[str, Any]) -> dict[str, float]:
     gains = metadata.get("ColourGains")
     if isinstance(gains, tuple | list) and len(gains) == 2:
         found["colour_gain_red"], found["colour_gain_blue"] = map(float, gains)
-    if (celsius := sensor_temperature(metadata)) is not None:
+    celsius = support.number_or_nan(metadata.get("SensorTemperature"))
+    idle = chips.idle_celsius("imx708")  # its lower and upper limit, and 0
+    if min(idle) < celsius < max(idle) and celsius not in idle:
         found["sensor_temperature_c"] = celsius
     return found
-
-
-def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
-    """Return the sensor's °C; None if it is absent or an idle value."""
-    value = metadata.get("SensorTemperature")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    idle = chips.idle_celsius("imx708")  # its lower and upper limit, and 0
-    return float(value) if min(idle) < value < max(idle) and value not in idle else None

@@ -244,12 +244,9 @@ class SerialThermometer(support.CheckedThermometer):
                 raise DeviceTimeout(f"{self.where}: cannot send, flow control blocks it") from error
             # pyserial reports an unplug without an errno, or with EIO
             raise DeviceGone(f"{self.where}: unplugged ({error})") from error
-        there = [channel for channel in self.channels if match[channel] is not None]
-        if not there:
-            raise BadReading(f"{self.where}: {match.string!r} has no value")
         measures = {
             channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match))
-            for channel in there
+            for channel in self.channels
         }
         reading = self.reading(measures, start)
         if self.command:
@@ -351,7 +348,9 @@ class SerialThermometer(support.CheckedThermometer):
 
     def _celsius(self, channel: str, match: re.Match[str]) -> float:
         """Convert a printed number to °C; BadReading if it means that nothing was measured."""
-        text = match[channel]
+        text = match[channel] or ""
+        if not text:
+            raise BadReading(f"{self.where}, {channel}: {match.string!r} has no value of it")
         number = support.parse_number(text, comma=True)
         where = f"{self.where}, {channel}: {text}"
         if skipped := self._skipped(match, channel):
@@ -427,9 +426,8 @@ class SerialThermometer(support.CheckedThermometer):
 
 def _decodings(line: bytes) -> Iterator[str]:
     """Yield a line as text: UTF-8 if valid, then Latin-1, each also with every degree sign as °."""
-    with contextlib.suppress(UnicodeDecodeError):
-        text = line.decode("utf-8")
-        yield text
-        yield text.translate(DEGREES)
-    yield line.decode("latin-1")
-    yield line.decode("latin-1").translate(DEGREES)
+    for encoding in ("utf-8", "latin-1"):
+        with contextlib.suppress(UnicodeDecodeError):
+            text = line.decode(encoding)
+            yield text
+            yield text.translate(DEGREES)

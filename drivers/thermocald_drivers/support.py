@@ -187,10 +187,16 @@ def middle_reading(
     missing: Mapping[str, str] | None = None,
 ) -> Reading:
     """Return a reading whose time is midway between `start` (clock's monotonic, s) and now."""
-    now = time.monotonic()
-    half = (clock.monotonic() - start) / 2.0
-    monotonic, utc = on_clock(clock, now)
+    monotonic, utc = read_together(clock.monotonic, clock.utc)
+    half = (monotonic - start) / 2.0
     return Reading(dict(values), monotonic - half, utc - half, missing or {})
+
+
+def number_or_nan(value: object) -> float:
+    """Return a value of a result as a float, NaN if it is no number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    return float(value)
 
 
 def read_line(path: Path) -> str:

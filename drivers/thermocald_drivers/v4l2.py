@@ -131,7 +131,6 @@ class V4l2Camera(Camera):
         self._wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
         self._held: dict[int, int] = {}  # also while it is closed and opened again
         self._asked: dict[int, int] = {}
-        self._automatic: list[Lock] = []
         self._available: dict[int, Control] = {}
 
     @classmethod
@@ -278,7 +277,7 @@ class V4l2Camera(Camera):
         Raises WrongDevice for a setting that the camera does not have or hold.
         """
         self._available = self.handle.controls()
-        self._asked, self._automatic = {}, []
+        self._asked = {}
         locked = self._collect()
         for control, value in self._asked.items():
             self._set(control, value, locked)
@@ -291,7 +290,7 @@ class V4l2Camera(Camera):
             raise WrongDevice(f"{self.where}: {'; '.join(problems)}")
 
     def _collect(self) -> set[int]:
-        """Fill `_asked` and `_automatic`; return the controls that the stanza does not set."""
+        """Fill `_asked`; return the controls that the stanza does not set."""
         locked = set()
         for lock in LOCKS:
             wanted = self._wanted[lock.option]
@@ -328,7 +327,6 @@ class V4l2Camera(Camera):
     def _ask_automatic(self, lock: Lock) -> None:
         if lock.automatic not in self._available:
             raise WrongDevice(f"{self.where}: {lock.option}: auto, but it has no automatic mode")
-        self._automatic.append(lock)
         if self.handle.get(lock.automatic) != lock.manual:
             return
         for value in lock.automatic_values:
@@ -368,7 +366,8 @@ class V4l2Camera(Camera):
 
     def _values(self) -> dict[int, int]:
         """Return the current values of all locked and automatic settings."""
-        automatic = [c for lock in self._automatic for c in (lock.automatic, lock.control)]
+        free = (lock for lock in LOCKS if self._wanted[lock.option] == AUTO)
+        automatic = [control for lock in free for control in (lock.automatic, lock.control)]
         watched = [*self._asked, *(c for c in automatic if c in self._available)]
         return {control: self.handle.get(control) for control in dict.fromkeys(watched)}
 

@@ -204,6 +204,8 @@ def test_the_instant_of_a_photograph_and_its_zone():
     assert exposure_start(exif(photograph(WHEN, subsecond=None)), "")[1] == 1.0
     assert exposure_start({"time": "0000:00:00 00:00:00"}, "") is None
     assert exposure_start({}, "") is None
+    for damaged in (0.0, -0.02, 1e9, "1/60"):
+        assert "exposure_s" not in exif(photograph(WHEN, exposure=damaged))
     for data in (b"", b"\xff\xd8\xff\xd9", b"GIF89a"):
         with pytest.raises(errors.BadReading, match="not a photograph"):
             exif(data)

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from thermocald_drivers.picamera import Picamera2Camera, sensor_temperature
+from thermocald_drivers.picamera import Picamera2Camera, frame_settings
 
 DRIVER = ("camera", "picamera2")
 
@@ -69,10 +69,11 @@ def test_the_temperature_of_the_sensor_is_stored_once_it_was_measured(bench, fak
             stored.append(device.capture().settings.get("sensor_temperature_c"))
     assert stored == [None, 31.0]
     lines = (shared / "data/libcamera/picamera2_metadata_real.jsonl").read_text().splitlines()
-    believed = [sensor_temperature(json.loads(line)) for line in lines]
+    believed = [frame_settings(json.loads(line)).get("sensor_temperature_c") for line in lines]
     # imx219 ×2: none; imx708: −20.0 (clamp), 65, 45; imx477: 0.0 (stuck), 29, none; ov5647: none
     assert believed == [None, None, None, 65.0, 45.0, None, 29.0, None, None]
     unknown = (-20.0, 80.0, 255.0, float("nan"), 1e300, "29.0", True, None)
     for value in (29.0, -3.0, *unknown):
         expected = None if value in unknown else value
-        assert sensor_temperature({"SensorTemperature": value}) == expected, value
+        found = frame_settings({"SensorTemperature": value})
+        assert found.get("sensor_temperature_c") == expected, value

@@ -16,7 +16,7 @@ import psycopg
 from psycopg.rows import dict_row
 
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
-from tests.commands import succeed
+from tests.commands import refuse, succeed
 from tests.fleet.conftest import address, execute
 from thermocald.fleet.overview import _calibration, _sensors, fleet_lines, render_fleet
 from thermocald.store.recording.head import Channel
@@ -155,6 +155,9 @@ def test_a_clock_that_was_years_ahead_hides_nothing(server):
     )  # fmt: skip
     document = json.loads(run("fleet", place, "--json", "-"))
     assert 0 < document["cameras"][0]["lag_s"] < 600
+    assert "thermocald nobody: there is no such station" in refuse(
+        "fleet", f"{place}?station=nobody"
+    )
 
 
 # --- the server's summary is that of a scan of all epochs ----------------------------------

@@ -117,10 +117,6 @@ class Progress:
     sent: Mapping[str, int]
     refused: int
 
-    @property
-    def rows(self) -> int:
-        return sum(self.sent.values())
-
 
 @dataclass(eq=False)
 class Forwarder:
@@ -315,7 +311,8 @@ def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None
                 return
             continue
         if trouble:
-            log.info("%s can be reached again, %d rows sent", forwarder.address, progress.rows)
+            rows = sum(progress.sent.values())
+            log.info("%s can be reached again, %d rows sent", forwarder.address, rows)
         pause, trouble = _FIRST_PAUSE_S, ""
         if wait(_IDLE_S):
             return

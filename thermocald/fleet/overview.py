@@ -26,6 +26,7 @@ import numpy as np
 
 from thermocald.analysis.statistics.dependence import dependence
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
+from thermocald.errors import UsageError
 from thermocald.figures import BAND, PALETTE, Figure, label_axes, new_drawing
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, parameter_label, percent, short_duration, shortened
@@ -34,6 +35,7 @@ from thermocald.report import Answer, Chapter, Section, Table
 from thermocald.result import document_of
 from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.fleet_reader import FleetCamera, FleetReader, Rate
+from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -326,10 +328,16 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     absent: list[str] = []
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
-    for address in addresses:
+    for source, address in zip(sources, addresses, strict=True):
         with FleetReader(address) as reader:
             now, stations = reader.now(), reader.stations()
             selected = reader.cameras(now)
+        part = address.camera or address.series or (address.station and not stations)
+        if part and not selected:
+            raise UsageError(
+                f"{source_name(source)}: there is no such station, camera or series with epochs; "
+                "leave out ?… to see all"
+            )
         for camera in selected:
             camera.state = stations.get(camera.station, camera.state)
             _complete(camera, now)

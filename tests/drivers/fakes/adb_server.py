@@ -35,7 +35,8 @@ def wait_little(monkeypatch) -> None:
     monkeypatch.setattr(adbutils._adb, "time", SimpleNamespace(sleep=lambda _: None))
 
 
-TAGS = {"iso": 0x8827, "distance": 0x9206, "subsecond": 0x9291, "zone": 0x9011, "zoom": 0xA404}
+TAGS = {"exposure": 0x829A, "iso": 0x8827, "distance": 0x9206, "subsecond": 0x9291, "zone": 0x9011,
+        "zoom": 0xA404}  # fmt: skip
 FOCUS = """  android.lens.focusDistance (80007): float[1]
         [0.25 ]
 """
@@ -46,9 +47,9 @@ def photograph(when: float, size=(96, 64), **stated) -> bytes:
     image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
     tags = Image.Exif()
     sub = tags.get_ifd(0x8769)
-    sub[0x829A] = 1 / 60
     sub[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(when))
-    usual = {"iso": 100, "distance": 1.5, "subsecond": f"{int(when % 1 * 1000):03d}"}
+    usual = {"exposure": 1 / 60, "iso": 100, "distance": 1.5,
+             "subsecond": f"{int(when % 1 * 1000):03d}"}  # fmt: skip
     for name, value in (usual | stated).items():
         if value is not None:
             sub[TAGS[name]] = value

@@ -295,11 +295,10 @@ class AlertOutput(Output):
             limit = (high if value > high or math.isinf(low) else low) + found.step
             bound = f" (limit {limit:g}{found.unit})"
             text = found.words + (bound if out else ": within its limits again")
-            one = Alert(
+            changes += [Alert(
                 device, condition.name, "out" if out else "in", f"{device}: {text}", value, limit,
                 str(result.get("series", "")), epoch, None if math.isnan(utc) else utc,
-            )  # fmt: skip
-            changes.append(one)
+            )]  # fmt: skip
         return changes
 
     def deliver(self, alert: Alert) -> None:

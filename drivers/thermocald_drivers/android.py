@@ -39,7 +39,7 @@ import re
 import time
 from datetime import UTC, datetime
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -53,9 +53,9 @@ from thermocald.errors import (
     PermanentDeviceError,
     WrongDevice,
 )
-from thermocald.hal import Camera, Found, Frame
+from thermocald.hal import Camera, Frame
 from thermocald_drivers import support
-from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, list_phones
+from thermocald_drivers.android_phone import AdbPhone, PhoneOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -105,6 +105,8 @@ class AndroidCamera(AdbPhone, Camera):
         minimum_free_mb: Annotated[float, Field(ge=0.0, le=1e6)] = 200.0
         timeout_s: Annotated[float, Field(ge=0.1, le=600.0)] = 15.0
 
+    usual: ClassVar = {"width": 4032, "height": 3024}
+
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         o = self.options
@@ -117,11 +119,6 @@ class AndroidCamera(AdbPhone, Camera):
         self.folder = o.folder.rstrip("/")
         self._unchecked = ""
         self._first: dict[str, Any] | None = None
-
-    @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """List the phones of the adb server in any state."""
-        return list_phones(width=4032, height=3024)
 
     def open(self) -> None:
         super().open()

@@ -86,17 +86,6 @@ class PhoneOptions(DriverOptions):
     timeout_s: support.Seconds
 
 
-def list_phones(**options: int) -> list[Found]:
-    """List the phones on a running adb server with further options; [] without a server."""
-    adbutils = support.library("adbutils", "android")
-    try:
-        require_server("127.0.0.1", 5037, 1.0, seen=False)
-        pairs = _devices(adbutils.AdbClient(socket_timeout=1.0))
-    except (OSError, adbutils.AdbError):
-        return []
-    return [Found({"serial": serial, **options}, f"{serial} {state}") for serial, state in pairs]
-
-
 def _devices(client: Any) -> list[tuple[str, str]]:
     """Return (serial, state) by `host:devices`; adbutils' own list cuts both at blanks."""
     with client.make_connection() as line:
@@ -121,6 +110,21 @@ class AdbPhone(Device):
 
     device_classes = ("char-usb_device",)  # of an adb server that this driver starts
     Options: ClassVar[type[DriverOptions]] = PhoneOptions
+    usual: ClassVar[Mapping[str, int] | None] = None
+    """Further options of a listed phone's stanza; None: phones are not listed for the driver."""
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
+        """List the phones on a running adb server in any state; [] without a server."""
+        if cls.usual is None:
+            return []
+        adbutils = support.library("adbutils", "android")
+        try:
+            require_server("127.0.0.1", 5037, 1.0, seen=False)
+            pairs = _devices(adbutils.AdbClient(socket_timeout=1.0))
+        except (OSError, adbutils.AdbError):
+            return []
+        return [Found({"serial": one, **cls.usual}, f"{one} {state}") for one, state in pairs]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -291,6 +295,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         timeout_s: support.Seconds = 5.0
 
     range_c = PHONE_RANGE_C
+    usual: ClassVar = {}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -307,11 +312,6 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
                     f"units.{channel}: sensors has no battery or zone of that name"
                 )
         self._scales = self._stated()
-
-    @classmethod
-    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """List the phones of the adb server."""
-        return list_phones()
 
     def close(self) -> None:
         super().close()

@@ -126,23 +126,21 @@ CHIPS = (  # each with its data sheet or survey
     Chip("mpu3050 mpu6050 mpu6000 mpu9150", (36.53,)),
     # InvenSense RM-MPU-6500A 4.23, DS-000189: T/333.87 + 21
     Chip("mpu6500 mpu6515 mpu6880 mpu9250 mpu9255 icm20948 icm20648", (21.0,)),
-    # TDK DS-000176; ST DocID030071 9.12; Analog Devices ADIS16480: 0 is 25 °C
+    # TDK DS-000176, DS-000451; ST DocID030071 9.12; NXP FXLS8962AF; Analog Devices ADIS16480: 0 is
+    # 25 °C
     Chip("icm20600 icm20602 icm20608 icm20608d icm20689 icm20690 iam20680 icm42600 icm42602 "
          "icm42605 icm42622 icm42688 lsm6ds0 lsm6ds3 lsm6ds3h lsm6ds3tr lsm6dsl lsm6dsm lsm6dso "
          "lsm6dso16is lsm6dsox lsm6dsr lsm6dsrx lsm6dst lsm6dsv ism330dhcx ism330dlc asm330lhh "
-         "lsm9ds1 lsm303agr adis16480", (25.0,)),
-    # Bosch BST-BMI160-DS000 2.11.8
-    Chip("bmi088 bmi160 bmi260 bmi270 bmi323", (23.0, -41.0)),
+         "lsm9ds1 lsm303agr adis16480 lis2dw12 lis3mdl lsm303d lis2mdl iis2mdc iis3dwb icm42670 "
+         "fxls8962af", (25.0,)),
+    # Bosch BST-BMI160-DS000 2.11.8, BST-BMA400-DS000, BST-BMG160-DS000
+    Chip("bmi088 bmi160 bmi260 bmi270 bmi323 bma400 bmg160", (23.0, -41.0)),
     # ams CCS811 application note 000373
     Chip("ccs811", (-25.0,)),
     # InvenSense PS-ITG-3200A: 35 + (T + 13200)/280
     Chip("itg3200", (82.14,)),
     # Bosch BST-BMA253-DS000: 0 is 24 °C
     Chip("bma250 bma250e bma253 bma254 bma255 bma280 bmc150 bmc156 bmi055", (24.0, -40.0)),
-    # Bosch BST-BMA400-DS000, BST-BMG160-DS000
-    Chip("bma400 bmg160", (23.0, -41.0)),
-    # ST DocID030071, TDK DS-000451, NXP FXLS8962AF: 0 is 25 °C
-    Chip("lis2dw12 lis3mdl lsm303d lis2mdl iis2mdc iis3dwb icm42670 fxls8962af", (25.0,)),
     # IST TSic 506F: −10 + 70 S/2047
     Chip("tsic506 tsic516 tsic716", (-10.0, 60.0)),
     # IST TSic 306: −50 + 200 S/2047

@@ -58,8 +58,8 @@ def crc8(data: bytes) -> int:
     return crc
 
 
-def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
-    """Return (°C, scratchpad) of a `w1_slave` file; raises BadReading if it fails a check."""
+def decode(content: str, where: str, family: str = "28") -> tuple[float, str]:
+    """Return (°C, POWER_ON or "") of a `w1_slave` file; raises BadReading if it fails a check."""
     if not content:
         raise BadReading(f"{where}: the file is empty: no answer, or one whose CRC failed")
     match = _FILE.fullmatch(content)
@@ -78,16 +78,10 @@ def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
     # kernels before 5.10 ignore the additional bits of GX20MH01 and MAX31850
     if milli not in (computed, int(int.from_bytes(pad[:2], "little", signed=True) * 1000 / 16)):
         raise BadReading(f"{where}: t={milli} does not follow from the bytes {match['pad']!r}")
-    return computed / 1000.0, pad
-
-
-def is_power_on(pad: bytes, family: str) -> bool:
-    """Return whether a scratchpad holds the power-on value."""
-    raw = int.from_bytes(pad[:2], "little")
-    if family == "3b" and pad[4] & 0x80:
-        raw &= ~3
+    raw = int.from_bytes(pad[:2], "little") & (~3 if family == "3b" and pad[4] & 0x80 else ~0)
     counterfeit = family == "28" and (pad[5] != 0xFF or pad[7] != 0x10)
-    return raw == (0x00AA if family == "10" else 0x0550) or (counterfeit and raw == 0x0190)
+    idle = raw == (0x00AA if family == "10" else 0x0550) or (counterfeit and raw == 0x0190)
+    return computed / 1000.0, POWER_ON if idle else ""
 
 
 def _kernel_millidegrees(pad: bytes, family: str) -> int:
@@ -183,9 +177,8 @@ class Ds18b20Thermometer(support.CheckedThermometer):
         for _ in range(self.options.attempts):
             try:
                 content = support.read_line(self.root / rom / "w1_slave")
-                value, pad = decode(content, f"1-wire {rom}", rom[:2])
-                idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
-                return self.judge(channel, f"1-wire {rom}", value, idle)
+                where = f"1-wire {rom}"
+                return self.judge(channel, where, *decode(content, where, rom[:2]))
             except OSError as error:  # also a BadReading
                 problem = support.fault(error, f"1-wire {rom}", seen=True)
                 if isinstance(problem, DeviceGone):

@@ -330,11 +330,9 @@ class V4l2Camera(Camera):
         if self.handle.get(lock.automatic) != lock.manual:
             return
         for value in lock.automatic_values:
-            try:
+            with suppress(OSError):
                 self.handle.set(lock.automatic, value)
-            except OSError:
-                continue
-            return
+                return
         raise WrongDevice(f"{self.where}: {lock.option}: auto is not accepted")
 
     def _value_to_hold(self, control: int) -> int | None:

@@ -8,7 +8,6 @@ hence the poll here.
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import select
@@ -170,10 +169,7 @@ class OpenCvStream:
         self._cv2 = cv2 = support.library("cv2")
         self._path = path
         self._pending: Future[Grab] | None = None
-        if not os.access(path, os.F_OK):
-            raise FileNotFoundError(errno.ENOENT, "No such file or directory", path)
-        if not os.access(path, os.R_OK | os.W_OK):
-            raise PermissionError(errno.EACCES, "Permission denied", path)
+        os.close(os.open(path, os.O_RDWR))  # says why it fails, which OpenCV does not
         self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
             raise DeviceGone(f"{path}: OpenCV cannot open it (busy, or not a capture device)")

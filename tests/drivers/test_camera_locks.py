@@ -47,11 +47,7 @@ def forget(fake, driver):
         fake.values = {v4l2.AUTO_FOCUS: 1, v4l2.FOCUS: 0, v4l2.AUTO_EXPOSURE: 3, v4l2.EXPOSURE: 156}
     else:
         controls = fake.instances[-1].configuration["controls"]
-        assert (controls["AeEnable"], controls["AwbEnable"], controls["AfMode"]) == (
-            False,
-            False,
-            0,
-        )
+        assert [controls[n] for n in ("AeEnable", "AwbEnable", "AfMode")] == [False, False, 0]
         fake.standing = {"LensPosition": 4.0, "ColourGains": (1.0, 1.0)}
 
 

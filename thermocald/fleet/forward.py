@@ -117,6 +117,10 @@ class Progress:
     sent: Mapping[str, int]
     refused: int
 
+    @property
+    def rows(self) -> int:
+        return sum(self.sent.values())
+
 
 @dataclass(eq=False)
 class Forwarder:
@@ -311,8 +315,7 @@ def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None
                 return
             continue
         if trouble:
-            rows = sum(progress.sent.values())
-            log.info("%s can be reached again, %d rows sent", forwarder.address, rows)
+            log.info("%s can be reached again, %d rows sent", forwarder.address, progress.rows)
         pause, trouble = _FIRST_PAUSE_S, ""
         if wait(_IDLE_S):
             return

@@ -37,7 +37,7 @@ import io
 import math
 import re
 import time
-from datetime import UTC, datetime
+from datetime import datetime
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -60,8 +60,7 @@ from thermocald_drivers.android_phone import AdbPhone, PhoneOptions
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-KEYS = {"camera": 27, "volume": 24}
-WAKE_KEY = 224
+KEYS = {"camera": 27, "volume": 24, "wake": 224}
 OPEN_APP = "am start -a android.media.action.STILL_IMAGE_CAMERA"
 STATE = (
     "dumpsys power | grep -m1 mWakefulness=; "
@@ -152,22 +151,19 @@ class AndroidCamera(AdbPhone, Camera):
         start = self._exposure_start(tags, triggered, stored)
         middle = start + tags.get("exposure_s", 0.0) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
+        numbers = {name: support.number_or_nan(tags.get(name)) for name in SETTINGS}
         return Frame(
             image=image,
             encoded=jpeg,
             monotonic=monotonic,
             utc=utc,
             exposure=tags.get("exposure_s"),
-            settings={
-                name: float(tags[name])
-                for name in SETTINGS
-                if isinstance(tags.get(name), int | float) and math.isfinite(tags[name])
-            },
+            settings={name: n for name, n in numbers.items() if math.isfinite(n)},
         )
 
     def _wake(self) -> None:
         """Switch on the screen and dismiss a lock without PIN; DeviceDenied if it has a PIN."""
-        self.shell(f"input keyevent {WAKE_KEY}; wm dismiss-keyguard")
+        self.shell(f"input keyevent {KEYS['wake']}; wm dismiss-keyguard")
         state = self.shell(STATE)
         if "Lockscreen=true" in state or "isKeyguardShowing=true" in state:
             raise DeviceDenied(
@@ -323,13 +319,13 @@ def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | 
 
     zone: the time zone, +hhmm, of a photograph that states none. None without a valid time.
     """
+    zone = str(tags.get("zone", zone))
+    zone = zone if re.fullmatch(r"[-+]\d\d:?\d\d", zone) else "+0000"
     try:
-        naive = datetime.strptime(str(tags.get("time")), "%Y:%m:%d %H:%M:%S")
+        moment = datetime.strptime(f"{tags.get('time')} {zone}", "%Y:%m:%d %H:%M:%S %z")
     except ValueError:
         return None
-    seconds = naive.replace(tzinfo=UTC).timestamp()
-    if sign := re.fullmatch(r"([-+])(\d\d):?(\d\d)", str(tags.get("zone", zone))):
-        seconds -= int(f"{sign[1]}1") * (3600 * int(sign[2]) + 60 * int(sign[3]))
+    seconds = moment.timestamp()
     digits = str(tags.get("subsecond", ""))
     if re.fullmatch(r"\d+", digits):
         return seconds + int(digits) / 10 ** len(digits), 10.0 ** -len(digits)
@@ -339,14 +335,12 @@ def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | 
 def focus_state(dump: str) -> dict[str, Any]:
     """Return the lens position and autofocus state that `dumpsys media.camera` reports, if any."""
     found: dict[str, Any] = {}
-    distance = re.search(
-        r"android\.lens\.focusDistance \([^)]*\):[^\n]*\n\s*\[\s*([-\d.eE]+)", dump
-    )
-    if distance:
-        found["focus_distance_dioptres"] = float(distance[1])
-    state = re.search(r"android\.control\.afState \([^)]*\):[^\n]*\n\s*\[\s*(\w+)", dump)
-    if state:
-        found["af_state"] = state[1]
+    for name, tag, value in (
+        ("focus_distance_dioptres", r"lens\.focusDistance", r"\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"),
+        ("af_state", r"control\.afState", r"\w+"),
+    ):
+        if match := re.search(rf"android\.{tag} \([^)]*\):[^\n]*\n\s*\[\s*({value})", dump):
+            found[name] = float(match[1]) if name in FOCUS else match[1]
     return found
 
 

@@ -69,9 +69,6 @@ DENIED = {
     "permissions": "no permissions; see the udev rules in systemd/",
 }
 """What the adb server says of a phone that it must not use, and advice."""
-OFFLINE = (
-    "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
-)
 
 _CLOCK_S, _CLOCK_TRIES = 0.002, 12
 
@@ -244,7 +241,10 @@ class AdbPhone(Device):
             if word in message:
                 return support.denied(f"{self.where}: {advice}", seen=self.seen)
         if "offline" in message:
-            return DeviceGone(f"{self.where}: {OFFLINE}")
+            return DeviceGone(
+                f"{self.where}: offline: re-plug the cable, or `adb reconnect offline`; an "
+                "unpowered hub is a common cause"
+            )
         if "connect to adb server" in message or "No adb exe" in message:
             server = f"{self.options.host}:{self.options.port}"
             return DeviceNotFound(f"no adb server at {server}: {message}")
@@ -255,8 +255,6 @@ class AdbPhone(Device):
 
 ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'
 DUMPS = {"battery": "dumpsys battery", "thermal": "dumpsys thermalservice", "zone": ZONES}
-PHONE_RANGE_C = (-30.0, 125.0)
-STATE_UNIT = "set units: {{{channel}: degC}}, tenths or thousandths"
 NO_BATTERY = (
     "no battery temperature: no battery, one above 70 °C, frozen values (`dumpsys battery reset` "
     "ends that), or an unknown unit ({state})"
@@ -294,7 +292,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         units: dict[str, Literal["degC", "tenths", "thousandths"]] = {}  # noqa: RUF012
         timeout_s: support.Seconds = 5.0
 
-    range_c = PHONE_RANGE_C
+    range_c = (-30.0, 125.0)
     usual: ClassVar = {}
 
     def __init__(self, **options: Any) -> None:
@@ -328,13 +326,12 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         found: dict[str, float | str] = {
             f"thermal:{name}": value for name, value in service.items()
         }
-        if "battery" in texts:
-            number = battery(texts["battery"], self._scales.get("battery"))
-            if number is None:
-                found["battery"] = NO_BATTERY
-            else:
-                self._scales["battery"] = number[1]
-                found["battery"] = self._in_unit("battery", *number)
+        number = battery(texts.get("battery", ""), self._scales.get("battery"))
+        if number is None:
+            found["battery"] = NO_BATTERY
+        else:
+            self._scales["battery"] = number[1]
+            found["battery"] = self._in_unit("battery", *number)
         found |= self._zones(texts)
         measures = {
             channel: (source, partial(self._judge, channel, source, found.get(source)))
@@ -347,7 +344,7 @@ class AndroidThermometer(AdbPhone, support.CheckedThermometer):
         if value is None:
             raise BadReading(f"{where}: the phone does not report it")
         if isinstance(value, str):
-            state = STATE_UNIT.format(channel=channel)
+            state = f"set units: {{{channel}: degC}}, tenths or thousandths"
             raise BadReading(f"{where}: {value.format(state=state)}")
         idle = "what an absent sensor reports" if chips.is_idle("", value) else ""
         return self.judge(source, where, value, idle)

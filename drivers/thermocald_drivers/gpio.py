@@ -61,7 +61,7 @@ def _pin(kind: str, options: PinOptions) -> Any:
         raise DeviceNotFound(f"GPIO {pin}: this machine has no usable pins ({error})") from error
     except gpiozero.GPIOPinInUse as error:
         raise DeviceDenied(f"GPIO {pin}: in use ({error})") from error
-    except (gpiozero.PinInvalidPin, gpiozero.PinError) as error:
+    except gpiozero.PinError as error:
         raise DeviceNotFound(f"GPIO {pin}: {error}") from error
     except OSError as error:
         hint = "check that the user is in the group gpio"

@@ -103,14 +103,13 @@ def discovery_messages(
             ],
             "availability_mode": "all",
             "device": _about(device),
+            "unit_of_measurement": unit,
+            "state_class": unit and "measurement",
+            "suggested_display_precision": decimals,
+            "device_class": kind,
         }
-        if unit:
-            message |= {"unit_of_measurement": unit, "state_class": "measurement"}
-        if decimals is not None:
-            message["suggested_display_precision"] = decimals
-        if kind:
-            message["device_class"] = kind
-        messages[f"{prefix}/sensor/thermocald-{node}/{key}/config"] = message
+        known = {name: value for name, value in message.items() if value is not None}
+        messages[f"{prefix}/sensor/thermocald-{node}/{key}/config"] = known
     return messages
 
 

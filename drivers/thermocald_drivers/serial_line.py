@@ -84,8 +84,7 @@ ENDS_OF_WORDS = {32767, 32768, 65535}
 FULL_SCALE = {-1.0, 1023.0, 4095.0, 16383.0, 32767.0, 65535.0}
 
 
-# an instrument's own error texts report that nothing was measured
-OF_AN_INSTRUMENT = {"minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": []}
+# their own error texts report that nothing was measured, so that `refuse_c` is empty
 INSTRUMENTS: Mapping[str, dict[str, Any]] = {
     # Papouch TM, TMU: sends unprompted every 10 s; lines end with CR alone.
     "papouch-tm": {"pattern": r"(?P<temperature>[-+]\d{3}\.\d)C", "timeout_s": 22.0},
@@ -153,7 +152,7 @@ class SerialThermometer(support.CheckedThermometer):
                 )
             own = {}
             if isinstance(name, str) and name in INSTRUMENTS:
-                own = {**OF_AN_INSTRUMENT, **INSTRUMENTS[name]}
+                own = {"minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": [], **INSTRUMENTS[name]}
             return {**own, **{key: value for key, value in data.items() if value is not None}}
 
     def __init__(self, **options: Any) -> None:

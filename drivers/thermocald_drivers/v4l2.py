@@ -62,7 +62,6 @@ if TYPE_CHECKING:
 FUTURE_S = 1.0
 """A time stamp may be this far ahead (vivid: up to a frame); a later one is of another clock."""
 EXPOSURE = 0x009A0902
-EXPOSURE_UNIT_S = 1e-4
 _UNREADABLE = {errno.EINVAL, errno.EACCES, errno.ENOTTY}
 
 
@@ -80,7 +79,7 @@ class Lock:
 
 LOCKS = (
     # V4L2_EXPOSURE_MANUAL is 1; aperture priority, automatic, shutter priority are 3, 0, 2
-    Lock("exposure_s", 0x009A0901, 1, (3, 0, 2), EXPOSURE, EXPOSURE_UNIT_S),
+    Lock("exposure_s", 0x009A0901, 1, (3, 0, 2), EXPOSURE, 1e-4),
     Lock("gain", 0x00980912, 0, (1,), 0x00980913),
     Lock("focus", 0x009A090C, 0, (1,), 0x009A090A),
     Lock("white_balance_k", 0x0098090C, 0, (1,), 0x0098091A),
@@ -90,6 +89,8 @@ OFF = (0x009A0916,)  # image stabilisation
 MODES = {lock.automatic: lock for lock in LOCKS}
 
 
+FORMATS = ("MJPG", *(name.strip() for name in support.FORMATS))
+NO_FORMAT = f"is not one of {', '.join(FORMATS)}"
 Whole = Annotated[int | str | None, support.or_auto(0, 1e6)]
 
 
@@ -106,7 +107,7 @@ class V4l2Camera(Camera):
         device: support.Text | None = None
         serial: support.Text | None = None
         card: support.Text | None = None
-        pixel_format: support.Text = "YUYV"
+        pixel_format: Annotated[str, support.like("|".join(FORMATS), NO_FORMAT)] = "YUYV"
         exposure_s: Annotated[float | str | None, support.or_auto(1e-5, 60)] = None
         gain: Whole = None
         focus: Whole = None
@@ -122,11 +123,6 @@ class V4l2Camera(Camera):
         o = self.options
         if (o.device is None) == (o.serial is None):
             raise ConfigurationError("set either device: (/dev/v4l/by-id/…) or serial:")
-        known = ["MJPG", *(name.strip() for name in support.FORMATS)]
-        if o.pixel_format not in known:
-            raise ConfigurationError(
-                f"pixel_format: {o.pixel_format!r} is not one of {', '.join(known)}"
-            )
         self.where = f"camera {o.device or o.serial}"
         self._wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
         self._held: dict[int, int] = {}  # also while it is closed and opened again
@@ -256,19 +252,16 @@ class V4l2Camera(Camera):
 
     def _path(self) -> str:
         """Return the device node; a serial number is looked up among udev's names."""
-        if self.options.device is not None:
-            return str(self.options.device)
-        links = sorted(
-            (Path(self.options.dev) / "v4l/by-id").glob(f"*{self.options.serial}*-video-index0")
-        )
+        o = self.options
+        if o.device is not None:
+            return str(o.device)
+        folder = Path(o.dev) / "v4l/by-id"
+        links = sorted(folder.glob(f"*{o.serial}*-video-index0"))
         if len(links) > 1:
             names = ", ".join(link.name for link in links)
-            raise WrongDevice(f"camera {self.options.serial}: several match: {names}; set device:")
+            raise WrongDevice(f"camera {o.serial}: several match: {names}; set device:")
         if not links:
-            raise support.absent(
-                f"camera {self.options.serial}: none in {self.options.dev}/v4l/by-id",
-                seen=self.seen,
-            )
+            raise support.absent(f"camera {o.serial}: none in {folder}", seen=self.seen)
         return str(links[0])
 
     def _apply(self) -> None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 _COUNTED = (*KEPT, "frame")
 _OF = {"server", "station", "identity", "inode"}
-_NO_FRAMES = ForwardConfig()
 
 
 class Cursor(BaseModel):
@@ -136,7 +135,7 @@ class Forwarder:
     cursor: Path | None = None
     batch: int = BATCH
     frames: Path = Path()
-    rule: ForwardConfig = _NO_FRAMES
+    rule: ForwardConfig = field(default_factory=ForwardConfig)
 
     def __post_init__(self) -> None:
         self._path = self.cursor or self.store.with_name(f"{self.store.name}.forwarded")

@@ -145,9 +145,7 @@ class ExecAlert(AlertOutput):
             with suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             child.communicate()
-            raise DeviceTimeout(
-                f"{self.where}: not finished in {self.options.timeout_s:g} s"
-            ) from error
+            raise DeviceTimeout(f"{self.where}: not finished in {self.timeout_s:g} s") from error
         if child.returncode:
             raise BadReading(f"{self.where}: ended with exit status {child.returncode}")
 

@@ -221,8 +221,7 @@ class AdbPhone(Device):
         try:
             return action()
         except (adbutils.AdbTimeout, TimeoutError) as error:
-            limit = f"{self.options.timeout_s:g} s"
-            raise DeviceTimeout(f"{self.where}: no answer in {limit}") from error
+            raise DeviceTimeout(f"{self.where}: no answer in {self.timeout_s:g} s") from error
         except adbutils.AdbError as error:
             raise self._translated(str(error)) from error
         except (EOFError, struct.error, ConnectionError) as error:

@@ -57,8 +57,8 @@ CHIPS = (  # each with its data sheet or survey
          "si7050 si7051 si7053 si7054 si7055", (-46.85, 128.86, 128.87)),
     # Sensirion SHT1x 4.3: d1 by supply voltage
     Chip("sht10 sht11 sht15 sht71 sht75", (-39.4, -39.6, -39.65, -39.7, -39.8, -40.1, 123.8)),
-    # Silicon Labs Si7005 5.1.2: S/32 − 50
-    Chip("si7005 th02 th06", (-50.0,)),
+    # Silicon Labs Si7005 5.1.2; Analog Devices TMP35/36/37; TI SNIS189: 0, 0 V or no pulse
+    Chip("si7005 th02 th06 tmp36 tmp37 lm50 mcp9700 mcp9700a lmt01", (-50.0,)),
     # TI SNAS643, SNAS649, SNAS678: −40 (−40.5) + 165 S/65536
     Chip("hdc100x hdc1000 hdc1008 hdc1010 hdc1050 hdc1080 hdc2010 hdc2080 hdc2021 hdc2022",
          (-40.0, -40.5, 124.99, 124.997, 125.0)),
@@ -108,8 +108,6 @@ CHIPS = (  # each with its data sheet or survey
     Chip("ncp15wb473 ncp18wb473 ncp21wb473 ncp03wb473 ncp15wl333 ncp03wf104 ncp15xh103 "
          "ncp18xh103 b57330v2103 b57891s0103 b57861s0103 ntc_thermistor",
          (-55.0, -40.0, 125.0, 155.0)),
-    # Analog Devices TMP35/36/37: 0 V
-    Chip("tmp36 tmp37 lm50 mcp9700 mcp9700a", (-50.0,)),
     # Microchip DS21942: 0 V
     Chip("mcp9701 mcp9701a", (-20.5, -20.51)),
     # Analog Devices AD22100: 0 V
@@ -145,8 +143,6 @@ CHIPS = (  # each with its data sheet or survey
     Chip("tsic506 tsic516 tsic716", (-10.0, 60.0)),
     # IST TSic 306: −50 + 200 S/2047
     Chip("tsic206 tsic306", (-50.0, 150.0)),
-    # TI SNIS189: no pulse is −50 °C
-    Chip("lmt01", (-50.0,)),
     # monitors of currents
     # Linux ltc2947-core.c: 0.204 T + 5.5
     Chip("ltc2947", (5.5, 5.296)),

@@ -102,8 +102,6 @@ class _KernelThermometer(support.CheckedThermometer):
         super().__init__(**options)
         self.chip = self.where = getattr(self.options, self.key)
         self.sysfs = Path(self.options.sysfs)
-        self._channels: dict[str, str] = {}
-        self._name = ""
 
     @classmethod
     def devices(cls, sysfs: Path) -> Iterator[tuple[Path, str, str]]:

@@ -192,9 +192,7 @@ class _Broker(Output):
             code = answered.result(self.options.timeout_s)
         except TimeoutError:
             _Broker.close(self)
-            raise DeviceTimeout(
-                f"{self.where}: no answer in {self.options.timeout_s:g} s"
-            ) from None
+            raise DeviceTimeout(f"{self.where}: no answer in {self.timeout_s:g} s") from None
         if code.is_failure:
             _Broker.close(self)
             if code.value == _UNAVAILABLE:
@@ -242,12 +240,8 @@ class _Broker(Output):
 class MqttOutput(_Broker):
     """An output that publishes each result; a device is announced with its first."""
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._announced: set[str] = set()
-
     def open(self) -> None:
-        self._announced = set()
+        self._announced: set[str] = set()
         self.connect(self._available_topic(self.options.device))
 
     def close(self) -> None:

@@ -179,7 +179,6 @@ class SerialThermometer(support.CheckedThermometer):
         self._decimals: dict[str, tuple[int, bool, int]] = {}
         self._line = b""
         self._synchronous = False
-        self._owed = True
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
@@ -277,10 +276,8 @@ class SerialThermometer(support.CheckedThermometer):
         if len(waiting) >= QUEUE:
             self._line, self._synchronous = b"", False  # bytes may be missing
             return
-        head, mark, tail = (self._line + waiting).rpartition(b"\n")
-        if mark:
-            self._synchronous = True
-        self._line = tail if mark else head + tail
+        _, ended, self._line = (self._line + waiting).rpartition(b"\n")
+        self._synchronous |= bool(ended)
 
     def _next_match(self) -> tuple[re.Match[str], float]:
         """Return the next line that matches, and the machine's monotonic time at its end."""

@@ -126,8 +126,6 @@ class V4l2Camera(Camera):
         self.where = f"camera {o.device or o.serial}"
         self._wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
         self._held: dict[int, int] = {}  # also while it is closed and opened again
-        self._asked: dict[int, int] = {}
-        self._available: dict[int, Control] = {}
 
     @classmethod
     def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
@@ -242,9 +240,8 @@ class V4l2Camera(Camera):
                 if broken is not None:
                     raise BadReading(f"{self.where}: only broken frames; {broken}") from error
                 after = f", {dropped} old frames were in the queue" if dropped else ""
-                raise DeviceTimeout(
-                    f"{self.where}: no new frame in {self.options.timeout_s:g} s{after}"
-                ) from error
+                message = f"{self.where}: no new frame in {self.timeout_s:g} s{after}"
+                raise DeviceTimeout(message) from error
             if grab is not None:
                 stamp = arrived if grab.stamp is None else grab.stamp
                 return grab, min(stamp, arrived)
@@ -269,8 +266,8 @@ class V4l2Camera(Camera):
 
         Raises WrongDevice for a setting that the camera does not have or hold.
         """
-        self._available = self.handle.controls()
-        self._asked = {}
+        self._available: dict[int, Control] = self.handle.controls()
+        self._asked: dict[int, int] = {}
         locked = self._collect()
         for control, value in self._asked.items():
             self._set(control, value, locked)

@@ -114,9 +114,8 @@ def test_a_program_gets_it_without_a_shell_and_a_few_variables_only(script, tmp_
     monkeypatch.setenv("DATABASE_PASSWORD", "SECRET")
     monkeypatch.setenv("LANG", "C.UTF-8")
     log, told = tmp_path / "log", tmp_path / "told"
-    script.write_text(
-        f'#!/bin/sh\nenv > {log}\necho "$1 $THERMOCALD_STATE" >> {told}\ncat >> {told}'
-    )
+    program = f'#!/bin/sh\nenv > {log}\necho "$1 $THERMOCALD_STATE" >> {told}\ncat >> {told}'
+    script.write_text(program)
     with output("exec", command=[str(script), "$HOME;ls"]) as device:
         for one in (OUT, OUT, IN):
             device.emit({**one, "device": "cam\x00era"})

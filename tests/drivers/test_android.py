@@ -7,10 +7,10 @@ import time
 
 import numpy as np
 import pytest
-from thermocald_drivers.android import exif, exposure_start
+from thermocald_drivers.android import exif, exposure_start, focus_state
 from thermocald_drivers.android_phone import AdbPhone
 
-from tests.drivers.fakes.adb_server import photograph, shoot
+from tests.drivers.fakes.adb_server import FOCUS, photograph, shoot
 from tests.drivers.laboratory import check_readings
 from thermocald import errors
 from thermocald.hal import VirtualClock
@@ -115,7 +115,7 @@ def test_a_file_that_grows_is_awaited_among_files_that_are_no_photographs(bench,
 @pytest.mark.parametrize("refuse", [False, None, True])
 def test_exposure_that_moved_is_flagged_or_refused(bench, fake, refuse):
     fake.media_camera, fake.shoot = "", shoot(distance=None)
-    with bench.device(refuse_unlocked=refuse, delete=True, timeout_s=0.3) as device:
+    with bench.device(refuse_unlocked=refuse, delete=True) as device:
         device.capture()
         assert any("cannot be checked" in w for w in device.warnings())  # the focus
         fake.shoot = shoot(iso=200)
@@ -125,10 +125,7 @@ def test_exposure_that_moved_is_flagged_or_refused(bench, fake, refuse):
         else:
             assert device.capture().settings["iso"] == 200.0
         assert any("refuse_unlocked" in w for w in device.warnings()) == (refuse is False)
-        fake.shoot = shoot(size=(48, 32))
-        with pytest.raises(errors.BadReading, match="48×32 px"):
-            device.capture()
-    assert not fake.files  # the refused ones are deleted too
+    assert not fake.files  # the refused one is deleted too
 
 
 @THERMOMETER
@@ -204,6 +201,7 @@ def test_the_instant_of_a_photograph_and_its_zone():
     assert exposure_start(exif(photograph(WHEN, subsecond=None)), "")[1] == 1.0
     assert exposure_start({"time": "0000:00:00 00:00:00"}, "") is None
     assert exposure_start({}, "") is None
+    assert focus_state(FOCUS.replace("0.25", "1.5e+01")) == {"focus_distance_dioptres": 15.0}
     for damaged in (0.0, -0.02, 1e9, "1/60"):
         assert "exposure_s" not in exif(photograph(WHEN, exposure=damaged))
     for data in (b"", b"\xff\xd8\xff\xd9", b"GIF89a"):

@@ -67,9 +67,7 @@ def test_what_is_not_configured_is_locked_as_it_is_also_after_a_plug(driver, ben
     ("driver", "change", "message"),
     [(driver, *row) for driver, rows in MOVED.items() for row in rows],
 )
-def test_a_lock_that_does_not_hold_gives_no_frame_until_it_is_set_back(
-    driver, bench, change, message
-):
+def test_a_lock_that_does_not_hold_gives_no_frame(driver, bench, change, message):
     with bench.device() as device:
         device.capture()
         with bench.broken(change), pytest.raises(BadReading, match=message):

@@ -59,9 +59,8 @@ def test_driver_is_what_it_is_registered_as_and_explains_its_stanza(driver):
     for option in made.Options.model_fields:
         assert option in text, f"option {option} is not explained at the top of the file"
     # at its top, it imports no device's library
-    top = re.findall(
-        r"^(?:import|from) (\w+)(?:[.\w]*$|.* import )", inspect.getsource(module), re.M
-    )
+    source = inspect.getsource(module)
+    top = re.findall(r"^(?:import|from) (\w+)(?:[.\w]*$|.* import )", source, re.M)
     assert set(top) <= {*sys.stdlib_module_names, "numpy", "pydantic", *OURS}
 
 

@@ -42,9 +42,8 @@ def test_bayer_of_a_plain_colour_is_its_luminance(fourcc):
     order = raw.PixelFormat(raw.v4l2_fourcc(*fourcc)).name[1:5]  # of the kernel: SGRBG10
     tile = np.array([colour[letter] for letter in order], "<u2").reshape(2, 2)
     mosaic = np.tile(tile, (HEIGHT // 2, WIDTH // 2))
-    data = (
-        pack_10(mosaic) if fourcc.startswith("p") else mosaic.astype(np.uint8 if eight else "<u2")
-    )
+    size = np.uint8 if eight else "<u2"
+    data = pack_10(mosaic) if fourcc.startswith("p") else mosaic.astype(size)
     centre = grey(data.tobytes(), fourcc)[4:-4, 4:-4]
     luminance = 0.299 * colour["R"] + 0.587 * colour["G"] + 0.114 * colour["B"]
     # some versions of OpenCV truncate 8 bits

@@ -36,13 +36,10 @@ def asked(far, **options):
 PROTOCOLS = [
     ("vaisala-hmp", b"SEND\r", b"RH= 43.0 %RH T= 21.0 'C Tdp= 8.0 'C\r\n", {"temperature": 21.0}),
     ("vaisala-hmp", b"SEND\r", b"T= -7.3 'C\r\n", {"temperature": -7.3}),
-    (
-        "lakeshore-218",
-        b"KRDG?\r\n",
-        b"+293.15,+294.15,+295.15,+273.15,+300.00,+301.00,+302.00,+303.15\r\n",
-        {f"input{k}": celsius for k, celsius in enumerate(
-            (20.0, 21.0, 22.0, 0.0, 26.85, 27.85, 28.85, 30.0), 1)},
-    ),
+    ("lakeshore-218", b"KRDG?\r\n",
+     b"+293.15,+294.15,+295.15,+273.15,+300.00,+301.00,+302.00,+303.15\r\n",
+     dict(zip((f"input{k}" for k in range(1, 9)),
+              (20.0, 21.0, 22.0, 0.0, 26.85, 27.85, 28.85, 30.0), strict=True))),
     ("fluke-1522", b"read?\r", b"t: 25.587 C\r\n", {"temperature": 25.587}),
 ]  # fmt: skip
 

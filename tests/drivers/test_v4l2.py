@@ -23,9 +23,7 @@ DRIVER = ("camera", "v4l2")
     ("flags", "shift", "pixel_format"),
     [(0x2000, -0.05, "GREY"), (0x12000, +0.05, "YUYV"), (0, -0.05, "MJPG")],
 )
-def test_the_frame_is_fresh_and_its_time_the_middle_of_the_exposure(
-    bench, fake, flags, shift, pixel_format
-):
+def test_a_fresh_frame_at_the_middle_of_its_exposure(bench, fake, flags, shift, pixel_format):
     fake.flags, stamps = flags, []
     fake.stamp = lambda now: stamps.append(now) or now
     with bench.device(exposure_s=0.1, pixel_format=pixel_format) as device:

@@ -54,9 +54,7 @@ def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
     assert "twins" in findings(server)
 
 
-def test_neither_epochs_calibrated_again_nor_a_new_store_of_a_station_are_twins(
-    server, two, make_result
-):
+def test_neither_new_calibrations_nor_a_new_store_are_twins(server, two, make_result):
     with Store.open(two[0], "append", durable=False) as store:
         (series,) = store.all_series()
         for i in (4, 5):

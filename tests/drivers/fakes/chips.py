@@ -79,8 +79,8 @@ def bme280(adc_t=ADC_T, adc_h=ADC_H, identity=0x60, status=0):
         if (register, data) == (0xE0, b"\xb6"):
             self.registers[0xF5] = b"\x00"
         if register == 0xF4 and data[0] & 3:
-            filtered = adc_t - (5000 if self.registers[0xF5][0] & 0b11100 else 0)
-            raw = (ADC_P << 4).to_bytes(3, "big") + (filtered << 4).to_bytes(3, "big")
+            found = adc_t - 1000 * self.registers[0xF5][0]
+            raw = (ADC_P << 4).to_bytes(3, "big") + (found << 4).to_bytes(3, "big")
             block(0xF7, raw + adc_h.to_bytes(2, "big"))
 
     chip.on_write = measure

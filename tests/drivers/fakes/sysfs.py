@@ -20,29 +20,24 @@ class Sysfs:
         target.write_text(content + "\n")
         return target
 
-    def hwmon(self, number: int, name: str, address: str = "", **files: str) -> Path:
-        folder = f"class/hwmon/hwmon{number}"
-        self.write(f"{folder}/name", name)
+    def device(self, folder: str, **files: str) -> Path:
         for file, content in files.items():
             self.write(f"{folder}/{file}", content)
+        return self.root / folder
+
+    def hwmon(self, number: int, name: str, address: str = "", **files: str) -> Path:
+        folder = self.device(f"class/hwmon/hwmon{number}", name=name, **files)
         if address:
             device = self.root / "devices" / address
             device.mkdir(parents=True, exist_ok=True)
-            (self.root / folder / "device").symlink_to(device)
-        return self.root / folder
+            (folder / "device").symlink_to(device)
+        return folder
 
     def iio(self, number: int, name: str, **files: str) -> Path:
-        folder = f"bus/iio/devices/iio:device{number}"
-        self.write(f"{folder}/name", name)
-        for file, content in files.items():
-            self.write(f"{folder}/{file}", content)
-        return self.root / folder
+        return self.device(f"bus/iio/devices/iio:device{number}", name=name, **files)
 
     def zone(self, number: int, kind: str, milli: str) -> Path:
-        folder = f"class/thermal/thermal_zone{number}"
-        self.write(f"{folder}/type", kind)
-        self.write(f"{folder}/temp", milli)
-        return self.root / folder
+        return self.device(f"class/thermal/thermal_zone{number}", type=kind, temp=milli)
 
     def w1(self, rom: str, content: str) -> Path:
         return self.write(f"bus/w1/devices/{rom}/w1_slave", content.rstrip("\n"))

@@ -291,11 +291,11 @@ class Sht3xThermometer(I2cThermometer):
         self._command(self.BREAK, 0.001)  # in the periodic mode of an earlier program, before any
         self._command(self.SOFT_RESET, 0.002)
         self._command(self.SERIAL_NUMBER, 0.001)
-        self._words(2)
+        self._words()
 
     def _measure(self) -> tuple[float, str]:
         self._command(self.SINGLE_SHOT_HIGH, 0.0155)
-        temperature, humidity = self._words(2)
+        temperature, humidity = self._words()
         self._driven(temperature & humidity)
         return -45.0 + 175.0 * temperature / 65535.0, ""
 
@@ -303,17 +303,14 @@ class Sht3xThermometer(I2cThermometer):
         self.handle.write_i2c_block_data(self.address, command >> 8, [command & 0xFF])
         self._wait(wait_s)
 
-    def _words(self, count: int) -> list[int]:
-        """Read `count` words, each followed by its CRC, without a register address."""
-        message = support.library("smbus2").i2c_msg.read(self.address, 3 * count)
+    def _words(self) -> tuple[int, int]:
+        """Read two words, each followed by its CRC, without a register address."""
+        message = support.library("smbus2").i2c_msg.read(self.address, 6)
         self.handle.i2c_rdwr(message)
         data = bytes(message)
-        words = []
-        for k in range(0, 3 * count, 3):
-            if crc8(data[k : k + 2]) != data[k + 2]:
-                raise BadReading(f"{self.where}: CRC error in {data.hex(' ')}; check the wiring")
-            words.append(int.from_bytes(data[k : k + 2], "big"))
-        return words
+        if crc8(data[:2]) != data[2] or crc8(data[3:5]) != data[5]:
+            raise BadReading(f"{self.where}: CRC error in {data.hex(' ')}; check the wiring")
+        return int.from_bytes(data[:2], "big"), int.from_bytes(data[3:5], "big")
 
 
 class Bme280Thermometer(I2cThermometer):

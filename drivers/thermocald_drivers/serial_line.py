@@ -21,7 +21,8 @@ r"""Thermometers that send lines of text on a serial port.
 Each named group of `pattern` is a channel; its number is scaled, offset, and converted to °C by
 `unit`. The pattern must match the **whole** line: the rest of a line that lost its start (`3.5C` of
 `+023.5C`) is not a reading. A decimal comma is read as a point. A `°` in the pattern matches the
-degree signs of UTF-8, Latin-1, code page 437 and LCD fonts. For named instruments see INSTRUMENTS.
+degree signs of UTF-8, UTF-16, Latin-1, code page 437 and LCD fonts. For named instruments see
+INSTRUMENTS.
 
 Firmware prints a fixed number if its sensor does not answer: −127 and 85 (DS18B20), −45 and −46.85
 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale); `chips` lists them. With `pattern` they
@@ -292,6 +293,8 @@ class SerialThermometer(support.CheckedThermometer):
                 if not whole and self.command:
                     self.handle.write(self.command)  # the answer may have been joined to it
                 line = line.strip(b"\0")
+                if len(line) > 8 and not any(line[1::2]):  # UTF-16
+                    line = line[::2]
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
                 match = next(filter(None, map(self.pattern.fullmatch, _decodings(line))), None)

@@ -82,6 +82,7 @@ ANSWERS = {
     "in pieces": (b"", b"T=2", b"0.50\r\n"),
     "an old answer in the queue": (b"T=99.00\r\n", b"T=20.50\r\n", b""),
     "an echo": (b"", b"T?\r\nT=20.50\r\n", b""),
+    "in UTF-16": (b"", "T=20.50\r\n".encode("utf-16-le"), b""),
     "garbage": (b"", b"\xff\x00\x91~\r\nready\r\nT=20.50\r\n", b""),
     "one channel without a sensor": (b"", b"T=20.5;A=-127.0;B=nan\r\n", b""),
     "a prompt, which is no late line": (b"T=9.00\r\n> ", b"T=20.50\r\n> ", b""),

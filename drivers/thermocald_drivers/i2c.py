@@ -100,9 +100,8 @@ class I2cThermometer(support.CheckedThermometer):
 
     def read(self) -> Reading:
         self.opened()
-        where = self.where
-        measures = {self.options.channel: (where, lambda: self.judge("", where, *self._measure()))}
-        return self.reading(measures)
+        channel, where = self.options.channel, self.where
+        return self.reading({channel: (where, lambda: self.judge("", where, *self._measure()))})
 
     def _identify(self) -> None:
         """Check the chip's identity and make it convert; WrongDevice if it is another chip."""

@@ -22,12 +22,9 @@ LOAD = pytest.mark.parametrize("driver", [("output", "android_load")])
 
 @pytest.mark.parametrize(
     ("trigger", "command"),
-    [
-        ({"trigger": "camera"}, "input keyevent 27"),
-        ({"trigger": "volume"}, "input keyevent 24"),
-        ({"trigger": "tap", "tap": [540, 2000]}, "input tap 540 2000"),
-    ],
-)
+    [({"trigger": "camera"}, "input keyevent 27"), ({"trigger": "volume"}, "input keyevent 24"),
+     ({"trigger": "tap", "tap": [540, 2000]}, "input tap 540 2000")],
+)  # fmt: skip
 def test_photographs_by_the_triggers_of_the_vendors(bench, fake, trigger, command):
     fake.trigger = command
     fake.add("IMG_old.jpg", b"old")

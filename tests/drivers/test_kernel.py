@@ -40,11 +40,9 @@ def test_channels_are_inputs_or_their_labels(sysfs, files, channels, expected):
 
 @pytest.mark.parametrize(
     ("files", "channels", "problem"),
-    [
-        ({"temp2_input": "51000"}, {"lens": "temp1"}, "no input temp1; there is temp2"),
-        ({}, {}, "no temperature input is there"),
-    ],
-)
+    [({"temp2_input": "51000"}, {"lens": "temp1"}, "no input temp1; there is temp2"),
+     ({}, {}, "no temperature input is there")],
+)  # fmt: skip
 def test_an_input_that_was_missing_is_read_when_it_is_there(sysfs, files, channels, problem):
     sysfs.hwmon(0, "it87", **files)
     device = thermometer("hwmon", sysfs, chip="it87", channels=channels)

@@ -38,9 +38,8 @@ def test_a_result_arrives_and_is_announced(bench, tmp_path):
     drift = next(m for t, m in announced.items() if "drift_x0_px" in t)
     assert (drift["unit_of_measurement"], drift["suggested_display_precision"]) == ("px", 2)
     # the last will is at `thermocald`: the device is available only together with it
-    assert {a["topic"] for a in drift["availability"]} == {
-        f"{NODE}/available", "thermocald/thermocald/available"
-    }  # fmt: skip
+    topics = {a["topic"] for a in drift["availability"]}
+    assert topics == {f"{NODE}/available", "thermocald/thermocald/available"}
     bench.fake.messages.clear()
     with bench.device(discovery=None) as device:
         device.emit(RESULT)

@@ -61,6 +61,14 @@ def test_a_block_knows_the_frame_before_it(archive, tmp_path):
     assert status[20] == "repeated_frame"
 
 
+def test_a_damaged_recording_costs_only_itself(archive, tmp_path):
+    shutil.copytree(archive, tmp_path / "all")
+    (tmp_path / "all/M2/recording.yaml").write_text("camera: [")
+    done = run_tasks(calibrate_block, find_blocks([tmp_path / "all"], tmp_path / "out", ()))
+    found = {(o.epochs, "M2/recording.yaml" in o.error) for o in done}
+    assert found == {(0, True), (40, False)}
+
+
 def test_a_folder_that_cannot_be_read_is_not_called_empty(archive, tmp_path, monkeypatch, caplog):
     with pytest.raises(DataError, match="gone: cannot be read: No such file or directory"):
         find_blocks([tmp_path / "gone"], tmp_path, ())

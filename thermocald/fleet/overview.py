@@ -334,10 +334,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
             selected = reader.cameras(now)
         part = address.camera or address.series or (address.station and not stations)
         if part and not selected:
-            raise UsageError(
-                f"{source_name(source)}: there is no such station, camera or series with epochs; "
-                "leave out ?… to see all"
-            )
+            raise UsageError(f"{source_name(source)}: there is no such station, camera or series")
         for camera in selected:
             camera.state = stations.get(camera.station, camera.state)
             _complete(camera, now)

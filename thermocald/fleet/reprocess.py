@@ -14,6 +14,7 @@ import logging
 import os
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -170,7 +171,7 @@ def find_series(sources: Sequence[Path]) -> dict[str, Path]:
     return found
 
 
-def _recordings(folder: Path) -> Iterator[tuple[tuple[str, str], Path]]:
+def _recordings(folder: Path) -> Iterator[tuple[tuple[str, ...], Path]]:
     def unreadable(cause: OSError) -> None:
         text = f"{cause.filename}: cannot be read: {cause.strerror}"
         if cause.filename == str(folder):
@@ -179,8 +180,11 @@ def _recordings(folder: Path) -> Iterator[tuple[tuple[str, str], Path]]:
 
     below = os.walk(folder, onerror=unreadable)
     for path in sorted(Path(place) for place, _, files in below if "recording.yaml" in files):
-        head = read_head(path)
-        yield (head.camera.name, head.series), path
+        name = path.relative_to(folder).parts  # of a damaged recording, whose task fails
+        with suppress(DataError):
+            head = read_head(path)
+            name = head.camera.name, head.series
+        yield name, path
 
 
 def _at_server(address: Path) -> Iterator[tuple[tuple[str, str, str], Path]]:
@@ -200,7 +204,9 @@ def find_blocks(
     """
     blocks: list[Block] = []
     for name, path in find_series(archives).items():
-        epochs = len(open_recording(path))
+        epochs = 1  # of a damaged recording, whose block fails
+        with suppress(DataError):
+            epochs = len(open_recording(path))
         for first in range(0, epochs, size):
             target = out / name / f"part-{first:08d}.parquet"
             if not target.exists():

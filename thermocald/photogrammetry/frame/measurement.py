@@ -211,7 +211,7 @@ class _Frame:
         the corners of squares of ChArUco boards.
         """
         again = {row for row, why in self._missed.items() if why in _WORTH_A_SECOND_LOOK}
-        if len(corners) < max(_FEW_CORNERS, len(again)):
+        if len(corners) < _FEW_CORNERS:
             again = set()
         appearances = enumerate(zip(self._field.kinds, self._field.codes, strict=True))
         rows = sorted(again.union(row for row, how in appearances if how == ("chess_corner", "")))

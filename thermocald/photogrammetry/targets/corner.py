@@ -49,6 +49,7 @@ _SADDLE_REACH = 0.25  # of the marker's side
 _FAR = 40.0  # standard deviations of the blur; the series would overflow where a fit runs away
 _LARGEST_SATURATION = 0.3  # where paper is cut at full scale; sharpened edges alone reach a tenth
 _CUT = 0.05, 0.998  # the same where few pixels of paper are used: share, and paper over full scale
+_LEAST_SD = 0.3  # DN, of quantisation
 _CLEAR = 6.0  # times its variance, from which the light's squared gradient is corrected
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
@@ -382,7 +383,8 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
             "no corner where the marker has one",
         ),
         (np.abs(np.cos(p[:, 2] - p[:, 3])) > 0.95, "too oblique"),
-        (np.abs(p[:, 6]) < 5 * residual_sd, "too little contrast"),
+        # an area of one grey value, as of a shadow, has no residuals
+        (np.abs(p[:, 6]) < 5 * np.maximum(residual_sd, _LEAST_SD), "too little contrast"),
     )
     reasons = first_reasons(tests)
     good = reasons == ""

@@ -80,8 +80,8 @@ def eight_bit(image: NDArray[Any], brightest: int = 0) -> NDArray[np.uint8]:
         return image
     import cv2
 
-    scale = 255.0 / max(brightest or int(image.max()), 1)
-    return cv2.convertScaleAbs(image, alpha=scale)  # type: ignore[return-value]
+    brightest = max(brightest or int(image.max()), 1)
+    return cv2.convertScaleAbs(image, alpha=255.0 / brightest)  # type: ignore[return-value]
 
 
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

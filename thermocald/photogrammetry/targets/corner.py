@@ -219,7 +219,12 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
     px, py = x.astype(float), y.astype(float)
     away = np.hypot(px - corners[:, 0, None], py - corners[:, 1, None])
-    placed = np.column_stack([corners, *_inward_angles(found)])
+    # angles of both edges' normals: across one side, towards the other
+    sides, angles = ((found.before - corners).T, (found.after - corners).T), []
+    for (side_x, side_y), (other_x, other_y) in (sides, sides[::-1]):
+        towards = np.sign(side_x * other_y - side_y * other_x)
+        angles.append(np.arctan2(towards * side_x, -towards * side_y))
+    placed = np.column_stack([corners, *angles])
     d1, d2 = _from_edges(placed, px, py)
     # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
     margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
@@ -244,16 +249,6 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     contrast = np.where(np.abs(contrast) < 1, 1.0, contrast)
     p = np.column_stack([placed, np.full(n, 1.2), background, contrast])
     return _Pixels(px, py, grey, use, saddle), p, cut_off
-
-
-def _inward_angles(found: Corners) -> list[Array]:
-    """Return the angles (n,) of both edges' normals: across one side, towards the other."""
-    sides = (found.before - found.places).T, (found.after - found.places).T
-    angles = []
-    for (x, y), (other_x, other_y) in (sides, sides[::-1]):
-        towards = np.sign(x * other_y - y * other_x)
-        angles.append(np.arctan2(towards * x, -towards * y))
-    return angles
 
 
 def _from_edges(p: Array, x: Array, y: Array) -> tuple[Array, Array]:

@@ -61,9 +61,27 @@ def spread_rows(count: int, most: int) -> Index:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return 8-bit values of an image of 8 or 16 bit."""
-    return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+def full_scale(image: NDArray[Any]) -> int:
+    """Return the grey value at which a sensor saturates, of an image of 8 or 16 bit.
+
+    A sensor of 10, 12 or 14 bit has its values at the lower or the upper end of 16 bit.
+    """
+    if image.dtype == np.uint8:
+        return 255
+    brightest = int(image.max())
+    if brightest >> 8 == 255:
+        return brightest
+    return next((1 << bits) - 1 for bits in (8, 10, 12, 14, 16) if brightest >> bits == 0)
+
+
+def eight_bit(image: NDArray[Any], brightest: int = 0) -> NDArray[np.uint8]:
+    """Return 8-bit values of an image of 8 or 16 bit; brightest: of 16 bit, becomes 255."""
+    if image.dtype == np.uint8:
+        return image
+    import cv2
+
+    brightest = max(brightest or int(image.max()), 1)
+    return cv2.convertScaleAbs(image, alpha=255.0 / brightest)  # type: ignore[return-value]
 
 
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -106,9 +106,11 @@ def test_exif_colours_and_comment_of_the_camera_stay(thermal):
 
 
 def test_other_images_are_refused(thermal):
-    """16 bits become a JPEG."""
-    deep, small = np.full((616, 820), 9 << 8, np.uint16), np.zeros((60, 80), np.uint8)
-    assert corrected(thermal, png(deep)) == corrected(thermal, png((deep >> 8).astype(np.uint8)))
+    """12 and 16 bits become a JPEG."""
+    grey, small = np.full((616, 820), 250, np.uint8), np.zeros((60, 80), np.uint8)
+    for most in (4095, 65535):
+        deep = np.rint(grey * (most / 255)).astype(np.uint16)
+        assert corrected(thermal, png(deep)) == corrected(thermal, png(grey))
     far = CalibratedEpoch(calibrated(thermal).epoch, failed("outside_range", "90 °C"), {})
     for encoded, done, words in (
         (png(small), None, "80×60 px, the model's camera 820×616"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -39,6 +41,16 @@ def test_files_that_simplejpeg_refuses_are_read_by_opencv():
     with pytest.raises(ValueError):
         simplejpeg.decode_jpeg(bytes(damaged), "GRAY")
     check_grey_values(bytes(damaged))
+
+
+def test_a_tiff_is_not_turned():
+    """OpenCV turns it by its tag; the interior orientation is that of the sensor."""
+    grey = COLOURS[..., 1]
+    data = cv2.imencode(".tif", grey)[1].tobytes()
+    # the tag takes the place of the number of samples, which is 1 by default
+    samples, turn = (struct.pack("<HHIHH", *tag, 0) for tag in ((277, 3, 1, 1), (274, 3, 1, 6)))
+    assert samples in data
+    assert np.array_equal(decode_grey(data.replace(samples, turn)), grey)
 
 
 def test_a_truncated_jpeg_is_refused():

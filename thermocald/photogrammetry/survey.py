@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.arrays import eight_bit
 from thermocald.errors import GeometryError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -37,7 +38,7 @@ from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
-from thermocald.photogrammetry.targets.markers import locate_markers, to_8_bit
+from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.photogrammetry.targets.outline import LocalMap, find_circles, local_maps
 from thermocald.photogrammetry.targets.ring_code import SEARCHES, have_rings, is_ring, read_codes
 from thermocald.result import Result, with_sds
@@ -59,7 +60,7 @@ def measure_codes(image: Image, rows: dict[RingCode, int], grows: bool) -> Obser
 
     rows: row of each code; new codes are added if it `grows` and left out otherwise.
     """
-    grey = to_8_bit(image)
+    grey = eight_bit(image)
     maps, best = LocalMap.none(), dict[RingCode, int]()
     for scale, polarity in SEARCHES if grows or rows else ():
         candidates = find_circles(grey, scale, polarity)

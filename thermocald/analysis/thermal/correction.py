@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import Maps
-from thermocald.arrays import eight_bit
+from thermocald.arrays import eight_bit, full_scale
 from thermocald.errors import DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -160,7 +160,8 @@ class FrameCorrector:
         result = calibrated.adjustment
         if result.interior is None:
             raise ImageError(f"{result.status}: {result.reason}")
-        image = eight_bit(EncodedImage(encoded).as_it_is())
+        whole = EncodedImage(encoded).as_it_is()
+        image = eight_bit(whole, full_scale(whole))
         sensor = self.sensor
         if image.shape[:2] != (sensor.height, sensor.width):
             raise ImageError(

@@ -473,7 +473,10 @@ def pose_only(
     result = adjust(sensor, testfield, observations, interior, exterior, s, ~fits)
     if not result.ok:
         return result
-    if is_ambiguous(sensor, testfield, observations, interior):
+    # a plane has a second, mirrored pose
+    rms = [rms for rms, _ in resection(sensor, interior, points, observations.points)]
+    flat = plane_fit(points, 0.005)[2]
+    if flat and len(rms) > 1 and rms[1] < _AMBIGUITY * max(rms[0], 1e-9):
         return failed(
             "ambiguous_pose",
             "the targets lie in one plane and a second, mirrored pose fits nearly as well: show "
@@ -481,14 +484,3 @@ def pose_only(
             observations,
         )
     return result
-
-
-def is_ambiguous(
-    sensor: Sensor, testfield: TestField, observations: Observations, interior: InteriorOrientation
-) -> bool:
-    """Return whether a plane field's second, mirrored pose fits nearly as well as the first."""
-    points = testfield.points[observations.targets]
-    if not plane_fit(points, 0.005)[2]:
-        return False
-    rms = [rms for rms, _ in resection(sensor, interior, points, observations.points)]
-    return len(rms) > 1 and rms[1] < _AMBIGUITY * max(rms[0], 1e-9)

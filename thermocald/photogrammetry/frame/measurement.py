@@ -210,9 +210,8 @@ class _Frame:
         These are corners of markers and chessboards that were not detected or badly placed, and
         the corners of squares of ChArUco boards.
         """
-        again = {row for row, why in self._missed.items() if why in _WORTH_A_SECOND_LOOK}
-        if len(corners) < max(_FEW_CORNERS, len(again)):
-            again = set()
+        missed = self._missed.items() if len(corners) >= _FEW_CORNERS else ()
+        again = {row for row, why in missed if why in _WORTH_A_SECOND_LOOK}
         appearances = enumerate(zip(self._field.kinds, self._field.codes, strict=True))
         rows = sorted(again.union(row for row, how in appearances if how == ("chess_corner", "")))
         if len(corners) < _FEWEST or not rows:

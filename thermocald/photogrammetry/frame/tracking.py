@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
+from thermocald.arrays import full_scale
 from thermocald.photogrammetry.frame.measurement import (
     Measurement,
     add_unknown_tilts,
@@ -249,7 +250,7 @@ def _track_circles(
     rows, weights, tilts, seen = circles
     fit = weights.apply(image)
     old, p, misfit = weights.parameters, fit.parameters, fit.misfit
-    top = float(np.iinfo(image.dtype).max)
+    top = full_scale(image)
     level = max(float(np.median(misfit[seen])) if seen.any() else 1.0, 1.0)
     disturbed = (
         (np.abs(p[:, :2] - old[:, :2]).max(axis=1, initial=0.0) > RENEWED_AT_PX)

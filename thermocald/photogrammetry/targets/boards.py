@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from thermocald.arrays import eight_bit
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
@@ -30,7 +31,6 @@ from thermocald.photogrammetry.targets.markers import (
     halved,
     marker_rows,
     parse_marker,
-    to_8_bit,
 )
 from thermocald.photogrammetry.targets.markers import dictionary as markers_of
 
@@ -303,7 +303,7 @@ def locate_chessboards(
         chess_code(columns, rows, number)  # refuses a board that looks the same upside down
         boards.setdefault((columns, rows), {})[number] = row
     found = Corners.none()
-    grey = to_8_bit(image)
+    grey = eight_bit(image)
     for (columns, rows), row_of in boards.items():
         grid = _find_board(grey, columns, rows)
         if grid is None:

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from thermocald.arrays import Array, Image, Single, scratch
+from thermocald.arrays import Array, Image, Single, full_scale, scratch
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import inverse_2x2, scaled_solve
 from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
@@ -227,7 +227,7 @@ def fit_circles(
     normal = np.zeros((n, 10, 10))
     pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
     cut = np.zeros(n, dtype=bool)
-    top = np.iinfo(image.dtype).max
+    top = full_scale(image)
     for w in parts:
         mine = maps.select(w.rows)
         fitted = _step(w, mine, parameters[w.rows], noise, work)

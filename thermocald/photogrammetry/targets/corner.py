@@ -4,10 +4,12 @@ At a corner two straight edges meet. Blurred by the optics, its grey values foll
 that a bivariate normal variate lies in a quadrant, with the cosine between the edges' normals as
 the correlation. Position, both edge directions, blur, background, and contrast are estimated by
 Levenberg's method for many corners at once. The covariance is that of least squares with the
-variance of the fit's own residuals. The errors of a JPEG are correlated from pixel to pixel: across
-an edge they cancel, along it they add up. The correlation ρ of neighbouring residuals of all
-corners enlarges the variance by (1 + ρ)/(1 − ρ), that of a mean of a first-order autoregression.
-With a JPEG of quality 30 to 95, error over standard deviation is 0.8 to 1.6, most often 1.0 to 1.2.
+variance of the fit's own residuals. A gradient of the light (a lamp, its reflection) is estimated
+too where it is significant; everywhere it would cost up to 40 % of the precision. The errors of a
+JPEG are correlated from pixel to pixel: across an edge they cancel, along it they add up. The
+correlation ρ of neighbouring residuals of all corners enlarges the variance by (1 + ρ)/(1 − ρ),
+that of a mean of a first-order autoregression. With a JPEG of quality 30 to 95, error over standard
+deviation is 0.8 to 1.6, most often 1.0 to 1.2.
 
 If squares touch at a corner (chessboards, AprilGrids), the opposite quadrant is dark as well. The
 grey values decide whether it is added to the model.
@@ -24,6 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from thermocald.arrays import full_scale
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import first_reasons, normal_cdf
@@ -46,6 +49,8 @@ _SADDLE_REACH = 0.25  # of the marker's side
 _FAR = 40.0  # standard deviations of the blur; the series would overflow where a fit runs away
 _LARGEST_SATURATION = 0.3  # where paper is cut at full scale; sharpened edges alone reach a tenth
 _CUT = 0.05, 0.998  # the same where few pixels of paper are used: share, and paper over full scale
+_LEAST_SD = 0.3  # DN, of quantisation
+_CLEAR = 6.0  # times its variance, from which the light's squared gradient is corrected
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
 
@@ -214,7 +219,12 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
     px, py = x.astype(float), y.astype(float)
     away = np.hypot(px - corners[:, 0, None], py - corners[:, 1, None])
-    placed = np.column_stack([corners, *_inward_angles(found)])
+    # angles of both edges' normals: across one side, towards the other
+    sides, angles = ((found.before - corners).T, (found.after - corners).T), []
+    for (side_x, side_y), (other_x, other_y) in (sides, sides[::-1]):
+        towards = np.sign(side_x * other_y - side_y * other_x)
+        angles.append(np.arctan2(towards * side_x, -towards * side_y))
+    placed = np.column_stack([corners, *angles])
     d1, d2 = _from_edges(placed, px, py)
     # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
     margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
@@ -239,16 +249,6 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     contrast = np.where(np.abs(contrast) < 1, 1.0, contrast)
     p = np.column_stack([placed, np.full(n, 1.2), background, contrast])
     return _Pixels(px, py, grey, use, saddle), p, cut_off
-
-
-def _inward_angles(found: Corners) -> list[Array]:
-    """Return the angles (n,) of both edges' normals: across one side, towards the other."""
-    sides = (found.before - found.places).T, (found.after - found.places).T
-    angles = []
-    for (x, y), (other_x, other_y) in (sides, sides[::-1]):
-        towards = np.sign(x * other_y - y * other_x)
-        angles.append(np.arctan2(towards * x, -towards * y))
-    return angles
 
 
 def _from_edges(p: Array, x: Array, y: Array) -> tuple[Array, Array]:
@@ -304,14 +304,13 @@ def _minimise(pixels: _Pixels, p: Array) -> tuple[Array, Array, Single, Array]:
     return p, r, j, step
 
 
-def _correlation(pixels: _Pixels, p: Array, r: Array) -> float:
-    """Return the correlation of neighbouring residuals r (n, m), 0 if negative.
+def _correlation(pixels: _Pixels, p: Array, r: Array) -> Array:
+    """Return the correlation (n,) of neighbouring residuals r (n, m), 0 if negative: that of all
+    corners, or a corner's own if that is significantly larger, as where it is covered in part.
 
     Their mean profile across the edges, as of a sharpened image, is removed first: it is common to
     all corners, and symmetric.
     """
-    if not len(p):
-        return 0.0
     depth = _depth(*_from_edges(p[:, :4], pixels.x, pixels.y), pixels.saddle)
     contrast = p[:, 6, None]
     bins = np.rint(np.clip(2.0 * (depth + _REACH_PX), 0.0, 4.0 * _REACH_PX)).astype(np.int64)
@@ -323,7 +322,31 @@ def _correlation(pixels: _Pixels, p: Array, r: Array) -> float:
     beside = (np.diff(pixels.x, axis=1) == 1) & pixels.use[:, 1:]
     products = np.sum(r[:, 1:] * r[:, :-1], axis=1, where=beside) / beside.sum(axis=1)
     squares = np.sum(r * r, axis=1) / pixels.use.sum(axis=1)
-    return float(np.clip(np.median(products / np.maximum(squares, 1e-9)), 0.0, 0.9))
+    own = products / np.maximum(squares, 1e-9)
+    usual = np.median(own) if len(own) else 0.0
+    rho = np.where(own > usual + 3.0 / np.sqrt(beside.sum(axis=1)), own, usual)
+    return np.clip(rho, 0.0, 0.9)
+
+
+def _correct_light(pixels: _Pixels, p: Array, r: Array, j: Single, variance: Array) -> Array:
+    """Correct parameters and residuals in place for a gradient of the light, if it is significant.
+
+    Returns the cofactors (n, 2, 2) of the places. The gradient has a prior variance by which its
+    square exceeds the noise of many, so that the correction sets in continuously.
+    """
+    from_corner = np.stack([pixels.x, pixels.y], axis=2) - p[:, None, :2]
+    by_light = (pixels.grey - r)[..., None] * from_corner
+    every = np.concatenate([j, by_light], axis=2) * pixels.use[..., None]
+    N, b = np.swapaxes(every, 1, 2) @ every, (r[:, None] @ every)[:, 0]
+    Q = scaled_solve(N, np.eye(9)[None, :, 7:], 1e-12)[:, 7:]
+    light = np.sum(Q * b[:, None, 7:], axis=2)
+    noise = np.trace(Q, axis1=1, axis2=2) * variance
+    prior = np.maximum(np.sum(light**2, axis=1) - _CLEAR * noise, 1e-9 * noise + 1e-300) / 2
+    N[:, [7, 8], [7, 8]] += (variance / prior)[:, None]
+    step = scaled_solve(N, b, 1e-12)
+    p += step[:, :7]
+    r -= (every @ step[..., None])[..., 0]
+    return scaled_solve(N, np.eye(9)[None, :, :2], 1e-12)[:, :2]
 
 
 def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
@@ -331,13 +354,11 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     pixels, p, cut_off = _pixels(image, found)
     p, r, j, step = _minimise(pixels, p)
     m = pixels.use.sum(axis=1)
-    jw = j * pixels.use[..., None].astype(float)
-    normal_matrix = np.swapaxes(jw, 1, 2) @ j
-    cofactors = scaled_solve(normal_matrix, np.eye(7)[None, :, :2], 1e-12)[:, :2]
     variance = np.sum(r * r, axis=1) / np.maximum(m - 7, 1)
+    cofactors = _correct_light(pixels, p, r, j, variance)
     residual_sd = np.sqrt(variance)
     move = np.hypot(*(p[:, :2] - found.places).T)
-    top = np.iinfo(image.dtype).max
+    top = full_scale(image)
     saturated = pixels.use & (pixels.grey >= top)
     saturation = np.sum(saturated, axis=1) / np.maximum(m, 1)
     tests = (
@@ -357,12 +378,13 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
             "no corner where the marker has one",
         ),
         (np.abs(np.cos(p[:, 2] - p[:, 3])) > 0.95, "too oblique"),
-        (np.abs(p[:, 6]) < 5 * residual_sd, "too little contrast"),
+        # an area of one grey value, as of a shadow, has no residuals
+        (np.abs(p[:, 6]) < 5 * np.maximum(residual_sd, _LEAST_SD), "too little contrast"),
     )
     reasons = first_reasons(tests)
     good = reasons == ""
     rho = _correlation(_Pixels(*(v[good] for v in pixels)), p[good], r[good])
-    variance *= (1 + rho) / (1 - rho)
+    variance[good] *= (1 + rho) / (1 - rho)
     quality = {
         # without the width of the pixel
         "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),

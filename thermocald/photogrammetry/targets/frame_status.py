@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import cv2
 import numpy as np
 
+from thermocald.arrays import full_scale
 from thermocald.photogrammetry.linalg import mad_sd
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
     levels = int(np.iinfo(image.dtype).max) + 1  # counted, since sorting takes twice as long
     count = np.cumsum(cv2.calcHist([sample], [0], None, [levels], [0, levels]), dtype=float)
     low, high = np.searchsorted(count / sample.size, np.array(_PERCENTILES) / 100)
-    top = 255 if image.dtype == np.uint8 else max(int(sample.max()), 1023)
+    top = max(full_scale(sample), 255 if image.dtype == np.uint8 else 1023)
     if high - low < _LEAST_CONTRAST / 255 * top:
         if high < 0.12 * top:
             return FrameStatus("black", f"the frame is black (grey values up to {high} DN)")

@@ -12,6 +12,7 @@ of a JPEG); PNG specification (third edition), 11.3.
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,8 @@ _set_log_level(2)  # errors: of a damaged file we tell
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SOS, _EOI = 0xDA, 0xD9
-_TIFF_SIZE, _SHORT = (256, 257), 3  # tags of width and height; the type of 16 bit
+_TIFF = b"II*\0", b"MM\0*"
+_WIDTH, _HEIGHT, _ORIENTATION, _SHORT = 256, 257, 274, 3  # tags; the type of 16 bit
 _MOST_TAGS = 500
 
 
@@ -62,15 +64,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
             at = next(begin for marker, begin, _ in _segments(data) if marker in _FRAMES)
             height, width = struct.unpack(">HH", data[at + 5 : at + 9])
             return width, height
-        if data[:4] in (b"II*\0", b"MM\0*"):
-            order = "<" if data[:2] == b"II" else ">"
-            (start,) = struct.unpack_from(order + "I", data, 4)
-            (count,) = struct.unpack_from(order + "H", data, start)
-            tags = data[start + 2 : start + 2 + 12 * min(count, _MOST_TAGS)]
-            size = {}
-            for tag, kind, _, raw in struct.iter_unpack(order + "HHI4s", tags):
-                (size[tag],) = struct.unpack_from(order + ("H" if kind == _SHORT else "I"), raw)
-            width, height = (size.get(tag, 0) for tag in _TIFF_SIZE)
+        if data[:4] in _TIFF:
+            tags = _tiff_tags(data)
+            (width,), (height,) = (
+                struct.unpack_from(form, data, at) for form, at in (tags[_WIDTH], tags[_HEIGHT])
+            )
             return (width, height) if width and height else None
         if data[:2] == b"BM":
             width, height = struct.unpack("<ii", data[18:26])
@@ -80,9 +78,21 @@ def image_size(data: bytes) -> tuple[int, int] | None:
                 w for line in data[:4096].split(b"\n") for w in line.partition(b"#")[0].split()
             ]
             return int(words[1][:9]), int(words[2][:9])
-    except (struct.error, ValueError, IndexError, StopIteration):
+    except (struct.error, ValueError, LookupError, StopIteration):
         pass
     return None
+
+
+def _tiff_tags(data: bytes) -> dict[int, tuple[str, int]]:
+    """Return format and place of the value of each tag in a TIFF's first directory."""
+    order = "<" if data[:2] == b"II" else ">"
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    tags = {}
+    for at in range(start + 2, start + 2 + 12 * min(count, _MOST_TAGS), 12):
+        tag, kind = struct.unpack_from(order + "HH", data, at)
+        tags[tag] = order + ("H" if kind == _SHORT else "I"), at + 8
+    return tags
 
 
 _MOST_PIXELS = 250_000_000
@@ -116,7 +126,7 @@ class EncodedImage:
     def whole(self) -> NDArray[Any]:
         """Return grey values (H, W), 8 or 16 bit.
 
-        EXIF's orientation flag is ignored, since the interior orientation is that of the sensor.
+        The orientation flag is ignored, since the interior orientation is that of the sensor.
         """
         if self._is_jpeg:
             try:
@@ -135,8 +145,13 @@ class EncodedImage:
         return self._decode(cv2.IMREAD_UNCHANGED)
 
     def _decode(self, flags: int) -> NDArray[Any]:
+        data = bytearray(self.data)
+        if data[:4] in _TIFF:  # OpenCV turns it, whatever the flags
+            with suppress(struct.error, KeyError):
+                form, at = _tiff_tags(self.data)[_ORIENTATION]
+                struct.pack_into(form, data, at, 1)
         try:
-            image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(self.data, np.uint8), flags)
+            image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error as error:
             raise ImageError(
                 f"{self.name}: is not an image that can be decoded ({error.err})"
@@ -151,7 +166,7 @@ class EncodedImage:
 def decode_grey(source: Path | bytes) -> NDArray[Any]:
     """Return grey values (H, W), 8 or 16 bit, of an image file or of encoded bytes.
 
-    EXIF's orientation flag is ignored. Raises ImageError if something is wrong with the file.
+    The orientation flag is ignored. Raises ImageError if something is wrong with the file.
     """
     return EncodedImage(source).whole()
 

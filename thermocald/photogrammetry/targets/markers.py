@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from thermocald.arrays import eight_bit
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.targets.corner import Corners
 
@@ -161,13 +162,6 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
     return parts[0], marker, corner
 
 
-def to_8_bit(image: Image) -> NDArray[np.uint8]:
-    """Return the image; one of 16 bit is scaled so that its brightest value is 255."""
-    if image.dtype == np.uint8:
-        return image  # type: ignore[return-value]
-    return cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))  # type: ignore[return-value]
-
-
 def halved(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the image at half its size: x in it is 2·x + ½ in the original."""
     return cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
@@ -194,7 +188,7 @@ def detect_markers(
     size first, at full size if half of the markers or fewer were found, and then, for AprilTags,
     with the wide border of Kalibr's AprilGrids, in the end smoothed.
     """
-    grey = to_8_bit(image)
+    grey = eight_bit(image)
     best: dict[int, Array] = {}
     best_border = 1
     for border, scale, searched in _searches(grey, name.startswith("DICT_APRILTAG")):

@@ -34,13 +34,13 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from thermocald.arrays import eight_bit
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.targets.circle import normal_cdf
 from thermocald.photogrammetry.targets.markers import (
     detect_markers,
     is_marker,
     parse_marker,
-    to_8_bit,
 )
 from thermocald.photogrammetry.targets.outline import RING_INNER, RING_OUTER, LocalMap, find_circles
 
@@ -406,7 +406,7 @@ def find_coded(
     best: dict[int, int] = {}  # place among the candidates by row
     maps, foreign = LocalMap.none(), False
     if row_of or named:
-        grey = to_8_bit(image)
+        grey = eight_bit(image)
         enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
         for scale, polarity in SEARCHES if image.shape[1] > _LARGE_WIDTH else SEARCHES[2:]:
             candidates = find_circles(grey, scale, polarity)

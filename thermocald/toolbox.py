@@ -183,8 +183,13 @@ def predict(
     test = list(test)
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
-    if channels is not None and temperature is None:
-        raise UsageError("channels belong to a temperature; a log has its own")
+    for name, value, other, needed in (
+        ("channels", channels, "temperature", temperature),
+        ("log_options", log_options, "log", log),
+        ("camera", camera, "programme", programme),
+    ):
+        if value is not None and needed is None:
+            raise UsageError(f"{name} would be ignored: give it with a {other}")
     require_within(
         temperature=(temperature, COLDEST_C), distance_m=(distance_m, 0.01),
         wanted_mm=(wanted_mm, 1e-3),

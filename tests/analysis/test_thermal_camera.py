@@ -100,7 +100,7 @@ def test_missing_readings_are_refused():
     """Also those of a second thermometer, and no NumPy number is."""
     heated = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5})
     camera, two = (ThermalCamera(thermal_model(*effects)) for effects in (LISTED, [heated]))
-    with pytest.raises(UsageError, match="temperature is NaN: give °C"):
+    with pytest.raises(UsageError, match="temperature is nan: give one in °C"):
         camera.at(float("nan"))
     for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
         with pytest.raises(UsageError, match="for each of its times"):

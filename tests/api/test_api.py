@@ -240,6 +240,12 @@ OUT_OF_BOUNDS = {
     "c is given twice": lambda M1: M1.calibrate(free="c,x0,c"),
     r"free is \['c', 0\]": lambda M1: M1.calibrate(free=["c", 0]),
     "seeds is 0": lambda M1: tc.plan(M1, seeds=0),
+    "give one set-up": lambda M1: tc.plan(M1, preset="nexus5-cold"),
+    "give one set-up: a": lambda _: tc.plan(preset="nexus5-cold", model=MODEL),
+    "~no one/x: does not exist": lambda _: tc.open("~no one/x"),
+    "camera would be ignored": lambda _: tc.predict(MODEL, 35.0, camera="cold.json"),
+    "interior: is a calibrated": lambda _: tc.predict(MODEL, programme="p", camera="cold.json"),
+    "--exterior zz": lambda M1: M1.measured(exterior="zz"),
     "epochs is 0": lambda M1: simulated(epochs=0),
     "give finite": lambda M1: simulated(lamp=[(0, float("nan"))]),
     "in the order of time": lambda M1: simulated(lamp=[(9, 1), (0, 3)]),
@@ -257,7 +263,7 @@ OUT_OF_BOUNDS = {
         timezone="UTC", log_options={"timezone": "UTC", "temperature_column": "T 1"}
     ),
     "unit is 3; it must be text": lambda M1: imported(log_options={"unit": 3}),
-    "channels belong to a temperature": lambda M1: tc.predict(
+    "channels would be ignored: give it with a temperature": lambda M1: tc.predict(
         MODEL, log="M1", channels={"temperature": 30.0}
     ),
 }
@@ -311,6 +317,11 @@ OF_A_CAMERA = {
     "a time is not known": lambda c: c.along(["noon"] * 3, HOT),
     "a time is not known: .* datetime64": lambda c: c.along(HIDDEN, HOT),
     "a time is not known: give": lambda c: c.live().update(np.nan, 30.0),
+    "a time is not known: give s": lambda c: c.along(TIMES, HOT, since=np.nan),
+    "since 1000.0: is outside": lambda c: c.along(TIMES, HOT, since=1000.0),
+    "temperature is inf": lambda c: c.along(TIMES, HOT, relative_to=np.inf),
+    "the temperature is inf": lambda c: fed(c).correct(FRAME, to=np.inf),
+    "an array .H, W. or .H, W, c": lambda c: fed(c).correct(np.zeros((2464, 3280, 3, 2), np.uint8)),
     "a temperature is no number": lambda c: c.along(TIMES, "hot"),
     "temperature is {'board': '30'}": lambda c: c.live().update(0.0, {"board": "30"}),
     "the frame is a list: give an array": lambda c: c.live().correct([[1, 2], [3, 4]]),
@@ -328,7 +339,7 @@ OF_A_CAMERA = {
 ANY = {
     "at", "centre", "changes", "codes", "diameters", "epochs", "frame", "image_points",
     "interior", "kinds", "names", "numbers", "offsets", "plane", "points", "pose", "R", "rows",
-    "seen", "settings", "sigma", "sigmas", "temperatures", "time", "times", "values",
+    "seen", "settings", "sigma", "sigmas", "since", "temperatures", "time", "times", "values",
 }  # fmt: skip
 
 
@@ -386,7 +397,9 @@ def test_times_of_pandas_with_and_without_a_zone(camera):
     plain = pandas.date_range("2020-07-01 12:00", periods=3, freq="min")
     berlin = plain.tz_localize("UTC").tz_convert("Europe/Berlin")
     wanted = 1593604800.0 + np.array([0.0, 60.0, 120.0])
-    for times in (plain, berlin, pandas.Series(berlin), list(berlin), berlin.to_pydatetime()):
+    texts = [time.isoformat() for time in berlin]
+    objects = berlin.to_pydatetime()
+    for times in (plain, berlin, pandas.Series(berlin), list(berlin), objects, texts):
         np.testing.assert_array_equal(camera.along(times, HOT).times, wanted)
         assert camera.live().update(times[0], 30.0).temperature == 30.0
     np.testing.assert_array_equal(camera.along(plain - plain[0], HOT).times, wanted - wanted[0])
@@ -399,6 +412,15 @@ def test_one_image_point_is_an_array_of_one(camera):
     for method in (now.undistort, now.rays, now.point_covariance):
         np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
     np.testing.assert_array_equal(now.project(POINT[0], [0.0] * 6), now.project(POINT, [0.0] * 6))
+    assert fed(camera).correct(FRAME[..., None]).shape == (*FRAME.shape, 1)
+
+
+def test_a_course_is_sliced_and_a_camera_is_a_key(camera):
+    along = camera.along(TIMES, HOT, since=np.datetime64(0, "s"))
+    for part in (along[1:], along[[1, 2]], along[along.temperatures > 25.0]):
+        np.testing.assert_array_equal(part.sd, along.sd[1:])
+    assert repr(along[:0]) == "<Along rpi-v2.1: 0 times>"
+    assert {camera: 1}[pickle.loads(pickle.dumps(camera))] == 1
 
 
 def test_a_copy_is_no_second_measurement(short, M2, inside, tmp_path):

@@ -200,8 +200,8 @@ def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
             f"{other.path}: at which temperature? Write 21.5={other.path}, or give the "
             "thermometer's --log"
         )
-    if other.camera.sensor != first.camera.sensor:
-        raise UsageError(f"{other.path}: is of another sensor than {first.path}")
+    if (other.camera.name, other.camera.sensor) != (first.camera.name, first.camera.sensor):
+        raise UsageError(f"{other.path}: is of another camera or sensor than {first.path}")
     own = np.flatnonzero(np.diag(other.camera.covariance) > 0)
     held = np.setdiff1d(np.arange(10), free)
     same = other.camera.values[held] == first.camera.values[held]

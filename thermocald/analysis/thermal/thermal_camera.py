@@ -32,12 +32,12 @@ from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
     moved_model,
+    one_time,
     predict_orientations,
     read_history,
     require_sd,
     steady_table,
 )
-from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
@@ -78,6 +78,9 @@ class ThermalCamera(Result):
 
     model: ThermalModel
     fitted: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    def __hash__(self) -> int:
+        return hash((self.model.camera, self.model.T0, self.model.interior))
 
     def save(self, path: Path | str) -> Path:
         """Write the model file (YAML), whole or not at all, and return its path.
@@ -250,6 +253,8 @@ class ThermalCamera(Result):
         self, T: float, channels: Mapping[str, float] | None = None
     ) -> tuple[Array, Array, Array]:
         """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p)."""
+        if not math.isfinite(T):
+            raise UsageError(f"the temperature is {T}: give one in °C")
         model, names = self.model, self.parameters
         table, knees = steady_table(model, names, channels) if channels else self._table
         dT = T - model.T0
@@ -281,8 +286,6 @@ class ThermalCamera(Result):
         thermometer that the model does not know.
         """
         T = float(temperature)
-        if math.isnan(T):
-            raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
         known = list(dict.fromkeys([*self.model.validity, *self.channels]))
         for name, value in (channels or {}).items():
@@ -318,15 +321,15 @@ class ThermalCamera(Result):
         extrapolate: bool = False,
         relative_to: float | None = None,
         temperature_sd: float = 0.0,
-        since: float | None = None,
+        since: Any = None,
     ) -> Along:
         """Return the camera along a temperature log, including effects with a memory.
 
         times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
         the reference first; at (E,): the times to predict for, by default `times`. The history
         begins with the first time. relative_to °C: the covariance is that of the difference from
-        the steady camera at this temperature; since s: instead, of the difference from the camera
-        at this time; temperature_sd K: of a reading, is propagated into the
+        the steady camera at this temperature; since: instead, of the difference from the camera
+        at this time of the log; temperature_sd K: of a reading, is propagated into the
         covariance (as if no effect had a memory, which would average it). Raises UsageError far
         outside the model's validity (unless `extrapolate`), for lengths that differ and for times
         that run backwards, DataError for times `at` that the log does not cover.
@@ -352,7 +355,9 @@ class ThermalCamera(Result):
         if relative_to is not None:
             base = self._steady(relative_to)[2]
         elif since is not None:
-            then = np.array([since - begin])
+            then = np.array([one_time(since, "since") - begin])
+            if not t[0] <= then[0] <= t[-1]:
+                raise DataError(f"since {since}: is outside the temperature log")
             base = predicted(history.at(then))[2]
             of_base = interpolation_matrix(t, then).toarray()[0]
         for first in range(0, len(history.times), _CHUNK):
@@ -415,7 +420,7 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
-    return ThermalCamera(read_model(Path(path).expanduser()))
+    return ThermalCamera(read_model(Path(path)))
 
 
 def _push(followers: list[Any], time: float, value: float) -> Array:
@@ -515,8 +520,10 @@ class LiveCamera:
         import cv2
 
         sensor = self.thermal.model.sensor
-        if not isinstance(frame, np.ndarray) or frame.ndim < 2:
-            raise UsageError(f"the frame is a {type(frame).__name__}: give an array (H, W)")
+        if not isinstance(frame, np.ndarray) or frame.ndim not in (2, 3):
+            raise UsageError(
+                f"the frame is a {type(frame).__name__}: give an array (H, W) or (H, W, channels)"
+            )
         if frame.shape[:2] != (sensor.height, sensor.width):
             raise UsageError(
                 f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "
@@ -525,9 +532,11 @@ class LiveCamera:
             )
         maps = self.maps(to)
         try:
-            return cv2.remap(frame, *maps, cv2.INTER_LINEAR)
+            return cv2.remap(frame, *maps, cv2.INTER_LINEAR).reshape(frame.shape)
         except cv2.error:
-            raise UsageError(f"a frame of {frame.dtype} cannot be resampled; give uint8") from None
+            raise UsageError(
+                f"a frame of {frame.dtype} cannot be resampled; give uint8, uint16 or float32"
+            ) from None
 
     def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.
@@ -544,9 +553,7 @@ class LiveCamera:
 
     def _checked(self, time: Any, temperature: float | Mapping[str, float]) -> tuple[float, ...]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
-        if np.ndim(time):
-            raise UsageError("time: give one time for a reading")
-        t = float(seconds(time))
+        t = one_time(time, "time")
         given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
         names, row = tuple(given), tuple(float(v) for v in given.values())
         if not row:

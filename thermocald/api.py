@@ -450,7 +450,12 @@ def paths_of(given: Paths) -> list[Path]:
 def _model_of(model: Model | None) -> ThermalModel | None:
     if model is None or isinstance(model, ThermalModel):
         return model
-    return (model if isinstance(model, ThermalCamera) else load_camera(model)).model
+    return thermal_of(model).model
+
+
+def thermal_of(model: ThermalCamera | Path | str) -> ThermalCamera:
+    """Return a thermal camera, loaded if it is given by its file."""
+    return model if isinstance(model, ThermalCamera) else load_camera(model)
 
 
 def _is_file(given: Path | str) -> bool:

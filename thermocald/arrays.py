@@ -47,9 +47,7 @@ def seconds(times: ArrayLike) -> Array:
     except (TypeError, ValueError):
         found = np.full(1, np.nan)
     if not np.isfinite(found).all() or np.ma.is_masked(times):
-        raise UsageError(
-            "a time is not known: give seconds since 1970-01-01 UTC, datetime64, or ISO text"
-        )
+        raise UsageError("a time is not known: give s since 1970-01-01 UTC, datetime64, ISO text")
     return found
 
 

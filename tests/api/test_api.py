@@ -243,7 +243,7 @@ OUT_OF_BOUNDS = {
     "give one set-up": lambda M1: tc.plan(M1, preset="nexus5-cold"),
     "give one set-up: a": lambda _: tc.plan(preset="nexus5-cold", model=MODEL),
     "~no one/x: does not exist": lambda _: tc.open("~no one/x"),
-    "camera would be ignored": lambda _: tc.predict(MODEL, 35.0, camera="cold.json"),
+    "give a programme too": lambda _: tc.predict(MODEL, 35.0, camera="cold.json"),
     "interior: is a calibrated": lambda _: tc.predict(MODEL, programme="p", camera="cold.json"),
     "--exterior zz": lambda M1: M1.measured(exterior="zz"),
     "epochs is 0": lambda M1: simulated(epochs=0),
@@ -263,7 +263,7 @@ OUT_OF_BOUNDS = {
         timezone="UTC", log_options={"timezone": "UTC", "temperature_column": "T 1"}
     ),
     "unit is 3; it must be text": lambda M1: imported(log_options={"unit": 3}),
-    "channels would be ignored: give it with a temperature": lambda M1: tc.predict(
+    "channels belong to a temperature": lambda M1: tc.predict(
         MODEL, log="M1", channels={"temperature": 30.0}
     ),
 }
@@ -317,8 +317,8 @@ OF_A_CAMERA = {
     "a time is not known": lambda c: c.along(["noon"] * 3, HOT),
     "a time is not known: .* datetime64": lambda c: c.along(HIDDEN, HOT),
     "a time is not known: give": lambda c: c.live().update(np.nan, 30.0),
-    "a time is not known: give s": lambda c: c.along(TIMES, HOT, since=np.nan),
-    "since 1000.0: is outside": lambda c: c.along(TIMES, HOT, since=1000.0),
+    "not known: give s since": lambda c: c.along(TIMES, HOT, since=np.nan),
+    "1 of 1 times are outside": lambda c: c.along(TIMES, HOT, since=1000.0),
     "temperature is inf": lambda c: c.along(TIMES, HOT, relative_to=np.inf),
     "the temperature is inf": lambda c: fed(c).correct(FRAME, to=np.inf),
     "an array .H, W. or .H, W, c": lambda c: fed(c).correct(np.zeros((2464, 3280, 3, 2), np.uint8)),

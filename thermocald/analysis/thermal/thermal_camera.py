@@ -17,7 +17,7 @@ raises UsageError unless extrapolation is requested explicitly.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -297,6 +297,7 @@ class ThermalCamera(Result):
         values, slope, J = self._steady(T, channels)
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
         beyond, covariance = 0.0, self._propagated(J, slope, temperature_sd**2)
+        covariance += temperature_sd**2 * self._noise_of(others)
         if others or not self.validity.low <= T <= self.validity.high:
             (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
             covariance += np.diag(drift)
@@ -355,9 +356,8 @@ class ThermalCamera(Result):
         if relative_to is not None:
             base = self._steady(relative_to)[2]
         elif since is not None:
-            then = np.array([one_time(since, "since") - begin])
-            if not t[0] <= then[0] <= t[-1]:
-                raise DataError(f"since {since}: is outside the temperature log")
+            at = one_time(since, "since")
+            then = read_history(times, temperatures, at, self.model.T0)[1] - begin
             base = predicted(history.at(then))[2]
             of_base = interpolation_matrix(t, then).toarray()[0]
         for first in range(0, len(history.times), _CHUNK):
@@ -366,7 +366,9 @@ class ThermalCamera(Result):
             shares = W.power(2).sum(axis=1) - 2.0 * (W @ of_base) + of_base @ of_base
             found, slope, J = predicted(part)
             values.append(found)
-            covariance.append(self._propagated(J - base, slope, temperature_sd**2 * shares))
+            noise = np.asarray(temperature_sd**2 * shares)
+            of_others = noise[:, None, None] * self._noise_of(others)
+            covariance.append(self._propagated(J - base, slope, noise) + of_others)
         Q = np.concatenate(covariance)
         Q[:, range(10), range(10)] += drift
         return Along(
@@ -389,15 +391,28 @@ class ThermalCamera(Result):
         outside = self.validity.check(T, extrapolate)
         variance = (rates * outside[:, None]) ** 2
         drift: Array | float = 0.0
-        for effect in self.model.effects:
-            name = str(effect.values.get("channel", ""))
+        for name in self.channels:
             if name in others and name in self.model.validity:
                 of_fit = Validity(*self.model.validity[name], name)
                 beyond = of_fit.check(others[name], extrapolate)
-                own = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
                 outside = np.maximum(outside, beyond)
-                drift = drift + np.abs(beyond[:, None] * own)
+                drift = drift + np.abs(beyond[:, None] * self._slope_of(name))
         return outside, variance + drift**2
+
+    def _slope_of(self, channel: str) -> Array:
+        """Return the change (10,) of the parameters per kelvin of another thermometer."""
+        own = [e.values for e in self.model.effects if e.values.get("channel") == channel]
+        return np.array([sum(float(v.get(n, 0.0)) for v in own) for n in IOP_NAMES])
+
+    def _noise_of(self, channels: Iterable[str]) -> Array:
+        """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
+        total = np.zeros((10, 10))
+        for name in channels:
+            fits = [f for f in self.model.fitted_on if name in f.get("other_sds_K", ())]
+            ratios = [f["other_sds_K"][name] / f["thermometer_sd_K"] for f in fits]
+            own = (float(np.median(ratios)) if ratios else 1.0) * self._slope_of(name)
+            total += np.outer(own, own)
+        return total
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
@@ -534,9 +549,7 @@ class LiveCamera:
         try:
             return cv2.remap(frame, *maps, cv2.INTER_LINEAR).reshape(frame.shape)
         except cv2.error:
-            raise UsageError(
-                f"a frame of {frame.dtype} cannot be resampled; give uint8, uint16 or float32"
-            ) from None
+            raise UsageError(f"a frame of {frame.dtype} cannot be resampled; give uint8") from None
 
     def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.

@@ -226,13 +226,9 @@ class Along:
         if np.ndim(self.times[i]):
             return replace(self, **{name: getattr(self, name)[i] for name in _OF_TIMES})
         return Camera(
-            self.sensor,
-            float(self.temperatures[i]),
-            self.values[i],
-            self.covariance[i],
-            float(self.extrapolated[i]),
-            self.camera,
-        )
+            self.sensor, float(self.temperatures[i]), self.values[i], self.covariance[i],
+            float(self.extrapolated[i]), self.camera,
+        )  # fmt: skip
 
     @property
     def sd(self) -> Array:

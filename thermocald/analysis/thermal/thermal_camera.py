@@ -372,14 +372,9 @@ class ThermalCamera(Result):
         Q = np.concatenate(covariance)
         Q[:, range(10), range(10)] += drift
         return Along(
-            self.model.sensor,
-            instants,
-            history.temperature(),
-            np.concatenate(values),
-            Q,
-            outside,
+            self.model.sensor, instants, history.temperature(), np.concatenate(values), Q, outside,
             self.model.camera,
-        )
+        )  # fmt: skip
 
     def _beyond(
         self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool

@@ -18,11 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.series.drift import with_drifts
-from thermocald.analysis.series.recorded import (
-    misplaced_doubts,
-    replay_into,
-    series_epochs,
-)
+from thermocald.analysis.series.recorded import misplaced_doubts, replay_into, series_epochs
 from thermocald.analysis.study.measured import measured_series
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError

@@ -207,12 +207,8 @@ class HypothesisFitter:
                 before, *_ = carried.get(id(operator), (0.0,))
                 carried[id(operator)] = (d + before, operator, channel)
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
-        return prepare(
-            self.series[series],
-            list(carried.values()),
-            list(unresolved.values()),
-            self.thermometer_factor,
-        )
+        both = list(carried.values()), list(unresolved.values())
+        return prepare(self.series[series], *both, self.thermometer_factor)
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array:
         """Return the sd (E,) of a trajectory beyond the readings' errors.

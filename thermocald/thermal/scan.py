@@ -340,15 +340,9 @@ def examine(fitter: HypothesisFitter, fit: Fit, series: int) -> Adequacy:
     free = scores.size
     excess = max(total - free, 0.0)
     coordinates = 2.0 * float(evidence.n.sum())
-    return Adequacy(
-        scores,
-        amplitudes,
-        directions,
-        trajectories,
-        excess,
-        (total - free) / np.sqrt(2.0 * free),
-        evidence.sigma_px * float(np.sqrt(excess * evidence.correlation / coordinates)),
-    )
+    misfit_px = evidence.sigma_px * float(np.sqrt(excess * evidence.correlation / coordinates))
+    significance = (total - free) / np.sqrt(2.0 * free)
+    return Adequacy(scores, amplitudes, directions, trajectories, excess, significance, misfit_px)
 
 
 _WORTH_PX = 0.0005
@@ -391,10 +385,6 @@ def relinearise(
     b = e.b - np.einsum("eti,tik->ek", weights[..., :2] * change, e.columns)
     values = solve(e.N, b)
     return replace(
-        e,
-        b=b,
-        values=values,
-        yy=np.einsum("ek,ek->e", values, b),
-        hidden=e.hidden.less(change) if e.hidden else None,
-        bend=bend,
-    )
+        e, b=b, values=values, yy=np.einsum("ek,ek->e", values, b),
+        hidden=e.hidden.less(change) if e.hidden else None, bend=bend,
+    )  # fmt: skip

@@ -175,8 +175,7 @@ def _average_epochs(
         if fine:
             runs = np.flatnonzero(np.diff(at // fine, prepend=-1))
             sums[at[runs] // fine] += np.add.reduceat(_shift_and_scale(p, w, middle), runs, axis=0)
-    if middle is None:
-        middle = np.full((targets, 2), np.nan)
+    assert middle is not None  # there are epochs
     determinant = normal[..., 0] * normal[..., 1] - normal[..., 2] ** 2
     there = determinant > 0
     d = np.where(there, determinant, 1.0)
@@ -359,18 +358,8 @@ def _start_input(
     reading_times: Array, readings: Mapping[str, Array], grid: ObservationGrid,
 ) -> SeriesInput:  # fmt: skip
     camera = head.camera
+    resolutions = {channel: c.resolution for channel, c in head.channels.items()}
     return SeriesInput(
-        name=name,
-        camera=camera.name,
-        sensor=camera.sensor,
-        field=field,
-        principal_distance=camera.principal_distance,
-        frame_times=frame_times,
-        reading_times=reading_times,
-        readings=readings,
-        resolutions={channel: c.resolution for channel, c in head.channels.items()},
-        grid=grid,
-        numbers=numbers,
-        series=head.series,
-        interior=camera.interior,
-    )
+        name, camera.name, camera.sensor, field, camera.principal_distance, frame_times,
+        reading_times, readings, resolutions, grid, numbers, head.series, camera.interior,
+    )  # fmt: skip

@@ -40,11 +40,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     rays,
 )
 from thermocald.photogrammetry.camera.conversions import opencv_terms
-from thermocald.photogrammetry.targets.image_file import (
-    EncodedImage,
-    with_comment,
-    with_metadata,
-)
+from thermocald.photogrammetry.targets.image_file import EncodedImage, with_comment, with_metadata
 from thermocald.result import jsonable, with_sds
 from thermocald.store.logger.clock import ORDERS, DeviceClock, date_orders, parse_moment
 

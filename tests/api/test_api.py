@@ -224,7 +224,7 @@ def simulated(**more):
 
 
 FIELD, MODEL = "M1/testfield.csv", "camera.yaml"
-ONE = {"cold.json": "26"}
+ONE, TWICE = {"cold.json": "26"}, {"cold.json": 9.0, "./cold.json": 26.0}
 OUT_OF_BOUNDS = {
     "window is -1": lambda M1: tc.study(M1, window=-1),
     "clusters_mm is 3; it must be a list .each": lambda M1: tc.reference_study(clusters_mm=3),
@@ -251,6 +251,8 @@ OUT_OF_BOUNDS = {
     "temperature is nan": lambda M1: tc.predict(MODEL, np.nan),
     "size 9×0 px is impossible": lambda M1: tc.correct("x.csv", MODEL, log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1: tc.fit_calibrations({}),
+    "holds the same camera as c": lambda _: tc.fit_calibrations(TWICE),
+    "warm.json: at which": lambda _: tc.fit_calibrations({"cold.json": 9.0, "warm.json": np.inf}),
     "sigma_px is 0": lambda M1: tc.check_testfield(FIELD, sigma_px=0.0),
     "roll is nan": lambda M1: tc.check_testfield(FIELD, roll=np.nan),
     "pixel_pitch is -1": lambda M1: tc.survey_testfield(["photos"], pixel_pitch=-1.0),

@@ -9,6 +9,7 @@ import pytest
 
 import thermocald as tc
 from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.analysis.thermal.correction import correct_points
 from thermocald.analysis.thermal.modelled_camera import ExtrapolationWarning
 from thermocald.analysis.thermal.predictions import predict_along, warm_up
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -125,6 +126,22 @@ def test_the_noise_of_another_thermometer_is_propagated():
     c, d = (camera.at(30.0, sd, {"board": 40.0}).covariance for sd in (0.0, 0.2))
     for change in (b - a, d - c):
         np.testing.assert_allclose(change[:3, :3], wanted, rtol=1e-6)
+
+
+def test_a_camera_with_two_thermometers_is_predicted_and_corrected():
+    """To the state in which both are as warm; they raised DataError."""
+    heated = ModelEffect("second_heat_source", {"channel": "board", "x0": 1e-4})
+    two, point = ThermalCamera(thermal_model(heated)), np.array([[100.0, 200.0]])
+    T0, pitch = two.model.T0, two.model.sensor.pixel_pitch
+    for warmer in (0.0, 20.0):
+        columns = {"temperature": np.full(2, T0), "board": np.full(2, T0 + warmer)}
+        log = TemperatureLog(np.array([0.0, 10.0]), columns)
+        moved = correct_points(two, log, np.array([5.0]), point)[0] - point
+        np.testing.assert_allclose(moved, [[-warmer * 1e-4 / pitch, 0.0]], atol=1e-6)
+    live = two.live()
+    live.update(0.0, {"temperature": T0, "board": T0})
+    assert np.ptp(live.maps()[0] - live.maps()[0][0]) < 1e-3
+    assert "the drift since" in str(tc.predict(two, 30.0, channels={"board": 45.0}))
 
 
 def test_the_object_error_equals_differences():

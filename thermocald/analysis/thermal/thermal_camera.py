@@ -141,9 +141,7 @@ class ThermalCamera(Result):
 
         Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
         """
-        (then, _, J0), (now, _, J) = (
-            self._steady(t, dict.fromkeys(self.channels, t)) for t in (since, T)
-        )
+        (then, _, J0), (now, _, J) = (self._steady(t) for t in (since, T))
         return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
@@ -252,7 +250,11 @@ class ThermalCamera(Result):
     def _steady(
         self, T: float, channels: Mapping[str, float] | None = None
     ) -> tuple[Array, Array, Array]:
-        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p)."""
+        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p).
+
+        channels: °C of the other thermometers, by default as warm.
+        """
+        channels = dict.fromkeys(self.channels, T) if channels is None else channels
         if not math.isfinite(T):
             raise UsageError(f"the temperature is {T}: give one in °C")
         model, names = self.model, self.parameters
@@ -294,7 +296,7 @@ class ThermalCamera(Result):
                 raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
-        values, slope, J = self._steady(T, channels)
+        values, slope, J = self._steady(T, channels or {})
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
         beyond, covariance = 0.0, self._propagated(J, slope, temperature_sd**2)
         covariance += temperature_sd**2 * self._noise_of(others)
@@ -397,7 +399,9 @@ class ThermalCamera(Result):
     def _slope_of(self, channel: str) -> Array:
         """Return the change (10,) of the parameters per kelvin of another thermometer."""
         own = [e.values for e in self.model.effects if e.values.get("channel") == channel]
-        return np.array([sum(float(v.get(n, 0.0)) for v in own) for n in IOP_NAMES])
+        linear = np.array([[sum(float(v.get(n, 0.0)) for v in own)] for n in IOP_NAMES])
+        at = self.model.interior.as_array()
+        return self.model.carried_derivatives(at, linear, ("slope",))[:, 0]
 
     def _noise_of(self, channels: Iterable[str]) -> Array:
         """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
@@ -555,7 +559,8 @@ class LiveCamera:
             raise UsageError("there is no reading yet: call update(time, temperature) first")
         target = self.thermal.model.T0 if to is None else to
         if self._maps is None or self._maps.to != target:
-            steady = self.thermal.at(target, extrapolate=True)
+            others = dict.fromkeys(self.thermal.channels, target)  # as warm
+            steady = self.thermal.at(target, channels=others, extrapolate=True)
             self._maps = Maps(steady.sensor, steady.values, target)
         return self._maps.of(self._now.values)
 

@@ -115,33 +115,27 @@ def test_missing_readings_are_refused():
     assert a - b == pytest.approx(20 * 1e-5)
 
 
-def test_the_noise_of_another_thermometer_is_propagated():
-    heated = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5, "x0": 2e-5})
+def test_a_camera_with_two_thermometers():
+    """The noise of both is propagated, each with its own size; steady, both are as warm."""
+    heated = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5, "x0": 1e-4})
     fitted = {"thermometer_sd_K": 0.1, "other_sds_K": {"board": 0.4}}
     camera = ThermalCamera(replace(thermal_model(heated), fitted_on=(fitted,)))
     log = [0.0, 60.0], {"temperature": [25.0, 30.0], "board": [35.0, 40.0]}
-    own, other = camera.model.rate_vector[:3], np.array([1e-5, 2e-5, 0.0])
+    own, other = camera.model.rate_vector[:3], np.array([1e-5, 1e-4, 0.0])
     wanted = 0.2**2 * np.outer(own, own) + 0.8**2 * np.outer(other, other)
     a, b = (camera.along(*log, temperature_sd=sd).covariance[1] for sd in (0.0, 0.2))
     c, d = (camera.at(30.0, sd, {"board": 40.0}).covariance for sd in (0.0, 0.2))
     for change in (b - a, d - c):
         np.testing.assert_allclose(change[:3, :3], wanted, rtol=1e-6)
-
-
-def test_a_camera_with_two_thermometers_is_predicted_and_corrected():
-    """To the state in which both are as warm; they raised DataError."""
-    heated = ModelEffect("second_heat_source", {"channel": "board", "x0": 1e-4})
-    two, point = ThermalCamera(thermal_model(heated)), np.array([[100.0, 200.0]])
-    T0, pitch = two.model.T0, two.model.sensor.pixel_pitch
-    for warmer in (0.0, 20.0):
-        columns = {"temperature": np.full(2, T0), "board": np.full(2, T0 + warmer)}
-        log = TemperatureLog(np.array([0.0, 10.0]), columns)
-        moved = correct_points(two, log, np.array([5.0]), point)[0] - point
-        np.testing.assert_allclose(moved, [[-warmer * 1e-4 / pitch, 0.0]], atol=1e-6)
-    live = two.live()
-    live.update(0.0, {"temperature": T0, "board": T0})
+    T0, point = np.full(2, camera.model.T0), np.array([[1500.0, 1200.0]])
+    for warmer in (0.0, 20.0):  # correcting raised DataError
+        table = TemperatureLog(np.array([0.0, 9.0]), {"temperature": T0, "board": T0 + warmer})
+        moved = correct_points(camera, table, np.array([5.0]), point)[0] - point
+        assert moved[0, 0] == pytest.approx(-warmer * 1e-4 / 0.00112, abs=0.02)
+    live = camera.live()
+    live.update(0.0, {"temperature": T0[0], "board": T0[0]})
     assert np.ptp(live.maps()[0] - live.maps()[0][0]) < 1e-3
-    assert "the drift since" in str(tc.predict(two, 30.0, channels={"board": 45.0}))
+    assert "the drift since" in str(tc.predict(camera, 30.0, channels={"board": 45.0}))
 
 
 def test_the_object_error_equals_differences():

@@ -229,7 +229,6 @@ OUT_OF_BOUNDS = {
     "window is -1": lambda M1: tc.study(M1, window=-1),
     "clusters_mm is 3; it must be a list .each": lambda M1: tc.reference_study(clusters_mm=3),
     "grid is 0; it must be from 2 to 9": lambda M1: tc.study(M1, grid=0),
-    "distance_mm is 0": lambda M1: tc.reference_study(distance_mm=0.0),
     "2 labels for 1 series": lambda M1: tc.study(M1, labels=["a", "b"]),
     "M1 is given twice; give each": lambda M1: tc.fit(M1, M1),
     "T0 is nan": lambda M1: tc.fit(M1, T0=np.nan),
@@ -238,14 +237,12 @@ OUT_OF_BOUNDS = {
     r"place is \(1, 2\); it must be a tuple": lambda M1: tc.check_testfield(FIELD, place=(1, 2)),
     "c is given twice": lambda M1: M1.calibrate(free="c,x0,c"),
     r"free is \['c', 0\]": lambda M1: M1.calibrate(free=["c", 0]),
-    "seeds is 0": lambda M1: tc.plan(M1, seeds=0),
     "give one set-up": lambda M1: tc.plan(M1, preset="nexus5-cold"),
     "give one set-up: a": lambda _: tc.plan(preset="nexus5-cold", model=MODEL),
     "~no one/x: does not exist": lambda _: tc.open("~no one/x"),
     "give a programme too": lambda _: tc.predict(MODEL, 35.0, camera="cold.json"),
     "interior: is a calibrated": lambda _: tc.predict(MODEL, programme="p", camera="cold.json"),
     "--exterior zz": lambda M1: M1.measured(exterior="zz"),
-    "epochs is 0": lambda M1: simulated(epochs=0),
     "give finite": lambda M1: simulated(lamp=[(0, float("nan"))]),
     "in the order of time": lambda M1: simulated(lamp=[(9, 1), (0, 3)]),
     "temperature is nan": lambda M1: tc.predict(MODEL, np.nan),
@@ -255,9 +252,7 @@ OUT_OF_BOUNDS = {
     "warm.json: at which": lambda _: tc.fit_calibrations({"cold.json": 9.0, "warm.json": np.inf}),
     "sigma_px is 0": lambda M1: tc.check_testfield(FIELD, sigma_px=0.0),
     "roll is nan": lambda M1: tc.check_testfield(FIELD, roll=np.nan),
-    "pixel_pitch is -1": lambda M1: tc.survey_testfield(["photos"], pixel_pitch=-1.0),
     "principal_distance is 0": lambda M1: imported(principal_distance=0.0),
-    "pixel_pitch is -0.01": lambda M1: imported(pixel_pitch=-0.01),
     "testfield is missing": lambda M1: imported(out="new"),
     "there is no 'timezon'": lambda M1: imported(log_options={"timezon": "UTC"}),
     "there is no column 'T 1'": lambda M1: imported(
@@ -394,10 +389,10 @@ def test_times_of_pandas_with_and_without_a_zone(camera):
     berlin = plain.tz_localize("UTC").tz_convert("Europe/Berlin")
     wanted = 1593604800.0 + np.array([0.0, 60.0, 120.0])
     texts = [time.isoformat() for time in berlin]
-    objects = berlin.to_pydatetime()
-    for times in (plain, berlin, pandas.Series(berlin), list(berlin), objects, texts):
+    for times in (berlin, pandas.Series(berlin), list(berlin), berlin.to_pydatetime(), texts):
         np.testing.assert_array_equal(camera.along(times, HOT).times, wanted)
         assert camera.live().update(times[0], 30.0).temperature == 30.0
+    np.testing.assert_array_equal(camera.along(plain, HOT).times, wanted)
     np.testing.assert_array_equal(camera.along(plain - plain[0], HOT).times, wanted - wanted[0])
     with pytest.raises(UsageError, match="a time is not known"):
         camera.along([plain[0], plain[1], pandas.NaT], HOT)

@@ -300,13 +300,11 @@ OF_A_CAMERA = {
     "sx, sy above 0": lambda c: resected(c, SEEN | {"sx": [0.0] * 4}),
     "no pose .too_few_targets.: 2": lambda c: c.at(35.0).project(POINT, resected(c, FEW)),
     "the pose: must be": lambda c: c.at(35.0).project(POINT, None),
-    "the pose: give one, not 2": lambda c: c.at(35.0).project(POINT, np.zeros((2, 6))),
     "px of 8.96 µm cannot be comp": lambda c: c.at(35.0).object_distance(
         c.for_images(410, 308).at(35.0), 1e4
     ),
     "no thermometer 'foo'; it knows": lambda c: tc.predict(c, 35.0, channels={"foo": 1.0}),
     "of board_temperature is nan": lambda c: c.at(35.0, channels={"board_temperature": np.nan}),
-    "temperature_sd is -1": lambda c: c.at(35.0, temperature_sd=-1.0),
     "times run backwards": lambda c: c.along(TIMES[::-1], HOT),
     "a time is not known": lambda c: c.along(["noon"] * 3, HOT),
     "a time is not known: .* datetime64": lambda c: c.along(HIDDEN, HOT),
@@ -318,6 +316,7 @@ OF_A_CAMERA = {
     "temperature is {'board': '30'}": lambda c: c.live().update(0.0, {"board": "30"}),
     "the frame is a list: give an array": lambda c: c.live().correct([[1, 2], [3, 4]]),
     "no reading yet": lambda c: c.live().correct(FRAME),
+    "to one run: make another": lambda c: pickle.dumps(fed(c)),
     "not later than the last reading": lambda c: fed(c).update(0.0, 30.0),
     r"live\(size=\(3280, 1000\)\)": lambda c: fed(c).correct(FRAME[:1000]),
     "frame of bool cannot be resampled": lambda c: fed(c).correct(FRAME > 0),

@@ -480,6 +480,9 @@ class LiveCamera:
             if name.split(".")[0] in drives
         }
 
+    def __reduce__(self) -> str:  # a copy would share the state of the effects with a memory
+        raise UsageError("a live camera belongs to one run: make another with live(), not a copy")
+
     def __repr__(self) -> str:
         now = "no reading yet" if self._now is None else f"{self._now.temperature:g} °C"
         return f"<LiveCamera {self.thermal.model.camera}: {now}>"

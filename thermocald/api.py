@@ -25,7 +25,6 @@ from thermocald.series import (
     Progress,
     Say,
     Series,
-    check_exterior,
     free_names,
     require_series,
     require_within,
@@ -147,7 +146,6 @@ def study(
             f"{len(labels)} labels for {len(series)} series; give one for each at most"
         )
     require_series(series)
-    check_exterior(exterior)
     settings = _study_settings(
         window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
@@ -306,6 +304,13 @@ def plan(
     from thermocald.discovery.plan import plan_power, set_ups
 
     require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
+    idle = [model] if preset is not None else []
+    if series is not None:
+        idle = [preset, model, testfield, programme]
+    if any(one is not None for one in idle):
+        raise UsageError(
+            "give one set-up: a series; or a preset or a model, with a testfield and a programme"
+        )
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
     source = None if series is None else series.observed()
     field = None if testfield is None else str(source_of(testfield))
@@ -445,7 +450,12 @@ def paths_of(given: Paths) -> list[Path]:
 def _model_of(model: Model | None) -> ThermalModel | None:
     if model is None or isinstance(model, ThermalModel):
         return model
-    return (model if isinstance(model, ThermalCamera) else load_camera(model)).model
+    return thermal_of(model).model
+
+
+def thermal_of(model: ThermalCamera | Path | str) -> ThermalCamera:
+    """Return a thermal camera, loaded if it is given by its file."""
+    return model if isinstance(model, ThermalCamera) else load_camera(model)
 
 
 def _is_file(given: Path | str) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import warnings
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -26,16 +27,18 @@ _buffers = threading.local()  # by name
 
 
 def seconds(times: ArrayLike) -> Array:
-    """Return times in s; datetime64, datetimes and pandas times count from 1970-01-01 UTC.
+    """Return times in s; datetime64, datetimes, pandas times and ISO text from 1970-01-01 UTC.
 
-    Raises UsageError for anything else, and for a time that is unknown (NaN, NaT, masked).
+    Without a zone they are UTC. Raises UsageError for anything else, and for a time that is unknown
+    (NaN, NaT, masked).
     """
     given = np.asarray(times)
     try:
-        if given.dtype == object and given.size and not isinstance(given.flat[0], float | int):
+        if given.dtype.kind in "OU" and given.size and not isinstance(given.flat[0], float | int):
+            parsed = [datetime.fromisoformat(t) if isinstance(t, str) else t for t in given.flat]
             with warnings.catch_warnings():  # numpy warns that it converts a zone to UTC
                 warnings.simplefilter("ignore")
-                given = given.astype("datetime64[us]")
+                given = np.array(parsed, object).astype("datetime64[us]").reshape(given.shape)
         if given.dtype.kind == "M":
             given = given - np.datetime64(0, "s")
         if given.dtype.kind == "m":
@@ -44,7 +47,7 @@ def seconds(times: ArrayLike) -> Array:
     except (TypeError, ValueError):
         found = np.full(1, np.nan)
     if not np.isfinite(found).all() or np.ma.is_masked(times):
-        raise UsageError("a time is not known: give seconds since 1970-01-01 UTC, or datetime64")
+        raise UsageError("a time is not known: give s since 1970-01-01 UTC, datetime64, ISO text")
     return found
 
 

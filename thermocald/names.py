@@ -240,11 +240,11 @@ def _in_words(kind: Any) -> str:
 def _plain(value: Any) -> Any:
     """Return Python's number for one of NumPy, xarray, …, also in a mapping; NaN if masked.
 
-    A path in the home folder (`~/`) is returned with that folder.
+    A path in a user's home folder (`~`, `~name`) is returned with that folder.
     """
     if isinstance(value, Mapping):
         return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, str | os.PathLike) and str(value).startswith("~/"):
+    if isinstance(value, str | os.PathLike) and str(value).startswith("~"):
         return os.path.expanduser(value)
     if getattr(value, "ndim", None) != 0 or "time" in str(value.dtype):
         return value

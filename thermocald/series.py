@@ -5,6 +5,7 @@ It is read from a recording's folder, a store or a server; callers need not know
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,15 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.series.drift import with_drifts
-from thermocald.analysis.series.recorded import (
-    misplaced_doubts,
-    replay_into,
-    series_epochs,
-)
+from thermocald.analysis.series.recorded import misplaced_doubts, replay_into, series_epochs
 from thermocald.analysis.study.measured import measured_series
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
 from thermocald.names import checked
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE
@@ -150,7 +148,7 @@ class Series:
         return len(self.frame_time)
 
     def __repr__(self) -> str:
-        size = f"{len(self)} epochs, {len(self.testfield)} targets"
+        size = f"{counted(len(self), 'epoch')}, {counted(len(self.testfield), 'target')}"
         text = f"<Series {self.camera}/{self.name}: {size}"
         known = self.temperature[np.isfinite(self.temperature)]
         if len(known):
@@ -243,6 +241,7 @@ class Series:
         store's series with its start condition. free: by default, for a store's series, as stored;
         then `exterior="per_epoch"` returns its epochs as they are stored.
         """
+        check_exterior(exterior)
         usual = self.camera
         if not isinstance(self._measured, Recording):
             usual += f"-{self._measured.start}" if self._measured.start else ""
@@ -367,4 +366,4 @@ def source_of(text: Path | str) -> Path:
     if text == "":
         raise UsageError("a path is empty: give a recording (folder) or a store")
     path = Path(text)
-    return path if is_server(path) else path.expanduser()
+    return path if is_server(path) else Path(os.path.expanduser(path))  # Path's raises for ~nobody

@@ -16,8 +16,8 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera, CameraDifference
 from thermocald.analysis.thermal.predictions import read_model_log
-from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
-from thermocald.api import Field, Paths, paths_of, read_testfield
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+from thermocald.api import Field, Paths, paths_of, read_testfield, thermal_of
 from thermocald.errors import DataError, UsageError
 from thermocald.names import checked
 from thermocald.photogrammetry import camera_files
@@ -185,12 +185,14 @@ def predict(
         raise UsageError("give one of --temperature, --log, --test, --programme")
     if channels is not None and temperature is None:
         raise UsageError("channels belong to a temperature; a log has its own")
+    if camera is not None and programme is None:
+        raise UsageError("camera describes how it warms: give a programme too")
     require_within(
         temperature=(temperature, COLDEST_C), distance_m=(distance_m, 0.01),
         wanted_mm=(wanted_mm, 1e-3),
     )  # fmt: skip
     require_series(test)
-    thermal = _thermal(model)
+    thermal = thermal_of(model)
     if temperature is not None:
         state = thermal.at(temperature, channels=channels, extrapolate=extrapolate)
         return predictions.describe_camera(thermal, state, distance_m)
@@ -237,7 +239,7 @@ def correct(
     from thermocald.output.corrected import Correction
 
     require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0.0))
-    thermal, path = _thermal(model), source_of(points)
+    thermal, path = thermal_of(model), source_of(points)
     if size is not None:
         thermal = thermal.for_images(*size)
     clock = device_clock(timezone, ambiguous=ambiguous)
@@ -290,7 +292,7 @@ def measure(
     if unit not in UNITS:
         raise UsageError(f"--length-unit {unit}: must be mm or m")
     tell = say or (lambda _: None)
-    thermal, path = _thermal(model), source_of(points)
+    thermal, path = thermal_of(model), source_of(points)
     clock = device_clock(timezone, ambiguous=ambiguous)
     controls = ControlPoints.read(source_of(control), unit)
     if controls.assumed:
@@ -338,7 +340,7 @@ def follow_scene(
     from thermocald.analysis.thermal import scene
     from thermocald.store.logger.photographs import read_photographs
 
-    thermal = _thermal(model)
+    thermal = thermal_of(model)
     pictures = read_photographs([source_of(photographs)], times)
     moments = [picture.moment for picture in pictures]
     taken = device_clock(timezone).utc(moments, lambda i: str(pictures[i].path)).tolist()
@@ -508,10 +510,6 @@ def check_testfield(
         model = camera_files.read(source_of(camera), pixel_pitch=pixel_pitch).model
     found = assess_field(read_testfield(field), model, place, look_at, roll, sigma_px)
     return FieldCheck(**vars(found))
-
-
-def _thermal(model: Model) -> ThermalCamera:
-    return model if isinstance(model, ThermalCamera) else load_camera(model)
 
 
 def _log_options(given: LogRead) -> LogOptions:

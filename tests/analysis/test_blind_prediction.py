@@ -11,7 +11,7 @@ part of the floor of `thermal_gradient` and `time_offset`.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,17 +30,6 @@ from thermocald.thermal.source import series_input
 READING_SD = float(np.hypot(0.04, 0.0625 / np.sqrt(12.0)))
 
 
-@dataclass(frozen=True)
-class PredictedCase:
-    """A tested case: RMS on M2 over the true floor, and the share inside the stated 95 % bands."""
-
-    effect: str
-    seed: int
-    ratio: float
-    coverage: float
-    rms_px: float
-
-
 def effect_option(name: str, truth: dict) -> list[str]:
     """Return the option with which a user who knows the effect would give it."""
     if name == "second_heat_source":
@@ -55,8 +44,11 @@ def effect_option(name: str, truth: dict) -> list[str]:
 
 def predict_case(
     name: str, seed: int, folder: Path, px: float = 0.3, discover: bool = False
-) -> PredictedCase:
-    """Fit M1 with the true effect (`discover`: with those that discovery finds), and test on M2."""
+) -> tuple[float, float, float]:
+    """Fit M1 with the true effect (`discover`: with those that discovery finds), and test on M2.
+
+    Returns the RMS on M2 over the true floor, the share inside the stated 95 % bands, and the RMS.
+    """
     series, truth = generate(Case((name,) if name != "none" else (), px, seed))
     for s in series:
         write(s, folder / s.name)
@@ -67,20 +59,16 @@ def predict_case(
         listed = ["--model", folder / "found.yaml"]
     succeed("fit", folder / "M1", "-o", model, *listed, "--json", "-")
     done = succeed("predict", "--model", model, "--test", folder / "M2", "--json", "-")
-    stated = json.loads(done.stdout)
-    (tested,) = stated["series"]
-    fitted = read_model(model)
-    source = series_input(read_recording(folder / "M2"))
-    second = reduce_series(source, strict=False)
-    true = predicted_error(_with_true_noise(fitted, truth), second, READING_SD)
-    rms_px = tested["rms_px"]
-    return PredictedCase(name, seed, rms_px / true.floor_px, tested["coverage"], rms_px)
+    (tested,) = json.loads(done.stdout)["series"]
+    second = reduce_series(series_input(read_recording(folder / "M2")), strict=False)
+    true = predicted_error(_with_true_noise(read_model(model), truth), second, READING_SD)
+    return tested["rms_px"] / true.floor_px, tested["coverage"], tested["rms_px"]
 
 
-def pooled(cases: list[PredictedCase]) -> tuple[float, float]:
+def pooled(cases: list[tuple[float, float, float]]) -> tuple[float, float]:
     """Return the RMS of the ratios, and the mean coverage."""
-    ratios = np.array([c.ratio for c in cases])
-    return float(np.sqrt(np.mean(ratios**2))), float(np.mean([c.coverage for c in cases]))
+    ratios, coverages, _ = np.array(cases).T
+    return float(np.sqrt(np.mean(ratios**2))), float(np.mean(coverages))
 
 
 def _with_true_noise(model: ThermalModel, truth: dict) -> ThermalModel:

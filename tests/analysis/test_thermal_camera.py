@@ -9,6 +9,7 @@ import pytest
 
 import thermocald as tc
 from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.analysis.thermal.correction import correct_points
 from thermocald.analysis.thermal.modelled_camera import ExtrapolationWarning
 from thermocald.analysis.thermal.predictions import predict_along, warm_up
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -100,7 +101,7 @@ def test_missing_readings_are_refused():
     """Also those of a second thermometer, and no NumPy number is."""
     heated = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5})
     camera, two = (ThermalCamera(thermal_model(*effects)) for effects in (LISTED, [heated]))
-    with pytest.raises(UsageError, match="temperature is NaN: give °C"):
+    with pytest.raises(UsageError, match="temperature is nan: give one in °C"):
         camera.at(float("nan"))
     for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
         with pytest.raises(UsageError, match="for each of its times"):
@@ -112,6 +113,29 @@ def test_missing_readings_are_refused():
         two.at(30.0)
     a, b = (two.at(30.0, channels={"board": T}).interior.c for T in (45.0, 25.0))
     assert a - b == pytest.approx(20 * 1e-5)
+
+
+def test_a_camera_with_two_thermometers():
+    """The noise of both is propagated, each with its own size; steady, both are as warm."""
+    heated = ModelEffect("second_heat_source", {"channel": "board", "c": 1e-5, "x0": 1e-4})
+    fitted = {"thermometer_sd_K": 0.1, "other_sds_K": {"board": 0.4}}
+    camera = ThermalCamera(replace(thermal_model(heated), fitted_on=(fitted,)))
+    log = [0.0, 60.0], {"temperature": [25.0, 30.0], "board": [35.0, 40.0]}
+    own, other = camera.model.rate_vector[:3], np.array([1e-5, 1e-4, 0.0])
+    wanted = 0.2**2 * np.outer(own, own) + 0.8**2 * np.outer(other, other)
+    a, b = (camera.along(*log, temperature_sd=sd).covariance[1] for sd in (0.0, 0.2))
+    c, d = (camera.at(30.0, sd, {"board": 40.0}).covariance for sd in (0.0, 0.2))
+    for change in (b - a, d - c):
+        np.testing.assert_allclose(change[:3, :3], wanted, rtol=1e-6)
+    T0, point = np.full(2, camera.model.T0), np.array([[1500.0, 1200.0]])
+    for warmer in (0.0, 20.0):  # correcting raised DataError
+        table = TemperatureLog(np.array([0.0, 9.0]), {"temperature": T0, "board": T0 + warmer})
+        moved = correct_points(camera, table, np.array([5.0]), point)[0] - point
+        assert moved[0, 0] == pytest.approx(-warmer * 1e-4 / 0.00112, abs=0.02)
+    live = camera.live()
+    live.update(0.0, {"temperature": T0[0], "board": T0[0]})
+    assert np.ptp(live.maps()[0] - live.maps()[0][0]) < 1e-3
+    assert "the drift since" in str(tc.predict(camera, 30.0, channels={"board": 45.0}))
 
 
 def test_the_object_error_equals_differences():

@@ -14,12 +14,7 @@ import pytest
 import thermocald as tc
 from benchmarks import audit_thermal
 from benchmarks.audit_camera import Scene
-from benchmarks.audit_thermal import (
-    fitted,
-    rate_errors,
-    read_apart,
-    seen,
-)
+from benchmarks.audit_thermal import fitted, rate_errors, read_apart, seen
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.analysis.test_thermal_model import for_fit, reduced
-from tests.commands import answer, succeed
+from tests.commands import answer
 from thermocald.analysis.statistics.random_effects import odd_specimens
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -23,7 +22,7 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect, ThermalModel
-from thermocald.physics.model_file import read_model, write_model
+from thermocald.physics.model_file import write_model
 from thermocald.physics.presets import preset_simulation
 from thermocald.thermal.source import epochs_input
 
@@ -185,23 +184,6 @@ def test_three_temperatures_predict_nearly_as_well_as_the_full_cycle():
     assert np.mean(held["rest"]) == pytest.approx(0.95, abs=0.06)
     for found in pulls.values():
         assert 0.4 < np.sqrt(np.mean(np.square(found))) < 1.6
-
-
-@pytest.mark.slow
-def test_the_command_uses_the_type(tmp_path):
-    kind, cycle = new_world(11)
-    write_model(tmp_path / "type.yaml", kind)
-    at_three_temperatures(cycle, 100.0, 45).write(tmp_path / "M1")
-    result = succeed("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--type",
-                     tmp_path / "type.yaml", "--json", tmp_path / "r.json")  # fmt: skip
-    assert "combined with the type rpi-v2.1 (10 cameras)" in result.stdout
-    assert "show little" not in result.stdout
-    found = json.loads((tmp_path / "r.json").read_text())["type"]
-    assert (found["name"], found["cameras"]) == ("rpi-v2.1", 10)
-    assert max(found["weights"].values()) < 0.1
-    found = read_model(tmp_path / "m.yaml")
-    assert found.evidence["shrunk_to_type"] == "rpi-v2.1"
-    assert [e.name for e in found.effects] == ["thermal_lag"]
 
 
 def test_a_wrong_type_is_refused(tmp_path):

@@ -224,33 +224,35 @@ def simulated(**more):
 
 
 FIELD, MODEL = "M1/testfield.csv", "camera.yaml"
-ONE = {"cold.json": "26"}
+ONE, TWICE = {"cold.json": "26"}, {"cold.json": 9.0, "./cold.json": 26.0}
 OUT_OF_BOUNDS = {
     "window is -1": lambda M1: tc.study(M1, window=-1),
     "clusters_mm is 3; it must be a list .each": lambda M1: tc.reference_study(clusters_mm=3),
     "grid is 0; it must be from 2 to 9": lambda M1: tc.study(M1, grid=0),
-    "distance_mm is 0": lambda M1: tc.reference_study(distance_mm=0.0),
     "2 labels for 1 series": lambda M1: tc.study(M1, labels=["a", "b"]),
     "M1 is given twice; give each": lambda M1: tc.fit(M1, M1),
     "T0 is nan": lambda M1: tc.fit(M1, T0=np.nan),
     "jobs is 999; it must be from 1 to 256": lambda M1: M1.calibrate(jobs=999),
-    "jobs is 0": lambda M1: tc.discover(M1, jobs=0),
     "calibrations is {'cold.json': '26'}": lambda M1: tc.fit_calibrations(ONE),
     r"place is \(1, 2\); it must be a tuple": lambda M1: tc.check_testfield(FIELD, place=(1, 2)),
     "c is given twice": lambda M1: M1.calibrate(free="c,x0,c"),
     r"free is \['c', 0\]": lambda M1: M1.calibrate(free=["c", 0]),
-    "seeds is 0": lambda M1: tc.plan(M1, seeds=0),
-    "epochs is 0": lambda M1: simulated(epochs=0),
+    "give one set-up": lambda M1: tc.plan(M1, preset="nexus5-cold"),
+    "give one set-up: a": lambda _: tc.plan(preset="nexus5-cold", model=MODEL),
+    "~no one/x: does not exist": lambda _: tc.open("~no one/x"),
+    "give a programme too": lambda _: tc.predict(MODEL, 35.0, camera="cold.json"),
+    "interior: is a calibrated": lambda _: tc.predict(MODEL, programme="p", camera="cold.json"),
+    "--exterior zz": lambda M1: M1.measured(exterior="zz"),
     "give finite": lambda M1: simulated(lamp=[(0, float("nan"))]),
     "in the order of time": lambda M1: simulated(lamp=[(9, 1), (0, 3)]),
     "temperature is nan": lambda M1: tc.predict(MODEL, np.nan),
     "size 9×0 px is impossible": lambda M1: tc.correct("x.csv", MODEL, log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1: tc.fit_calibrations({}),
+    "holds the same camera as c": lambda _: tc.fit_calibrations(TWICE),
+    "warm.json: at which": lambda _: tc.fit_calibrations({"cold.json": 9.0, "warm.json": np.inf}),
     "sigma_px is 0": lambda M1: tc.check_testfield(FIELD, sigma_px=0.0),
     "roll is nan": lambda M1: tc.check_testfield(FIELD, roll=np.nan),
-    "pixel_pitch is -1": lambda M1: tc.survey_testfield(["photos"], pixel_pitch=-1.0),
     "principal_distance is 0": lambda M1: imported(principal_distance=0.0),
-    "pixel_pitch is -0.01": lambda M1: imported(pixel_pitch=-0.01),
     "testfield is missing": lambda M1: imported(out="new"),
     "there is no 'timezon'": lambda M1: imported(log_options={"timezon": "UTC"}),
     "there is no column 'T 1'": lambda M1: imported(
@@ -284,7 +286,6 @@ def fed(c):
 FRAME = np.zeros((2464, 3280), np.uint8)
 OF_A_CAMERA = {
     "to is 'image'; it must be an Int": lambda c: c.at(35.0).undistort([[1, 2]], to="image"),
-    "0×0 px is impossible": lambda c: c.live(size=(0, 0)),
     "give one time": lambda c: c.live().update([0.0, 60.0], 30.0),
     "distance_mm is -1": lambda c: c.at(35.0).object_error(-1),
     r"image points: must be an array \(n, 2\)": lambda c: c.at(35.0).undistort([1, 2, 3]),
@@ -299,28 +300,28 @@ OF_A_CAMERA = {
     "sx, sy above 0": lambda c: resected(c, SEEN | {"sx": [0.0] * 4}),
     "no pose .too_few_targets.: 2": lambda c: c.at(35.0).project(POINT, resected(c, FEW)),
     "the pose: must be": lambda c: c.at(35.0).project(POINT, None),
-    "the pose: give one, not 2": lambda c: c.at(35.0).project(POINT, np.zeros((2, 6))),
-    "image points: must": lambda c: c.at(35.0).undistort(np.zeros((2, 4, 2))),
     "px of 8.96 µm cannot be comp": lambda c: c.at(35.0).object_distance(
         c.for_images(410, 308).at(35.0), 1e4
     ),
     "no thermometer 'foo'; it knows": lambda c: tc.predict(c, 35.0, channels={"foo": 1.0}),
     "of board_temperature is nan": lambda c: c.at(35.0, channels={"board_temperature": np.nan}),
-    "temperature_sd is -1": lambda c: c.at(35.0, temperature_sd=-1.0),
     "times run backwards": lambda c: c.along(TIMES[::-1], HOT),
     "a time is not known": lambda c: c.along(["noon"] * 3, HOT),
     "a time is not known: .* datetime64": lambda c: c.along(HIDDEN, HOT),
-    "a time is not known: give": lambda c: c.live().update(np.nan, 30.0),
+    "not known: give s since": lambda c: c.along(TIMES, HOT, since=np.nan),
+    "1 of 1 times are outside": lambda c: c.along(TIMES, HOT, since=1000.0),
+    "temperature is inf": lambda c: fed(c).correct(FRAME, to=np.inf),
+    "an array .H, W. or .H, W, c": lambda c: fed(c).correct(np.zeros((2464, 3280, 3, 2), np.uint8)),
     "a temperature is no number": lambda c: c.along(TIMES, "hot"),
     "temperature is {'board': '30'}": lambda c: c.live().update(0.0, {"board": "30"}),
     "the frame is a list: give an array": lambda c: c.live().correct([[1, 2], [3, 4]]),
     "no reading yet": lambda c: c.live().correct(FRAME),
+    "to one run: make another": lambda c: pickle.dumps(fed(c)),
     "not later than the last reading": lambda c: fed(c).update(0.0, 30.0),
     r"live\(size=\(3280, 1000\)\)": lambda c: fed(c).correct(FRAME[:1000]),
     "frame of bool cannot be resampled": lambda c: fed(c).correct(FRAME > 0),
     "K outside the": lambda c: fed(c).update(1.0, 150.0),
     "1 of 2 times are outside the temp": lambda c: c.along(TIMES, HOT, at=[30.0, 1e6]),
-    "1 of 2 times are outside": lambda c: c.along(TIMES, HOT, at=[30.0, -1000.0]),
 }
 
 
@@ -328,7 +329,7 @@ OF_A_CAMERA = {
 ANY = {
     "at", "centre", "changes", "codes", "diameters", "epochs", "frame", "image_points",
     "interior", "kinds", "names", "numbers", "offsets", "plane", "points", "pose", "R", "rows",
-    "seen", "settings", "sigma", "sigmas", "temperatures", "time", "times", "values",
+    "seen", "settings", "sigma", "sigmas", "since", "temperatures", "time", "times", "values",
 }  # fmt: skip
 
 
@@ -386,9 +387,11 @@ def test_times_of_pandas_with_and_without_a_zone(camera):
     plain = pandas.date_range("2020-07-01 12:00", periods=3, freq="min")
     berlin = plain.tz_localize("UTC").tz_convert("Europe/Berlin")
     wanted = 1593604800.0 + np.array([0.0, 60.0, 120.0])
-    for times in (plain, berlin, pandas.Series(berlin), list(berlin), berlin.to_pydatetime()):
+    texts = [time.isoformat() for time in berlin]
+    for times in (berlin, pandas.Series(berlin), list(berlin), berlin.to_pydatetime(), texts):
         np.testing.assert_array_equal(camera.along(times, HOT).times, wanted)
         assert camera.live().update(times[0], 30.0).temperature == 30.0
+    np.testing.assert_array_equal(camera.along(plain, HOT).times, wanted)
     np.testing.assert_array_equal(camera.along(plain - plain[0], HOT).times, wanted - wanted[0])
     with pytest.raises(UsageError, match="a time is not known"):
         camera.along([plain[0], plain[1], pandas.NaT], HOT)
@@ -399,6 +402,15 @@ def test_one_image_point_is_an_array_of_one(camera):
     for method in (now.undistort, now.rays, now.point_covariance):
         np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
     np.testing.assert_array_equal(now.project(POINT[0], [0.0] * 6), now.project(POINT, [0.0] * 6))
+    assert fed(camera).correct(FRAME[..., None]).shape == (*FRAME.shape, 1)
+
+
+def test_a_course_is_sliced_and_a_camera_is_a_key(camera):
+    along = camera.along(TIMES, HOT, since=np.datetime64(0, "s"))
+    for part in (along[1:], along[[1, 2]], along[along.temperatures > 25.0]):
+        np.testing.assert_array_equal(part.sd, along.sd[1:])
+    assert repr(along[:0]) == "<Along rpi-v2.1: 0 times>"
+    assert {camera: 1}[pickle.loads(pickle.dumps(camera))] == 1
 
 
 def test_a_copy_is_no_second_measurement(short, M2, inside, tmp_path):

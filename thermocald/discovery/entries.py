@@ -175,7 +175,7 @@ def compare_shift_and_tilt(
     rest = tuple(p for p in term.parameters if p not in (*_SHIFT, *_TILT, *_BOTH))
     names = (*_SHIFT, *_TILT, *_BOTH, *rest)
     shift, tilt, both = np.arange(2), np.arange(2, 4), np.arange(4, len(names))
-    own = -1 if term.is_drive else number
+    own = -1 if term.kind.is_drive else number
     # correlation of the estimates, with c and kappa estimated too; the shift of an effect that is
     # T itself is in the base's rates
     A, _ = normals_of_term(fitter, fit, term, names, leave=frozenset({own, -1}))

@@ -348,7 +348,7 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
         theirs = [t for t in s.terms if t.effect not in best.names]
         worse, band = s.score - best.score, criteria.BAND
         # one drive in place of another is compared by the fit alone
-        if len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive:
+        if len(mine) == len(theirs) == 1 and mine[0].kind.is_drive and theirs[0].kind.is_drive:
             worse, band = s.fit.chi2 - best.fit.chi2, criteria.DRIVES_BAND
         # and so is a step that one epoch shows: any cause that begins there fits it as well, and
         # the determinant counts only how much the readings' errors blur this epoch

@@ -198,6 +198,10 @@ def read_camera_device(path: Path) -> CameraDevice:
     document = read_yaml(path)
     top = QuantityReader(path, document)
     top.require_format(CAMERA_FORMAT)
+    if "interior" in document:
+        raise top.fail(
+            "interior", "is a calibrated camera's; give a file that describes how a camera warms"
+        )
     top.only(
         ("format", "name", "width", "height", "pixel_pitch", "exterior", "distance", "measuring",
          "look", "heat", "thermometers")

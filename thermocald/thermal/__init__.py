@@ -1,3 +1,1 @@
 """Series reduced to small normal equations, and the hypotheses that are fitted to them."""
-
-from __future__ import annotations

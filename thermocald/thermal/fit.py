@@ -112,7 +112,7 @@ class HypothesisFitter:
         evidence = self.series[series]
         if values is None:
             return np.zeros((len(evidence.times), 1)), []
-        drives = tuple((t.effect, t.nonlinear) for t in terms if t.is_drive)
+        drives = tuple((t.effect, t.nonlinear) for t in terms if t.kind.is_drive)
         through = term.through_drive and bool(drives)
         key = (
             series, term.effect, tuple(sorted(values.items())), drives if through else None,
@@ -159,7 +159,7 @@ class HypothesisFitter:
         blocks = [Block(-1, None, 0, 1, BASE)]
         start = len(BASE)
         for i, term in enumerate(terms):
-            if term.is_drive:
+            if term.kind.is_drive:
                 continue
             m = 2 if term.kind.is_periodic else 1
             for s in range(len(self.series)) if term.is_separate else (None,):
@@ -207,12 +207,8 @@ class HypothesisFitter:
                 before, *_ = carried.get(id(operator), (0.0,))
                 carried[id(operator)] = (d + before, operator, channel)
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
-        return prepare(
-            self.series[series],
-            list(carried.values()),
-            list(unresolved.values()),
-            self.thermometer_factor,
-        )
+        both = list(carried.values()), list(unresolved.values())
+        return prepare(self.series[series], *both, self.thermometer_factor)
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array:
         """Return the sd (E,) of a trajectory beyond the readings' errors.
@@ -435,6 +431,12 @@ class HypothesisFitter:
         A, _, searched = self.normal_equations(fit, only)
         return replace(fit, covariance=scaled_inverse(A, _RIDGE), searched=tuple(searched))
 
+    def replaced(self, better: Sequence[ReducedSeries | None]) -> list[ReducedSeries] | None:
+        """Return the series, those that are better in their place; None if none is."""
+        if all(e is None for e in better):
+            return None
+        return [e or old for e, old in zip(better, self.series, strict=True)]
+
     def refine_in(self, better: Sequence[ReducedSeries] | None, fit: Fit) -> Fit:
         """Refine a fit in better series, if there are any; they replace the fitter's."""
         if better is None:
@@ -446,7 +448,7 @@ class HypothesisFitter:
 
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:
     """Return the drives among some terms, as `catalogue.drive` takes them."""
-    return [(t.effect, t.values(series) or {}) for t in terms if t.is_drive]
+    return [(t.effect, t.values(series) or {}) for t in terms if t.kind.is_drive]
 
 
 _ORDERS = 8  # of the cosines, over a series, of the camera's movement

@@ -69,11 +69,6 @@ class Term:
         return catalogue.get(self.effect)
 
     @property
-    def is_drive(self) -> bool:
-        """Whether it replaces the temperature in the linear terms."""
-        return self.kind.is_drive
-
-    @property
     def is_separate(self) -> bool:
         """Whether each series has coefficients of its own: a height, or amplitude and phase."""
         return self.kind.is_event or self.kind.is_periodic

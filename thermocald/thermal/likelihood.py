@@ -68,15 +68,11 @@ class Sums:
         right[epochs] -= np.sum(own * data, axis=1)
         cross[:, epochs] -= np.moveaxis(np.swapaxes(coupled, 1, 2) @ own, 1, 0)
         wide = coupled.reshape(data.size, len(cross))
+        logdet = self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L))))
         return Sums(
-            whole,
-            right,
-            self.yy - float(np.sum(data**2)),
-            self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L)))),
-            cross,
-            self.normal - wide.T @ wide,
-            self.right - wide.T @ data.ravel(),
-        )
+            whole, right, self.yy - float(np.sum(data**2)), logdet, cross,
+            self.normal - wide.T @ wide, self.right - wide.T @ data.ravel(),
+        )  # fmt: skip
 
 
 @lru_cache(maxsize=4)

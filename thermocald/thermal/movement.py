@@ -400,9 +400,6 @@ def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries
     """Return the series with remaining jumps as part of their noise; None if there are none."""
     if any(len(e.times) < criteria.FEWEST for e in fitter.series):
         return None
-    out = [
+    return fitter.replaced([
         weight_jumps_down(e, *measure_jumps(fitter, fit, s)) for s, e in enumerate(fitter.series)
-    ]
-    if all(e is None for e in out):
-        return None
-    return [e or old for e, old in zip(out, fitter.series, strict=True)]
+    ])  # fmt: skip

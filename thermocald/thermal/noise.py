@@ -245,10 +245,10 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
     bias the rates towards 0, and in their slope would seem to determine a delay.
     """
     direction = fit.direction(fit.blocks[0])[0]
-    out = []
+    out: list[ReducedSeries | None] = []
     for s, e in enumerate(fitter.series):
         if e.blocks is not None or e.movement is not None or e.tremble is not None:
-            out.append(e)
+            out.append(None)
             continue
         name = e.history.reference
         old = e.thermometers[name]
@@ -267,7 +267,7 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
         new = replace(old, trajectory=trajectory, deviation=old.deviation - state)
         history = replace(e.history, readings={**e.history.readings, name: trajectory})
         out.append(replace(e, history=history, thermometers={**e.thermometers, name: new}))
-    return None if out == list(fitter.series) else out
+    return fitter.replaced(out)
 
 
 def find_poorly_read(fitter: HypothesisFitter, fit: Fit) -> list[str]:

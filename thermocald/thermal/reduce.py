@@ -25,22 +25,14 @@ import numpy as np
 
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.epoch.adjustment import (
-    AdjustmentSettings,
-    adjust,
-    cold_start,
-)
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, cold_start
 from thermocald.photogrammetry.field.testfield import (
     FAR_ELSEWHERE,
     Observations,
     find_misplaced,
     plane_fit,
 )
-from thermocald.photogrammetry.linalg import (
-    MAD_TO_SD,
-    median_known,
-    orthonormal_combinations,
-)
+from thermocald.photogrammetry.linalg import MAD_TO_SD, median_known, orthonormal_combinations
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     Partials,
@@ -294,13 +286,9 @@ def reduce_series(
     trajectory = instruments[reference].trajectory[instruments[reference].erring]
     trajectory = trajectory[np.isfinite(trajectory)]
     history = History(
-        times,
-        knots,
-        {name: c.trajectory for name, c in instruments.items()},
-        reference,
-        float(np.mean(trajectory)) if T0 is None else T0,
-        source.polygons(),
-    )
+        times, knots, {name: c.trajectory for name, c in instruments.items()}, reference,
+        float(np.mean(trajectory)) if T0 is None else T0, source.polygons(),
+    )  # fmt: skip
     change = float(np.ptp(trajectory))
     least_change = max(
         criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * instruments[reference].noise
@@ -338,14 +326,9 @@ def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> l
 
 
 def _reduce(
-    source: SeriesInput,
-    times: Array,
-    history: History,
-    instruments: Mapping[str, Thermometer],
-    at: Partials,
-    scale: Array | None,
-    distortion: Distortion = "angle",
-) -> ReducedSeries:
+    source: SeriesInput, times: Array, history: History, instruments: Mapping[str, Thermometer],
+    at: Partials, scale: Array | None, distortion: Distortion = "angle",
+) -> ReducedSeries:  # fmt: skip
     X = source.field.points
     A = np.concatenate([at.A, at.B * X[:, None, :]], axis=-1)
     used = source.grid.observed.any(axis=0)
@@ -389,27 +372,12 @@ def _reduce(
     weak = ~enough | touched
     N[weak], b[weak], yy[weak], count[weak], w[weak], v[weak] = 0.0, 0.0, 0.0, 0, 0.0, np.nan
     return ReducedSeries(
-        source=source,
-        times=times,
-        history=history,
-        thermometers=instruments,
-        at=at,
-        scale=scale,
-        columns=A,
-        N=N / variance,
-        b=b / variance,
-        yy=yy / variance,
-        values=values,
-        residuals=v,
-        weights=w / variance,
-        n=count,
-        sigma0=sigma0 / np.sqrt(variance),
-        variance=variance,
-        correlation=_measure_correlation(v),
-        hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
-        distortion=distortion,
+        source, times, history, instruments, at, scale, A, N=N / variance, b=b / variance,
+        yy=yy / variance, values=values, residuals=v, weights=w / variance, n=count,
+        sigma0=sigma0 / np.sqrt(variance), variance=variance, correlation=_measure_correlation(v),
+        hidden=group_hidden_targets(w / variance, misclosure - offsets, A), distortion=distortion,
         touched=touched,
-    )
+    )  # fmt: skip
 
 
 def _solve_cameras(w: Array, N: Array, A: Array, left: Array) -> tuple[Array, Array, Array]:
@@ -496,11 +464,6 @@ def without_targets(evidence: ReducedSeries, rows: NDArray[np.int64]) -> Reduced
 def with_points(evidence: ReducedSeries, grid: ObservationGrid) -> ReducedSeries:
     """Reduce the series with other image points, at the same linearisation."""
     return _reduce(
-        replace(evidence.source, grid=grid),
-        evidence.times,
-        evidence.history,
-        evidence.thermometers,
-        evidence.at,
-        evidence.scale,
-        evidence.distortion,
-    )
+        replace(evidence.source, grid=grid), evidence.times, evidence.history,
+        evidence.thermometers, evidence.at, evidence.scale, evidence.distortion,
+    )  # fmt: skip

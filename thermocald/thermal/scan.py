@@ -70,7 +70,7 @@ class Scan:
 
 def lay_stack(fitter: HypothesisFitter, candidate: Candidate, series: int, fit: Fit) -> Array:
     """Return a candidate's trajectories (G, E, m) over its grid in a series."""
-    drives = [t for t in fit.terms if t.is_drive]
+    drives = [t for t in fit.terms if t.kind.is_drive]
     chained = candidate.kind.is_drive and bool(drives)
     key = (candidate, series)
     if key in fitter.stacks and not chained:
@@ -205,7 +205,7 @@ def normals_of_term(
         if term.values(s) is None:
             further.append(None)
             continue
-        if term.is_drive:
+        if term.kind.is_drive:
             trajectory = fitter.drive(fit.terms, s)[0]
         else:
             trajectory = fitter.trajectories(term, s, fit.terms, operators=False)[0][:, 0]
@@ -340,15 +340,9 @@ def examine(fitter: HypothesisFitter, fit: Fit, series: int) -> Adequacy:
     free = scores.size
     excess = max(total - free, 0.0)
     coordinates = 2.0 * float(evidence.n.sum())
-    return Adequacy(
-        scores,
-        amplitudes,
-        directions,
-        trajectories,
-        excess,
-        (total - free) / np.sqrt(2.0 * free),
-        evidence.sigma_px * float(np.sqrt(excess * evidence.correlation / coordinates)),
-    )
+    misfit_px = evidence.sigma_px * float(np.sqrt(excess * evidence.correlation / coordinates))
+    significance = (total - free) / np.sqrt(2.0 * free)
+    return Adequacy(scores, amplitudes, directions, trajectories, excess, significance, misfit_px)
 
 
 _WORTH_PX = 0.0005
@@ -356,10 +350,7 @@ _WORTH_PX = 0.0005
 
 def remove_curvature(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
     """Return the series without the projection's curvature; None if it matters in none."""
-    out = [relinearise(fitter, fit, s) for s in range(len(fitter.series))]
-    if all(e is None for e in out):
-        return None
-    return [e or old for e, old in zip(out, fitter.series, strict=True)]
+    return fitter.replaced([relinearise(fitter, fit, s) for s in range(len(fitter.series))])
 
 
 def relinearise(
@@ -394,10 +385,6 @@ def relinearise(
     b = e.b - np.einsum("eti,tik->ek", weights[..., :2] * change, e.columns)
     values = solve(e.N, b)
     return replace(
-        e,
-        b=b,
-        values=values,
-        yy=np.einsum("ek,ek->e", values, b),
-        hidden=e.hidden.less(change) if e.hidden else None,
-        bend=bend,
-    )
+        e, b=b, values=values, yy=np.einsum("ek,ek->e", values, b),
+        hidden=e.hidden.less(change) if e.hidden else None, bend=bend,
+    )  # fmt: skip

@@ -542,7 +542,6 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     N = np.add.reduceat(evidence.N, first, axis=0)
     b = np.add.reduceat(evidence.b, first, axis=0)
     values = solve(N, b)
-    yy = np.einsum("ek,ek->e", values, b)
     knots = next(iter(evidence.thermometers.values())).times
     inside = (knots >= evidence.history.times[0] - 30.0) & (
         knots <= evidence.history.times[-1] + 30.0
@@ -556,21 +555,14 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
         shape=(len(knots), int(state.max()) + 1),
     )
     there = np.maximum(np.add.reduceat((evidence.n > 0).astype(float), first), 1.0)
+    free = evidence.rank * float((evidence.n > 0).sum() - (total > 0).sum())
     return replace(
         evidence,
         times=average @ evidence.times + (total == 0) * evidence.times[first],
-        N=N,
-        b=b,
-        yy=yy,
-        values=values,
+        N=N, b=b, yy=np.einsum("ek,ek->e", values, b), values=values,
         n=np.add.reduceat(evidence.n, first),
         sigma0=np.sqrt(np.add.reduceat(evidence.sigma0**2, first) / there),
-        blocks=Blocks(
-            average,
-            pool,
-            evidence.rank * float((evidence.n > 0).sum() - (total > 0).sum()),
-            first,
-        ),
+        blocks=Blocks(average, pool, free, first),
         hidden=evidence.hidden.in_blocks(first) if evidence.hidden else None,
         slope_jumps=None,
-    )
+    )  # fmt: skip

@@ -134,11 +134,10 @@ def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
 
 def _average_temperature(series: SeriesInput, size: int) -> Array:
     """Return averages (⌈E / size⌉,) of the reference temperature, interpolated across gaps."""
-    values = np.zeros(len(series.frame_times))
-    for readings in list(series.readings.values())[:1]:
-        there = np.flatnonzero(np.isfinite(readings))
-        if len(there):
-            values = np.interp(np.arange(len(values)), there, readings[there])
+    E = len(series.frame_times)
+    readings = next(iter(series.readings.values()), np.zeros(E))
+    there = np.flatnonzero(np.isfinite(readings))
+    values = np.interp(np.arange(E), there, readings[there]) if len(there) else np.zeros(E)
     starts = np.arange(0, len(values), size)
     total = np.add.reduceat(values, starts)
     return np.asarray(total / np.diff(np.append(starts, len(values))))
@@ -176,8 +175,7 @@ def _average_epochs(
         if fine:
             runs = np.flatnonzero(np.diff(at // fine, prepend=-1))
             sums[at[runs] // fine] += np.add.reduceat(_shift_and_scale(p, w, middle), runs, axis=0)
-    if middle is None:
-        middle = np.full((targets, 2), np.nan)
+    assert middle is not None  # there are epochs
     determinant = normal[..., 0] * normal[..., 1] - normal[..., 2] ** 2
     there = determinant > 0
     d = np.where(there, determinant, 1.0)
@@ -274,15 +272,14 @@ def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: st
         channel: np.array([e.temperatures.get(channel, np.nan) for e in epochs], dtype=float)
         for channel in head.channels
     }
-    whole = _start_input(
+    return _start_input(
         head, field, name,
         np.array([e.number for e in epochs], dtype=np.int64),
         np.array([e.frame_time for e in epochs], dtype=float),
         np.array([e.temperature_time for e in epochs], dtype=float),
         readings,
+        ObservationGrid.from_observations(field, [e.observations for e in epochs]),
     )  # fmt: skip
-    grid = ObservationGrid.from_observations(field, [e.observations for e in epochs])
-    return replace(whole, grid=grid)
 
 
 _COPY = (
@@ -316,10 +313,11 @@ def series_input(
     """
     source.head.require_calibrated(source.title)
     if source.has_observations and len(source) > limit_rows(len(source.testfield)):
-        every = source.columns
+        every, nothing = source.columns, np.empty((0, len(source.testfield), 3))
         whole = _start_input(
             source.head, source.testfield, source.title, every.numbers, every.frame_time,
             every.temperature_time, every.temperatures,
+            ObservationGrid(nothing[..., :2], nothing),
         )  # fmt: skip
         return condensed(replace(whole, columns=_read_columns(source)), source)
     if isinstance(source, Recording) and not source.has_observations:
@@ -357,22 +355,11 @@ def _read_columns(source: Recording | StoredRecording) -> dict[str, NDArray[np.f
 
 def _start_input(
     head: Head, field: TestField, name: str, numbers: NDArray[np.int64], frame_times: Array,
-    reading_times: Array, readings: Mapping[str, Array],
+    reading_times: Array, readings: Mapping[str, Array], grid: ObservationGrid,
 ) -> SeriesInput:  # fmt: skip
     camera = head.camera
-    nothing = np.empty((0, len(field), 3))
+    resolutions = {channel: c.resolution for channel, c in head.channels.items()}
     return SeriesInput(
-        name=name,
-        camera=camera.name,
-        sensor=camera.sensor,
-        field=field,
-        principal_distance=camera.principal_distance,
-        frame_times=frame_times,
-        reading_times=reading_times,
-        readings=readings,
-        resolutions={channel: c.resolution for channel, c in head.channels.items()},
-        grid=ObservationGrid(nothing[..., :2], nothing),
-        numbers=numbers,
-        series=head.series,
-        interior=camera.interior,
-    )
+        name, camera.name, camera.sensor, field, camera.principal_distance, frame_times,
+        reading_times, readings, resolutions, grid, numbers, head.series, camera.interior,
+    )  # fmt: skip

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
 
 # a normal distribution without what is beyond k sigma, and its sd, √(1 - 2 k φ(k) / (2 Φ(k) - 1))
 CLIPPED_AT, CLIPPED_SD = 2.2, 0.9162
@@ -280,15 +280,9 @@ def _measure_bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
 
 
 def smooth_channel(
-    times: Array,
-    readings: Array,
-    own: NDArray[np.bool_],
-    latent: NDArray[np.bool_],
-    curved: NDArray[np.bool_],
-    resolution: float | None,
-    noises: Array | None = None,
-    passed: NDArray[np.bool_] | None = None,
-) -> Thermometer:
+    times: Array, readings: Array, own: Mask, latent: Mask, curved: Mask,
+    resolution: float | None, noises: Array | None = None, passed: Mask | None = None,
+) -> Thermometer:  # fmt: skip
     """Smooth a column on knots: its own times, and other columns' knots, which stay NaN.
 
     times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent, curved (K,):
@@ -400,14 +394,11 @@ def extend(channel: Thermometer) -> Thermometer:
     early = 0.5 * abs(first) * (t[0] - before) + 0.1 * channel.noise
     late = 0.5 * (abs(last) + rate) * (after - t[-1]) + 0.1 * channel.noise
     return replace(
-        channel,
-        times=np.concatenate([before, t, after]),
+        channel, times=np.concatenate([before, t, after]),
         trajectory=np.concatenate([held, channel.trajectory, carried]),
-        deviation=np.pad(channel.deviation, (n, m)),
-        sd=np.concatenate([early, channel.sd, late]),
-        mixing=mixing,
-        real=np.pad(channel.real, (n, m)),
-    )
+        deviation=np.pad(channel.deviation, (n, m)), sd=np.concatenate([early, channel.sd, late]),
+        mixing=mixing, real=np.pad(channel.real, (n, m)),
+    )  # fmt: skip
 
 
 def _smooth(values: Array, weights: Array, noise: float) -> Array:

@@ -28,6 +28,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics.model import BASES, RATED, ThermalModel, choose_basis, distortion_along
 from thermocald.store.logger.dialect import to_celsius
 from thermocald.store.recording.reader import interpolate_readings
+from thermocald.thermal.source import refuse_copies
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 FORMAT = "thermocald-calibration/1"
+_COPY = "holds the same camera as {}; give calibrations from different photographs"
 _LEVEL = 1e-3
 _LEAST_SPAN_K = 1.0
 _HOT_C = 45.0  # if all are hotter, they may be in another unit, which gives them at most _WARM_C
@@ -132,6 +134,7 @@ def fit_calibrations(
     free = np.flatnonzero(np.diag(first.camera.covariance) > 0)
     for one in calibrations:
         _require_alike(first, one, free)
+    refuse_copies([(str(c.path), c.camera.values) for c in calibrations], _COPY, atol=0.0)
     T = np.array([camera.temperature for camera in cameras])
     if np.ptp(T) < _LEAST_SPAN_K:
         raise DataError(
@@ -195,13 +198,13 @@ def fit_calibrations(
 
 def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
     """Raise UsageError for an unknown temperature, another sensor or other free parameters."""
-    if math.isnan(other.camera.temperature):
+    if not math.isfinite(other.camera.temperature):
         raise UsageError(
             f"{other.path}: at which temperature? Write 21.5={other.path}, or give the "
             "thermometer's --log"
         )
-    if other.camera.sensor != first.camera.sensor:
-        raise UsageError(f"{other.path}: is of another sensor than {first.path}")
+    if (other.camera.name, other.camera.sensor) != (first.camera.name, first.camera.sensor):
+        raise UsageError(f"{other.path}: is of another camera or sensor than {first.path}")
     own = np.flatnonzero(np.diag(other.camera.covariance) > 0)
     held = np.setdiff1d(np.arange(10), free)
     same = other.camera.values[held] == first.camera.values[held]

@@ -40,11 +40,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     rays,
 )
 from thermocald.photogrammetry.camera.conversions import opencv_terms
-from thermocald.photogrammetry.targets.image_file import (
-    EncodedImage,
-    with_comment,
-    with_metadata,
-)
+from thermocald.photogrammetry.targets.image_file import EncodedImage, with_comment, with_metadata
 from thermocald.result import jsonable, with_sds
 from thermocald.store.logger.clock import ORDERS, DeviceClock, date_orders, parse_moment
 
@@ -133,7 +129,8 @@ def _predict(
         log.times, log.channels, times, extrapolate, relative_to=target,
         temperature_sd=temperature_sd,
     )  # fmt: skip
-    return camera.at(target, extrapolate=True), along
+    others = dict.fromkeys(camera.channels, target)  # as warm
+    return camera.at(target, channels=others, extrapolate=True), along
 
 
 _QUALITY = 95  # of a JPEG: its losses are below the noise of a camera
@@ -148,7 +145,8 @@ class FrameCorrector:
     def __init__(self, thermal: ThermalCamera, camera: str, origin: Sequence[float]) -> None:
         self.sensor, self.to = thermal.model.sensor, thermal.model.T0
         self._camera, self._origin = camera, list(origin)
-        self._steady = thermal.at(self.to, extrapolate=True)
+        others = dict.fromkeys(thermal.channels, self.to)  # as warm
+        self._steady = thermal.at(self.to, channels=others, extrapolate=True)
         self._maps = Maps(self._steady.sensor, self._steady.values, self.to)
 
     def correct(self, encoded: bytes, calibrated: CalibratedEpoch) -> bytes:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Steady
@@ -26,15 +27,18 @@ from thermocald.store.logger.dialect import to_celsius
 from thermocald.store.recording.reader import TemperatureLog
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.physics.model import ThermalModel
 
 
 OTHER_UNITS = {"fahrenheit": "degF", "kelvin": "K"}
 _REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
 _STEP = 1e-3  # relative step of a parameter for its derivative
+_OF_TIMES = ("times", "temperatures", "values", "covariance", "extrapolated")
 _MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 
 
@@ -193,7 +197,7 @@ def _step(model: ThermalModel, name: str) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Along:
-    """The camera along a history; indexing gives a Camera.
+    """The camera along a history; an index gives a Camera, a slice or a mask a part of it.
 
     times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K.
     """
@@ -208,20 +212,23 @@ class Along:
 
     def __repr__(self) -> str:
         T = self.temperatures
-        return f"<Along {self.camera}: {len(self)} times, {T.min():.1f} to {T.max():.1f} °C>"
+        span = f", {T.min():.1f} to {T.max():.1f} °C" if len(T) else ""
+        return f"<Along {self.camera}: {counted(len(self), 'time')}{span}>"
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def __getitem__(self, i: int) -> Camera:
+    @overload
+    def __getitem__(self, i: int) -> Camera: ...
+    @overload
+    def __getitem__(self, i: slice | Sequence[int] | Index | Mask) -> Along: ...
+    def __getitem__(self, i: int | slice | Sequence[int] | Index | Mask) -> Camera | Along:
+        if np.ndim(self.times[i]):
+            return replace(self, **{name: getattr(self, name)[i] for name in _OF_TIMES})
         return Camera(
-            self.sensor,
-            float(self.temperatures[i]),
-            self.values[i],
-            self.covariance[i],
-            float(self.extrapolated[i]),
-            self.camera,
-        )
+            self.sensor, float(self.temperatures[i]), self.values[i], self.covariance[i],
+            float(self.extrapolated[i]), self.camera,
+        )  # fmt: skip
 
     @property
     def sd(self) -> Array:
@@ -267,6 +274,13 @@ def read_history(
         )
     begin = float(min(t[0], instants.min()))
     return begin, instants, History(instants - begin, t - begin, readings, reference, T0)
+
+
+def one_time(time: Any, name: str) -> float:
+    """Return one time in s. Raises UsageError for several."""
+    if np.ndim(time):
+        raise UsageError(f"{name}: give one time")
+    return float(seconds(time))
 
 
 def require_sd(temperature_sd: float) -> None:

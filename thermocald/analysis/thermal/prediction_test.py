@@ -287,9 +287,8 @@ def predicted_error(
     source = series.source
     if source.sensor != model.sensor or source.camera != model.camera:
         raise ConfigurationError(
-            f"the model is of camera {model.camera} ({model.sensor.width}×{model.sensor.height} "
-            f"px), {source.name} of {source.camera} ({source.sensor.width}×"
-            f"{source.sensor.height} px): a thermal model belongs to one camera"
+            f"the model is of camera {model.camera} ({model.sensor}), {source.name} of "
+            f"{source.camera} ({source.sensor}): a thermal model belongs to one camera"
         )
     # the model's T₀ and reference, whichever column comes first
     history = series.history
@@ -361,7 +360,7 @@ def thermometer_noise(
     First from the readings' errors, propagated through each effect's operator, then what the times
     of the readings leave unresolved at most. Both are terms of a sum: a factor (E,) for each epoch
     and a variance (T, 2) px² for each target. A (T, 2, 22): from `image_partials`; thermometer_sd
-    K: of a reading.
+    K: of a reading of the reference.
     """
     history = series.readings_history
     jump = series.thermometers[history.reference].slope_jump(history.times)
@@ -394,7 +393,8 @@ def thermometer_noise(
                 continue  # independent thermometers
             shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
             shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
-            terms.append((thermometer_sd**2 * shared, (A @ c) * (A @ d)))
+            sd = thermometer_sd if a == history.reference else series.thermometers[a].noise
+            terms.append((sd**2 * shared, (A @ c) * (A @ d)))
     return terms, [(left**2, (A @ c) ** 2) for c, left in unresolved]
 
 

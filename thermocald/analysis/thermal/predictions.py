@@ -166,7 +166,8 @@ class Prediction(Result):
 def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> Prediction:
     """Describe a camera, and its uncertainty and drift on a plane at `distance` m."""
     error = camera.object_error(distance * 1000.0)
-    reference = thermal.at(thermal.model.T0, extrapolate=True)
+    T0 = thermal.model.T0
+    reference = thermal.at(T0, channels=dict.fromkeys(thermal.channels, T0), extrapolate=True)
     moved = camera.object_distance(reference, distance * 1000.0)
     document = {
         "format": "thermocald-prediction/1",
@@ -177,7 +178,7 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
     }
     in_space = (
         f"  on a plane at {distance:g} m: ± {plain(document['object_error_mm'], 'mm', 2)} "
-        f"from this orientation's uncertainty; the drift since {thermal.model.T0:g} °C is up to "
+        f"from this orientation's uncertainty; the drift since {T0:g} °C is up to "
         f"{plain(document['drift_from_reference_mm'], 'mm', 3)}"
     )
     return Prediction(thermal, document, [*camera.lines(), in_space], camera)

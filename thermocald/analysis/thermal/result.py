@@ -303,6 +303,11 @@ def build_camera(
     first = models[0]
     values = np.array([first.value(n) for n in names])
     certain = with_covariance(first, tuple(names), values, covariance)
+    other_sds = [
+        {name: round(f.thermometer_sd * (known[name].noise / known[e.history.reference].noise), 5)
+         for name in ThermalCamera(certain).channels if name in known}
+        for e, f in zip(fitter.series, fits, strict=True) for known in [e.thermometers]
+    ]  # fmt: skip
     model = replace(
         certain,
         effects=tuple(_with_event_sd(e, series[0]) for e in certain.effects),
@@ -310,8 +315,9 @@ def build_camera(
         validity=_find_ranges(series),
         fitted_on=tuple(
             {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
-             "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
-            for s, f in zip(series, fits, strict=True)
+             "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5),
+             **({"other_sds_K": sds} if sds else {})}
+            for s, f, sds in zip(series, fits, other_sds, strict=True)
         ),
         evidence={"fit": verdict},
     )  # fmt: skip

@@ -17,7 +17,7 @@ raises UsageError unless extrapolation is requested explicitly.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,12 +32,12 @@ from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
     moved_model,
+    one_time,
     predict_orientations,
     read_history,
     require_sd,
     steady_table,
 )
-from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
@@ -78,6 +78,9 @@ class ThermalCamera(Result):
 
     model: ThermalModel
     fitted: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    def __hash__(self) -> int:
+        return hash((self.model.camera, self.model.T0, self.model.interior))
 
     def save(self, path: Path | str) -> Path:
         """Write the model file (YAML), whole or not at all, and return its path.
@@ -138,9 +141,7 @@ class ThermalCamera(Result):
 
         Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
         """
-        (then, _, J0), (now, _, J) = (
-            self._steady(t, dict.fromkeys(self.channels, t)) for t in (since, T)
-        )
+        (then, _, J0), (now, _, J) = (self._steady(t) for t in (since, T))
         return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
@@ -249,7 +250,13 @@ class ThermalCamera(Result):
     def _steady(
         self, T: float, channels: Mapping[str, float] | None = None
     ) -> tuple[Array, Array, Array]:
-        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p)."""
+        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p).
+
+        channels: °C of the other thermometers, by default as warm.
+        """
+        channels = dict.fromkeys(self.channels, T) if channels is None else channels
+        if not math.isfinite(T):
+            raise UsageError(f"the temperature is {T}: give one in °C")
         model, names = self.model, self.parameters
         table, knees = steady_table(model, names, channels) if channels else self._table
         dT = T - model.T0
@@ -281,8 +288,6 @@ class ThermalCamera(Result):
         thermometer that the model does not know.
         """
         T = float(temperature)
-        if math.isnan(T):
-            raise UsageError("the temperature is NaN: give °C")
         require_sd(temperature_sd)
         known = list(dict.fromkeys([*self.model.validity, *self.channels]))
         for name, value in (channels or {}).items():
@@ -291,9 +296,10 @@ class ThermalCamera(Result):
                 raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
-        values, slope, J = self._steady(T, channels)
+        values, slope, J = self._steady(T, channels or {})
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
         beyond, covariance = 0.0, self._propagated(J, slope, temperature_sd**2)
+        covariance += temperature_sd**2 * self._noise_of(others)
         if others or not self.validity.low <= T <= self.validity.high:
             (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
             covariance += np.diag(drift)
@@ -318,15 +324,15 @@ class ThermalCamera(Result):
         extrapolate: bool = False,
         relative_to: float | None = None,
         temperature_sd: float = 0.0,
-        since: float | None = None,
+        since: Any = None,
     ) -> Along:
         """Return the camera along a temperature log, including effects with a memory.
 
         times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
         the reference first; at (E,): the times to predict for, by default `times`. The history
         begins with the first time. relative_to °C: the covariance is that of the difference from
-        the steady camera at this temperature; since s: instead, of the difference from the camera
-        at this time; temperature_sd K: of a reading, is propagated into the
+        the steady camera at this temperature; since: instead, of the difference from the camera
+        at this time of the log; temperature_sd K: of a reading, is propagated into the
         covariance (as if no effect had a memory, which would average it). Raises UsageError far
         outside the model's validity (unless `extrapolate`), for lengths that differ and for times
         that run backwards, DataError for times `at` that the log does not cover.
@@ -352,7 +358,8 @@ class ThermalCamera(Result):
         if relative_to is not None:
             base = self._steady(relative_to)[2]
         elif since is not None:
-            then = np.array([since - begin])
+            at = one_time(since, "since")
+            then = read_history(times, temperatures, at, self.model.T0)[1] - begin
             base = predicted(history.at(then))[2]
             of_base = interpolation_matrix(t, then).toarray()[0]
         for first in range(0, len(history.times), _CHUNK):
@@ -361,18 +368,15 @@ class ThermalCamera(Result):
             shares = W.power(2).sum(axis=1) - 2.0 * (W @ of_base) + of_base @ of_base
             found, slope, J = predicted(part)
             values.append(found)
-            covariance.append(self._propagated(J - base, slope, temperature_sd**2 * shares))
+            noise = np.asarray(temperature_sd**2 * shares)
+            of_others = noise[:, None, None] * self._noise_of(others)
+            covariance.append(self._propagated(J - base, slope, noise) + of_others)
         Q = np.concatenate(covariance)
         Q[:, range(10), range(10)] += drift
         return Along(
-            self.model.sensor,
-            instants,
-            history.temperature(),
-            np.concatenate(values),
-            Q,
-            outside,
+            self.model.sensor, instants, history.temperature(), np.concatenate(values), Q, outside,
             self.model.camera,
-        )
+        )  # fmt: skip
 
     def _beyond(
         self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
@@ -384,15 +388,30 @@ class ThermalCamera(Result):
         outside = self.validity.check(T, extrapolate)
         variance = (rates * outside[:, None]) ** 2
         drift: Array | float = 0.0
-        for effect in self.model.effects:
-            name = str(effect.values.get("channel", ""))
+        for name in self.channels:
             if name in others and name in self.model.validity:
                 of_fit = Validity(*self.model.validity[name], name)
                 beyond = of_fit.check(others[name], extrapolate)
-                own = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
                 outside = np.maximum(outside, beyond)
-                drift = drift + np.abs(beyond[:, None] * own)
+                drift = drift + np.abs(beyond[:, None] * self._slope_of(name))
         return outside, variance + drift**2
+
+    def _slope_of(self, channel: str) -> Array:
+        """Return the change (10,) of the parameters per kelvin of another thermometer."""
+        own = [e.values for e in self.model.effects if e.values.get("channel") == channel]
+        linear = np.array([[sum(float(v.get(n, 0.0)) for v in own)] for n in IOP_NAMES])
+        at = self.model.interior.as_array()
+        return self.model.carried_derivatives(at, linear, ("slope",))[:, 0]
+
+    def _noise_of(self, channels: Iterable[str]) -> Array:
+        """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
+        total = np.zeros((10, 10))
+        for name in channels:
+            fits = [f for f in self.model.fitted_on if name in f.get("other_sds_K", ())]
+            ratios = [f["other_sds_K"][name] / f["thermometer_sd_K"] for f in fits]
+            own = (float(np.median(ratios)) if ratios else 1.0) * self._slope_of(name)
+            total += np.outer(own, own)
+        return total
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
@@ -415,7 +434,7 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
-    return ThermalCamera(read_model(Path(path).expanduser()))
+    return ThermalCamera(read_model(Path(path)))
 
 
 def _push(followers: list[Any], time: float, value: float) -> Array:
@@ -460,6 +479,9 @@ class LiveCamera:
             for sign in (1.0, -1.0)
             if name.split(".")[0] in drives
         }
+
+    def __reduce__(self) -> str:  # a copy would share the state of the effects with a memory
+        raise UsageError("a live camera belongs to one run: make another with live(), not a copy")
 
     def __repr__(self) -> str:
         now = "no reading yet" if self._now is None else f"{self._now.temperature:g} °C"
@@ -515,8 +537,10 @@ class LiveCamera:
         import cv2
 
         sensor = self.thermal.model.sensor
-        if not isinstance(frame, np.ndarray) or frame.ndim < 2:
-            raise UsageError(f"the frame is a {type(frame).__name__}: give an array (H, W)")
+        if not isinstance(frame, np.ndarray) or frame.ndim not in (2, 3):
+            raise UsageError(
+                f"the frame is a {type(frame).__name__}: give an array (H, W) or (H, W, channels)"
+            )
         if frame.shape[:2] != (sensor.height, sensor.width):
             raise UsageError(
                 f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "
@@ -525,7 +549,7 @@ class LiveCamera:
             )
         maps = self.maps(to)
         try:
-            return cv2.remap(frame, *maps, cv2.INTER_LINEAR)
+            return cv2.remap(frame, *maps, cv2.INTER_LINEAR).reshape(frame.shape)
         except cv2.error:
             raise UsageError(f"a frame of {frame.dtype} cannot be resampled; give uint8") from None
 
@@ -538,15 +562,14 @@ class LiveCamera:
             raise UsageError("there is no reading yet: call update(time, temperature) first")
         target = self.thermal.model.T0 if to is None else to
         if self._maps is None or self._maps.to != target:
-            steady = self.thermal.at(target, extrapolate=True)
+            others = dict.fromkeys(self.thermal.channels, target)  # as warm
+            steady = self.thermal.at(target, channels=others, extrapolate=True)
             self._maps = Maps(steady.sensor, steady.values, target)
         return self._maps.of(self._now.values)
 
     def _checked(self, time: Any, temperature: float | Mapping[str, float]) -> tuple[float, ...]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
-        if np.ndim(time):
-            raise UsageError("time: give one time for a reading")
-        t = float(seconds(time))
+        t = one_time(time, "time")
         given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
         names, row = tuple(given), tuple(float(v) for v in given.values())
         if not row:

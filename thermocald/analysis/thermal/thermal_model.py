@@ -114,9 +114,7 @@ def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> No
             )
         if s.sensor != first.sensor:
             raise DataError(
-                f"{s.name} has {s.sensor.width}×{s.sensor.height} px of "
-                f"{s.sensor.pixel_pitch:g} mm, {first.name} {first.sensor.width}×"
-                f"{first.sensor.height} px of {first.sensor.pixel_pitch:g} mm: fit series of one "
+                f"{s.name} has {s.sensor}, {first.name} {first.sensor}: fit series of one "
                 "resolution; a model is scaled to another when it is used"
             )
         if reduced.history.reference != series[0].history.reference:
@@ -195,7 +193,6 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
             )
     names = _names(first)
     values = np.array([[m.value(n) for n in names] for m in models])
-    n = len(models)
     people = population(values, np.array([m.covariance_of(names) for m in models]))
     low, high = zip(*(next(iter(m.validity.values())) for m in models if m.validity), strict=True)
     channel = next(iter(first.validity), "temperature")
@@ -204,7 +201,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     return replace(
         mean,
         camera=name,
-        name=f"type {name}, {n} cameras",
+        name=f"type {name}, {len(models)} cameras",
         exterior=None,
         sds=own,
         evidence={},

@@ -61,9 +61,16 @@ def spread_rows(count: int, most: int) -> Index:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return 8-bit values of an image of 8 or 16 bit."""
-    return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+def eight_bit(image: NDArray[Any], like: NDArray[Any] | None = None) -> NDArray[np.uint8]:
+    """Return 8-bit values of an image of 8 bit, or of 10, 12, 14 or 16 bit stored in 16.
+
+    like: another image of the camera, by default this one, whose largest value shows how many.
+    """
+    if image.dtype == np.uint8:
+        return image
+    bits = int((image if like is None else like).max()).bit_length()
+    small: NDArray[np.uint8] = np.minimum(image >> (max(bits + bits % 2, 10) - 8), 255).astype("u1")
+    return small
 
 
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

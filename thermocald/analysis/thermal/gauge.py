@@ -8,8 +8,8 @@ no row has the status `ok`, so that a study or a fit does not take a prediction 
 
     predicted      interior orientation only: there are no control points, or none gives a pose
     resected       also the pose from the control points, with the predicted camera as prior
-    last_pose      control points hidden or too few: the last pose, with the mount's possible
-                   motion, unless most of those seen contradict it
+    last_pose      control points hidden, or too few to check each other: the last pose, with the
+                   mount's possible motion, unless most of those seen contradict it
     outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
                    all if too far
     no_temperature the last reading is too old, or there is none
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
 
 
 _FEWEST = 3  # control points, if there is an earlier pose
+_FEW = 4  # redundancy up to which a pose may follow a wrong control point
 _MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
 _ELSEWHERE_CHI2 = 18.4  # two degrees of freedom, one in ten thousand
 _SUDDEN_K = 2.0  # change between two frames below which a missing effect has little influence
@@ -413,6 +414,13 @@ class GaugeCalibrator(EpochCalibrator):
             result = again if again.ok else result
         if not result.ok:
             return self._without_pose(epoch, now, seen, f"{result.status}: {result.reason}")
+        if (last := self.pose) is not None and result.redundancy <= _FEW:
+            used = seen.select(~np.isin(seen.targets, result.rejected))
+            share = self._share_elsewhere(last, now, used, self._since(last, now, epoch))
+            # most of them move with the camera; of three points, nothing checks even that
+            if share > 0.0 and (share <= 0.5 or not result.redundancy):
+                why = "a control point contradicts the last pose, and too few are seen to check it"
+                return self._without_pose(epoch, now, used, why)
         if in_order:
             self.pose = _pose_of(epoch, now, seen, result)
             self._watch(self.pose)
@@ -440,10 +448,8 @@ class GaugeCalibrator(EpochCalibrator):
         still = f"; the mount may have moved for {hours:.2f} h"
         if self._mount is None:
             still = "; the mount is taken not to have moved since, as its movement is not known"
-        since = np.zeros((16, 16))  # the covariance of what may have changed
-        since[IOP, IOP] = self._change(last.predicted, now)
-        since[range(10, 13), range(10, 13)] = math.radians(self._mount or 0.0) ** 2 * hours
-        if seen is not None and len(seen) and self._most_are_elsewhere(last, now, seen, since):
+        since = self._since(last, now, epoch)
+        if seen is not None and len(seen) and self._share_elsewhere(last, now, seen, since) > 0.5:
             why = f"{why}; most are not where the last pose puts them: was the camera moved?"
             return self._unposed("predicted", why, now, seen)
         result = self._unposed("last_pose", why + still, now, seen)
@@ -455,10 +461,18 @@ class GaugeCalibrator(EpochCalibrator):
             exterior=ExteriorOrientation.from_array(last.values[EOP]),
         )
 
-    def _most_are_elsewhere(
+    def _since(self, last: Pose, now: PredictedCamera, epoch: Epoch) -> Array:
+        """Return the covariance (16, 16) of what may have changed since the last pose."""
+        hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
+        since = np.zeros((16, 16))
+        since[IOP, IOP] = self._change(last.predicted, now)
+        since[range(10, 13), range(10, 13)] = math.radians(self._mount or 0.0) ** 2 * hours
+        return since
+
+    def _share_elsewhere(
         self, last: Pose, now: PredictedCamera, seen: Observations, since: Array
-    ) -> bool:
-        """Test whether more than half of the control points contradict the last pose.
+    ) -> float:
+        """Return the share of the control points that contradict the last pose.
 
         Those that it used are compared with their image then, others with their coordinates; since
         (16, 16): the covariance of what may have changed.
@@ -473,7 +487,7 @@ class GaugeCalibrator(EpochCalibrator):
         C[1][:, range(2), range(2)] += new.sigmas**2
         left = np.concatenate([moved, new.points - at])
         chi2 = np.einsum("ni,nij,nj->n", left, np.linalg.inv(np.concatenate(C)), left)
-        return bool(np.mean(chi2 > _ELSEWHERE_CHI2) > 0.5)
+        return float(np.mean(chi2 > _ELSEWHERE_CHI2))
 
     def _moved_since(
         self, then: Pose, now: PredictedCamera, seen: Observations

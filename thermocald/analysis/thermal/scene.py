@@ -105,7 +105,7 @@ def track_features(
     reference: NDArray[Any], points: NDArray[np.float32], image: NDArray[Any]
 ) -> tuple[NDArray[np.int64], Array]:
     """Track features (F, 2) px; return the rows of those found again and their shifts (n, 2) px."""
-    first, now, start = eight_bit(reference), eight_bit(image), None
+    first, now, start = eight_bit(reference), eight_bit(image, reference), None
     options: dict[str, Any] = {
         "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3),

@@ -62,14 +62,14 @@ def spread_rows(count: int, most: int) -> Index:
 
 
 def eight_bit(image: NDArray[Any], like: NDArray[Any] | None = None) -> NDArray[np.uint8]:
-    """Return 8-bit values of an image of 8 bit, or of 10, 12, 14 or 16 bit stored in 16.
+    """Return 8-bit values of an image of 8 or 16 bit.
 
-    like: another image of the camera, by default this one, whose largest value shows how many.
+    like: an image of the camera whose largest value shows how many of the 16 bits are used.
     """
     if image.dtype == np.uint8:
         return image
-    bits = int((image if like is None else like).max()).bit_length()
-    small: NDArray[np.uint8] = np.minimum(image >> (max(bits + bits % 2, 10) - 8), 255).astype("u1")
+    used = 16 if like is None else max(int(like.max()).bit_length(), 8)
+    small: NDArray[np.uint8] = np.minimum(image >> (used - 8), 255).astype(np.uint8)
     return small
 
 

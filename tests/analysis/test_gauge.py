@@ -17,7 +17,8 @@ from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
+from thermocald.analysis.thermal.gauge import GaugeCalibrator
+from thermocald.analysis.thermal.predictor import Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
@@ -127,7 +128,7 @@ def read(temperatures, period: float = 10.0) -> list[Epoch]:
 
 def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
     results, words, events = followed(
-        GaugeCalibrator(thermal_camera()), read([20.0, 44.9, 55.0, 90.0, 20.0])
+        GaugeCalibrator(thermal_camera()), read([20.0, 44.9, 55.0, 90.0, 44.0], 3600.0)
     )
     assert words == ["predicted", "predicted", "outside_range", "outside_range", "predicted"]
     _, inside, outside, far, _ = (r.adjustment for r in results)
@@ -139,13 +140,24 @@ def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
 
 def test_the_covariance_grows_while_a_thermometer_is_lost():
     results, words, events = followed(
-        GaugeCalibrator(thermal_camera()), read([20.0, math.nan, math.nan, math.nan, 21.0], 300.0)
+        GaugeCalibrator(thermal_camera()), read([20.0, math.nan, math.inf, math.nan, 21.0], 300.0)
     )
     assert words == ["predicted", *["no_temperature"] * 3, "predicted"]
     sd = [r.adjustment.sd[1] for r in results]
     assert sd[0] < sd[1] < sd[2] < sd[3]
     assert sd[4] == pytest.approx(sd[0], rel=0.1)
     assert [kind for kind, _ in events] == ["no_temperature", "predicted"]
+
+
+def test_a_reading_that_jumps_is_no_temperature():
+    """Of 30 °C between two of 20 °C: the camera was 5 sds off, without a word."""
+    results, words, events = followed(
+        GaugeCalibrator(thermal_camera()), read([20.0, 20.1, 30.0, 20.1, 21.0, 22.0], 60.0)
+    )
+    assert words == ["predicted"] * 2 + ["no_temperature"] + ["predicted"] * 3
+    sd = [r.adjustment.sd[1] for r in results]
+    assert sd[2] == pytest.approx(np.hypot(sd[1], 9.9 * RATES["x0"]), rel=0.02)
+    assert "jumped by 9.9 K" in events[0][1]
 
 
 def test_a_delayed_epoch_has_the_camera_of_its_time():
@@ -403,7 +415,7 @@ def test_the_movement_has_true_sds():
         gauge.calibrate(world.epoch(1, 10.0))
         then = gauge.pose
         world.pose = POSE + np.array([2e-3, -1e-3, 1e-3, 30.0, -20.0, 10.0])
-        epoch = world.epoch(2, 25.0)
+        epoch = world.epoch(2, 25.0, period=3600.0)
         gauge.calibrate(epoch)
         found = gauge.compare(then, gauge.pose)
         error = found.values - (world.pose - POSE)

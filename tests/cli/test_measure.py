@@ -222,7 +222,7 @@ def scaled(factor: float, *names: str):
      ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
      ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),
      ("points.csv", "time;name;x;y;sx;sy\n1700021600;a;1640;1700;1;1\n", "columns with commas"),
-     ("points.csv", lambda i, _: {"y": -900}, "above the horizon"),
+     ("points.csv", lambda i, _: {"y": 20}, "above the horizon"),
      ("points.csv", lambda i, _: {"x": 5000}, "px is outside"),
      ("points.csv", lambda i, _: {"sx": 0}, "must be above 0"),
      ("points.csv", lambda i, _: {"time": 1_600_000_000}, "outside the temp"),

@@ -103,14 +103,15 @@ FEATURE = {"geometry": {"type": "Point", "coordinates": [313e3, 192e3, 138.0]}, 
 
 @pytest.mark.parametrize(
     ("document", "words"),
-    [({"gcps": {"src": [[1, 2]] * 5, "dst": POINTS}}, "gcps.src has 5 points and gcps.dst 8"),
+    [({}, "as JSON"),
+     ({"gcps": {"src": [[1, 2]] * 5, "dst": POINTS}}, "gcps.src has 5 points and gcps.dst 8"),
      ({"gcps": {"src": [[1, 2]] * 8, "dst": POINTS}}, "do X and Y hold degrees"),
      ({"gcps": {"src": [[1, 2]]}}, "'dst' is missing"),
      ({"type": "FeatureCollection", "features": [FEATURE]}, "is not valid JSON of control points")],
 )  # fmt: skip
 def test_control_points_that_pyorc_would_not_take_are_said(tmp_path, document, words):
     path = tmp_path / "site.json"
-    path.write_text(json.dumps(document))
+    path.write_text("\ufeff" + json.dumps(document) if words != "as JSON" else "[" * 100_000)
     with pytest.raises(DataError, match=words) as refused:
         ControlPoints.read(path, "m")
     assert str(refused.value).count(str(path)) == 1

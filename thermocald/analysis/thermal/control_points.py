@@ -84,14 +84,11 @@ class ControlPoints:
         """
         if path.suffix.lower() not in (".json", ".geojson"):
             return _from_table(path, unit)
+        document = read_document(path)
         try:
-            document = json.loads(path.read_text(encoding="utf-8-sig"))
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: cannot be read as JSON: {error}") from error
-        try:
-            if isinstance(document, dict) and "gcps" in document:
+            if "gcps" in document:
                 return _from_pyorc(document, str(path))
-            if isinstance(document, dict) and document.get("type") == "FeatureCollection":
+            if document.get("type") == "FeatureCollection":
                 return _from_features(document, str(path))
         except DataError:
             raise
@@ -340,6 +337,15 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
     return ControlPoints.build(
         words["target"], stacked("X", "Y", "Z"), sigmas, unit, str(path), seen, **looks
     )
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file, {} for anything else. Raises DataError naming the file."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {error}") from error
+    return document if isinstance(document, dict) else {}
 
 
 def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:

@@ -88,7 +88,7 @@ Track = tuple["NDArray[np.int64]", "Array"]
 def detect_features(reference: NDArray[Any]) -> NDArray[np.float32]:
     """Detect features (F, 2) px in a reference frame (H, W). Raises DataError for too few."""
     corners = cv2.goodFeaturesToTrack(
-        eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
+        eight_bit(reference, reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
     )
     found = np.zeros((0, 2)) if corners is None else np.asarray(corners).reshape(-1, 2)
     last = np.array(reference.shape[::-1]) - _WINDOW_PX
@@ -105,7 +105,7 @@ def track_features(
     reference: NDArray[Any], points: NDArray[np.float32], image: NDArray[Any]
 ) -> tuple[NDArray[np.int64], Array]:
     """Track features (F, 2) px; return the rows of those found again and their shifts (n, 2) px."""
-    first, now, start = eight_bit(reference), eight_bit(image, reference), None
+    first, now, start = eight_bit(reference, reference), eight_bit(image, reference), None
     options: dict[str, Any] = {
         "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3),

@@ -266,9 +266,16 @@ def place_on(
     times; member (n,): time of each point. For a line, rays meet the plane through it that faces
     the camera, and points are projected onto the line: an image point's distance from the line's
     image has no effect, and points have variance along the line, and across it that of the line.
-    Raises GeometryError for a ray that does not meet the surface in front of the camera.
+    Raises GeometryError for a point outside the image, and for a ray that does not meet the surface
+    in front of the camera.
     """
     uv = np.atleast_2d(np.asarray(image_points, dtype=float))
+    if not (inside := sensor.contains(uv, -1.0)).all():
+        x, y = uv[np.argmin(inside)]
+        raise GeometryError(
+            f"image point {x:.0f}, {y:.0f} px is outside the camera's {sensor.width} × "
+            f"{sensor.height} px"
+        )
     values = np.broadcast_to(values, (len(uv), 16))
     pose = values[0, EOP]
     centre = pose[3:]

@@ -239,20 +239,17 @@ class ControlPoints:
         field, seen, n = self.field, self.seen, len(self.seen)
         names = [field.names[row] for row in seen.targets]
         mirrored = "mirrored they fit: X and Y, or x and y, are exchanged, or a sign is wrong"
-        changes = [
-            (mirrored, camera, replace(field, points=field.points[:, [1, 0, 2]]), seen),
-            (mirrored, camera, field, replace(seen, points=seen.points[:, ::-1])),
-        ]
-        x, y = seen.points.T
-        size = np.array([camera.sensor.width, camera.sensor.height])
         upright = "turned by 90° they fit: were x, y read in an image that was shown upright?"
-        turned = ((y, size[1] - 1 - x), (size[0] - 1 - y, x))
-        changes += [(upright, camera, field, replace(seen, points=np.array(t).T)) for t in turned]
+        (x, y), size = seen.points.T, (camera.sensor.width, camera.sensor.height)
+        turned = (mirrored, y, x), (upright, y, size[1] - 1 - x), (upright, size[0] - 1 - y, x)
+        changes = [(mirrored, camera, replace(field, points=field.points[:, [1, 0, 2]]), seen)]
+        for text, *at in turned:
+            changes.append((text, camera, field, replace(seen, points=np.array(at).T)))
         for factor in _OTHER_SIZES:
-            at, sigmas = (seen.points + 0.5) * factor - 0.5, seen.sigmas * factor
+            larger, sigmas = (seen.points + 0.5) * factor - 0.5, seen.sigmas * factor
             text = f"times {factor:g} they fit: are x, y of images of {size[0] / factor:g} × "
             text += f"{size[1] / factor:g} px? Give them for {size[0]} × {size[1]} px"
-            changes.append((text, camera, field, replace(seen, points=at, sigmas=sigmas)))
+            changes.append((text, camera, field, replace(seen, points=larger, sigmas=sigmas)))
         for i, j in combinations(range(min(n, _EXCHANGED)), 2):
             order = np.arange(n)
             order[[i, j]] = j, i

@@ -17,7 +17,8 @@ from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.gauge import GaugeCalibrator, Predictor
+from thermocald.analysis.thermal.gauge import GaugeCalibrator
+from thermocald.analysis.thermal.predictor import Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
@@ -127,7 +128,7 @@ def read(temperatures, period: float = 10.0) -> list[Epoch]:
 
 def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
     results, words, events = followed(
-        GaugeCalibrator(thermal_camera()), read([20.0, 44.9, 55.0, 90.0, 20.0])
+        GaugeCalibrator(thermal_camera()), read([20.0, 44.9, 55.0, 90.0, 44.0], 3600.0)
     )
     assert words == ["predicted", "predicted", "outside_range", "outside_range", "predicted"]
     _, inside, outside, far, _ = (r.adjustment for r in results)
@@ -139,13 +140,24 @@ def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
 
 def test_the_covariance_grows_while_a_thermometer_is_lost():
     results, words, events = followed(
-        GaugeCalibrator(thermal_camera()), read([20.0, math.nan, math.nan, math.nan, 21.0], 300.0)
+        GaugeCalibrator(thermal_camera()), read([20.0, math.nan, math.inf, math.nan, 21.0], 300.0)
     )
     assert words == ["predicted", *["no_temperature"] * 3, "predicted"]
     sd = [r.adjustment.sd[1] for r in results]
     assert sd[0] < sd[1] < sd[2] < sd[3]
     assert sd[4] == pytest.approx(sd[0], rel=0.1)
     assert [kind for kind, _ in events] == ["no_temperature", "predicted"]
+
+
+def test_a_reading_that_jumps_is_no_temperature():
+    """Of 30 °C between two of 20 °C: the camera was 5 sds off, without a word."""
+    results, words, events = followed(
+        GaugeCalibrator(thermal_camera()), read([20.0, 20.1, 30.0, 20.1, 21.0, 22.0], 60.0)
+    )
+    assert words == ["predicted"] * 2 + ["no_temperature"] + ["predicted"] * 3
+    sd = [r.adjustment.sd[1] for r in results]
+    assert sd[2] == pytest.approx(np.hypot(sd[1], 9.9 * RATES["x0"]), rel=0.02)
+    assert "jumped by 9.9 K" in events[0][1]
 
 
 def test_a_delayed_epoch_has_the_camera_of_its_time():
@@ -288,8 +300,8 @@ def nearly_on_a_line(seed: int, survey_mm: float):
     return world, gauge.calibrate(world.epoch(1, 30.0)).adjustment
 
 
-def in_fog(seed: int, seen: int, knocked: bool):
-    """Calibrate with few points of twelve in sight, after a knock or without one."""
+def in_fog(seed: int, seen: int, knocked: bool, wrong_px: float = 0.0):
+    """Calibrate with few points of twelve in sight, after a knock or without; one may be wrong."""
     world = World(700 + seed)
     gauge = GaugeCalibrator(thermal_camera(), world.field, mount_sd_deg=0.01)
     gauge.calibrate(world.epoch(1, 20.0))
@@ -297,9 +309,21 @@ def in_fog(seed: int, seen: int, knocked: bool):
         turn = world.rng.choice([-1, 1], 3) * world.rng.uniform(0.05, 0.2, 3)
         world.pose = POSE + np.concatenate([np.deg2rad(turn), world.rng.normal(0, 30, 3)])
     epoch = world.epoch(2, 21.0, world.rng.choice(12, seen, False), 60.0)
+    epoch.observations.points[0] += world.rng.choice([-1, 1], 2) * wrong_px
     result = gauge.calibrate(epoch).adjustment
     assert result.exterior is not None or "was the camera moved?" in result.reason
     return world, result
+
+
+def surveyed_badly_from_near(seed: int):
+    """Calibrate with six points at 4 to 12 m whose sds of 50 mm are 20 px in the image."""
+    world, rng = World(seed, 6), np.random.default_rng(seed)
+    world.points = POSE[3:] + 0.4 * (world.points - POSE[3:])
+    surveyed = world.points + rng.normal(0, 50.0, (6, 3))
+    world.field = TestField.build(world.field.names, surveyed, 50.0)
+    return world, GaugeCalibrator(thermal_camera(), world.field).calibrate(
+        world.epoch(1, 20.0)
+    ).adjustment
 
 
 @pytest.mark.parametrize(
@@ -310,6 +334,10 @@ def in_fog(seed: int, seen: int, knocked: bool):
         (moved_stones, (200.0,), 20, 17),
         # some had another pose, up to a thousand sds off, without a word
         (nearly_on_a_line, (30.0,), 40, 5),
+        # of three points 22 of 25 poses were up to thirty sds off, of four and five one in ten
+        *((in_fog, (n, False, px), 20, 18) for n in (3, 4, 5) for px in (5.0, 20.0)),
+        # 15 of 100 had none: a start of three points fits the others no better than the survey
+        (surveyed_badly_from_near, (), 30, 27),
         # one or two points left 13 and 15 of 60 false poses: their survey's errors hid a knock
         *((in_fog, (n, True), 40, 0) for n in (1, 2, 3)),
         *((in_fog, (n, False), 40, 40) for n in (1, 2, 3)),
@@ -378,7 +406,7 @@ def test_the_movement_has_true_sds():
         gauge.calibrate(world.epoch(1, 10.0))
         then = gauge.pose
         world.pose = POSE + np.array([2e-3, -1e-3, 1e-3, 30.0, -20.0, 10.0])
-        epoch = world.epoch(2, 25.0)
+        epoch = world.epoch(2, 25.0, period=3600.0)
         gauge.calibrate(epoch)
         found = gauge.compare(then, gauge.pose)
         error = found.values - (world.pose - POSE)

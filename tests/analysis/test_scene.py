@@ -241,6 +241,18 @@ def test_replay_follows_a_folder_of_photographs(tmp_path):
     assert "go together" in alone.stderr
 
 
+def test_frames_of_10_bit_in_16_are_followed_as_those_of_8():
+    """They had four grey levels, and twelve features were left."""
+    bank = Bank(7)
+    images = [bank.frame(camera().at(T)) for T in (20.0, 30.0)]
+    points = detect_features(images[0])
+    rows, moved = track_features(images[0], points, images[1])
+    wide = [image.astype(np.uint16) * 4 for image in images]
+    again = track_features(wide[0], detect_features(wide[0]), wide[1])
+    np.testing.assert_array_equal(again[0], rows)
+    np.testing.assert_array_equal(again[1], moved)
+
+
 def test_frames_that_cannot_be_followed_are_refused(tmp_path):
     with pytest.raises(DataError, match="features"):
         detect_features(np.full((HEIGHT, WIDTH), 90, np.uint8))

@@ -276,6 +276,10 @@ def resected(c, seen):
     return c.at(35.0).resect(tc.TestField.build("abcd", corners), seen)
 
 
+def on_floor(c, point, sigma=0.0):
+    return c.at(35.0).on_plane([[900, 700]], [0.0] * 6, tc.Plane(point, [0, 0, 1]), sigma)
+
+
 def fed(c):
     """Return the live camera after a reading."""
     live = c.live()
@@ -291,6 +295,9 @@ OF_A_CAMERA = {
     r"image points: must be an array \(n, 2\)": lambda c: c.at(35.0).undistort([1, 2, 3]),
     r"normal is \[0, 0, 0\]; it must be three": lambda c: tc.Plane([0, 0, 0], [0, 0, 0]),
     "at least two points": lambda c: tc.Profile([[0, 0, 0]]),
+    "plane has 2 rows for 1 image": lambda c: on_floor(c, [[0, 0, -1e3]] * 2),
+    "sigma must be 0 or above": lambda c: on_floor(c, [0, 0, -1e3], -1.0),
+    "sigma: give one number, or": lambda c: on_floor(c, [0, 0, -1e3], [1.0, 2.0, 3.0]),
     "plane is 'water'; it must be a P": lambda c: c.at(35.0).on_plane(POINT, [0.0] * 6, "water"),
     "points and sigmas must be numbers": lambda c: tc.TestField.build(["a"], [[1.0, 2.0]]),
     "points must be finite": lambda c: tc.TestField.build(["a"], [[1.0, 2.0, np.nan]]),

@@ -222,10 +222,11 @@ def scaled(factor: float, *names: str):
      ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
      ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),
      ("points.csv", "time;name;x;y;sx;sy\n1700021600;a;1640;1700;1;1\n", "columns with commas"),
-     ("points.csv", lambda i, _: {"y": -900}, "above the horizon"),
+     ("points.csv", lambda i, _: {"y": 20}, "above the horizon"),
      ("points.csv", lambda i, _: {"x": 5000}, "px is outside"),
      ("points.csv", lambda i, _: {"sx": 0}, "must be above 0"),
      ("points.csv", lambda i, _: {"time": 1_600_000_000}, "outside the temp"),
+     ("gcp.csv", lambda i, _: {"target": " "} if i == 2 else {}, "point 3 needs a name in one"),
      ("gcp.csv", degrees, "do X and Y hold degrees?"),
      ("gcp.csv", scaled(1e-3, "X", "Y"), "are they in m?"),
      ("gcp.csv", scaled(1000, *"XYZ"), "are they in mm?"),
@@ -256,6 +257,7 @@ def test_what_cannot_be_measured_is_said(gauge, file, content, words):
 @pytest.mark.parametrize(
     ("change", "words"),
     [(scaled(1000, "sX", "sY", "sZ"), "far better than their standard deviations say: are sX, sY"),
+     (scaled(75, *"XYZ", "sX", "sY", "sZ"), "are they in m, not in cm?"),
      # the pose fits, and places were 20 m off without a word
      (lambda _, r: {"x": 3279 - float(r["x"]), "y": 2463 - float(r["y"])},
       "doubtful: the camera hangs upside down in this pose")],

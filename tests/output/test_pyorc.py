@@ -103,17 +103,32 @@ FEATURE = {"geometry": {"type": "Point", "coordinates": [313e3, 192e3, 138.0]}, 
 
 @pytest.mark.parametrize(
     ("document", "words"),
-    [({"gcps": {"src": [[1, 2]] * 5, "dst": POINTS}}, "gcps.src has 5 points and gcps.dst 8"),
+    [({}, "as JSON"),
+     ({"gcps": {"src": [[1, 2]] * 5, "dst": POINTS}}, "gcps.src has 5 points and gcps.dst 8"),
      ({"gcps": {"src": [[1, 2]] * 8, "dst": POINTS}}, "do X and Y hold degrees"),
      ({"gcps": {"src": [[1, 2]]}}, "'dst' is missing"),
      ({"type": "FeatureCollection", "features": [FEATURE]}, "is not valid JSON of control points")],
 )  # fmt: skip
 def test_control_points_that_pyorc_would_not_take_are_said(tmp_path, document, words):
     path = tmp_path / "site.json"
-    path.write_text(json.dumps(document))
+    path.write_text("\ufeff" + json.dumps(document) if words != "as JSON" else "[" * 100_000)
     with pytest.raises(DataError, match=words) as refused:
         ControlPoints.read(path, "m")
     assert str(refused.value).count(str(path)) == 1
+
+
+def test_a_receivers_names_and_the_sds_of_its_image_points_are_read(tmp_path):
+    """Of GeoJSON, sx in px was once taken for the sd of X in metres."""
+    given = {"Name": "a", "Lateral RMS": 0.01, "elevation_rms": 0.02, "x": 5, "y": 6, "sx": 0.2}
+    feature = {"geometry": {"type": "Point", "coordinates": [192e3, 313e3, 138]}}
+    document = {"type": "FeatureCollection", "features": [{**feature, "properties": given}]}
+    (tmp_path / "a.geojson").write_text(json.dumps(document))
+    head = "Name,Easting,Northing,Elevation,Easting RMS,Northing RMS,Elevation RMS,x,y,sx,sy"
+    (tmp_path / "a.csv").write_text(f"{head}\na,192000,313000,138,0.01,0.01,0.02,5,6,0.2,1\n")
+    for name in ("a.geojson", "a.csv"):
+        points = ControlPoints.read(tmp_path / name, "m")
+        assert points.field.sigmas.tolist() == [[10.0, 10.0, 20.0]]
+        assert points.seen.sigmas.tolist() == [[0.2, 1.0]]
 
 
 def river_camera() -> Camera:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.analysis.thermal.control_points import ControlPoints, read_document
 from thermocald.errors import DataError, UsageError
 from thermocald.files import write_text
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP
@@ -191,10 +191,7 @@ def renew_configuration(
 
 
 def _document(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {error}") from error
-    if not isinstance(document, dict) or not isinstance(document.get("gcps"), dict):
+    document = read_document(path)
+    if not isinstance(document.get("gcps"), dict):
         raise DataError(f"{path}: is not a camera configuration of pyorc; it has no gcps")
     return document

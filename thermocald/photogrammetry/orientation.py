@@ -227,15 +227,20 @@ def resection(
 
 _SPREAD = 6  # points whose triples are tried
 _START = 0.005  # of the image's width: largest RMS residual of a pose of all points
+_START_SDS = 3.0  # the same, in standard deviations of a poor survey
 
 
 def possible_poses(
-    sensor: Sensor, interior: InteriorOrientation, field_points: ArrayLike, image_points: ArrayLike
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    field_points: ArrayLike,
+    image_points: ArrayLike,
+    sigmas: Array,
 ) -> list[ExteriorOrientation]:
     """Return poses that fit all points, the best first; several of them may be nearly the same.
 
-    They are those of `resection`, and up to four of any three of six points that are far apart in
-    the image. Source: Ke and Roumeliotis (2017), AP3P.
+    sigmas (n, 3) mm: of the points. The poses are those of `resection`, and up to four of any three
+    of six points that are far apart in the image. Source: Ke and Roumeliotis (2017), AP3P.
     """
     X, uv = np.asarray(field_points, dtype=float), np.asarray(image_points, dtype=float)
     try:
@@ -254,8 +259,14 @@ def possible_poses(
             pose = _exterior(cv2.Rodrigues(turn)[0], shift.ravel())
             off = image_residuals(sensor, interior, pose, X, uv)
             found.append((float(np.sqrt(np.mean(off**2))), pose))
+
+    def allowed(pose: ExteriorOrientation) -> float:
+        angles = sigmas / np.linalg.norm(X - pose.centre, axis=1)[:, None]
+        surveyed = interior.c / sensor.pixel_pitch * float(np.sqrt(np.mean(angles**2)))
+        return max(_START * sensor.width, _START_SDS * surveyed)
+
     found.sort(key=lambda f: f[0])
-    return [pose for rms, pose in found if rms <= _START * sensor.width]
+    return [pose for rms, pose in found if rms <= allowed(pose)]
 
 
 _QUICK_VIEWS_DEG = (60.0, 40.0, 80.0, 25.0)

@@ -205,7 +205,7 @@ class Camera(Result):
 
         pose: from `resect`, or one without error, as in `project`; sigma: of the image points, px.
         Also returns their joint covariance (3n, 3n), from image points, camera, pose and plane.
-        Raises GeometryError for rays that miss it.
+        Raises GeometryError for rays that miss it, and for points outside the image.
         """
         from thermocald.photogrammetry.epoch.adjustment import Adjustment
         from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
@@ -217,7 +217,15 @@ class Camera(Result):
         if isinstance(pose, Adjustment):  # of camera and pose together
             values, covariance = pose.values, pose.covariance
         points = _numbers(image_points, 2)
-        sigmas = _numbers(np.broadcast_to(sigma, points.shape), 2, "sigma")
+        try:
+            sigmas = _numbers(np.broadcast_to(sigma, points.shape), 2, "sigma")
+        except ValueError:
+            raise UsageError(f"sigma: give one number, or ({len(points)}, 2), px") from None
+        if (sigmas < 0).any():
+            raise UsageError("sigma must be 0 or above, px")
+        many = [len(v) for v in vars(plane).values() if np.ndim(v) == 2]
+        if not isinstance(plane, Profile) and {*many} - {len(points)}:
+            raise UsageError(f"plane has {many[0]} rows for {len(points)} image points")
         return place_on(self.sensor, values, covariance, points, sigmas, plane)
 
     def object_distance(self, other: Camera, distance_mm: float) -> Array:

@@ -20,6 +20,7 @@ from thermocald.photogrammetry.field.testfield import KINDS, Observations, TestF
 from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from numpy.typing import ArrayLike
@@ -34,6 +35,7 @@ UNITS = {"mm": 1.0, "m": 1000.0}
 _LEAST_EXTENT_MM = 50.0  # of a gauge's points; it is smaller for metres read as mm, or for degrees
 _LEAST_OF_A_GRID_MM = 1000.0  # of points more than a hundred times as far from the origin
 _LARGEST_EXTENT_MM = 2e6  # it is larger for mm read as metres
+_WIDE_M = 500.0  # few gauges are wider; five metres in cm read as metres are
 _FITS = 3.0  # largest sigma0 of a pose that fits after mirroring
 _POOR = 15.0  # largest sigma0 that standard deviations of a poor survey explain
 _BETTER = 0.5  # largest fraction of sigma0 that a change has to leave
@@ -82,14 +84,11 @@ class ControlPoints:
         """
         if path.suffix.lower() not in (".json", ".geojson"):
             return _from_table(path, unit)
+        document = read_document(path)
         try:
-            document = json.loads(path.read_text(encoding="utf-8-sig"))
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: cannot be read as JSON: {error}") from error
-        try:
-            if isinstance(document, dict) and "gcps" in document:
+            if "gcps" in document:
                 return _from_pyorc(document, str(path))
-            if isinstance(document, dict) and document.get("type") == "FeatureCollection":
+            if document.get("type") == "FeatureCollection":
                 return _from_features(document, str(path))
         except DataError:
             raise
@@ -110,6 +109,11 @@ class ControlPoints:
         scale = UNITS[unit]
         if not names:
             raise DataError(f"{where}: holds no control points")
+        if not all((np.asarray(sds) > 0).all() for sds in (sigmas, *(seen or ())[1:])):
+            raise DataError(f"{where}: a standard deviation must be above 0")
+        for number, name in enumerate(names, 1):
+            if not name.strip() or not name.isprintable():
+                raise DataError(f"{where}: control point {number} needs a name in one line")
         if not np.isfinite(points).all():
             row = int(np.argmin(np.isfinite(points).all(axis=1)))
             raise DataError(f"{where}, {names[row]}: a control point needs X, Y and Z")
@@ -170,7 +174,10 @@ class ControlPoints:
 
     def find_doubts(self, camera: Camera, pose: Adjustment) -> list[str]:
         """Return what is doubtful in a pose although the control points fit, a sentence each."""
-        return [s for s in (self._find_twin(camera, pose), self._doubt_lens(camera)) if s]
+        wide = float(np.ptp(self.field.points[:, :2], axis=0).max()) / 1000
+        unit = f"the control points extend over {wide:.0f} m: are they in m, not in cm?"
+        size = unit * (self.unit == "m" and wide > _WIDE_M)
+        return [s for s in (size, self._find_twin(camera, pose), self._doubt_lens(camera)) if s]
 
     def _find_twin(self, camera: Camera, pose: Adjustment) -> str:
         """Return the exchange of names with which another pose fits, as a sentence; "" without one.
@@ -232,20 +239,17 @@ class ControlPoints:
         field, seen, n = self.field, self.seen, len(self.seen)
         names = [field.names[row] for row in seen.targets]
         mirrored = "mirrored they fit: X and Y, or x and y, are exchanged, or a sign is wrong"
-        changes = [
-            (mirrored, camera, replace(field, points=field.points[:, [1, 0, 2]]), seen),
-            (mirrored, camera, field, replace(seen, points=seen.points[:, ::-1])),
-        ]
-        x, y = seen.points.T
-        size = np.array([camera.sensor.width, camera.sensor.height])
         upright = "turned by 90° they fit: were x, y read in an image that was shown upright?"
-        turned = ((y, size[1] - 1 - x), (size[0] - 1 - y, x))
-        changes += [(upright, camera, field, replace(seen, points=np.array(t).T)) for t in turned]
+        (x, y), size = seen.points.T, (camera.sensor.width, camera.sensor.height)
+        turned = (mirrored, y, x), (upright, y, size[1] - 1 - x), (upright, size[0] - 1 - y, x)
+        changes = [(mirrored, camera, replace(field, points=field.points[:, [1, 0, 2]]), seen)]
+        for text, *at in turned:
+            changes.append((text, camera, field, replace(seen, points=np.array(at).T)))
         for factor in _OTHER_SIZES:
-            at, sigmas = (seen.points + 0.5) * factor - 0.5, seen.sigmas * factor
+            larger, sigmas = (seen.points + 0.5) * factor - 0.5, seen.sigmas * factor
             text = f"times {factor:g} they fit: are x, y of images of {size[0] / factor:g} × "
             text += f"{size[1] / factor:g} px? Give them for {size[0]} × {size[1]} px"
-            changes.append((text, camera, field, replace(seen, points=at, sigmas=sigmas)))
+            changes.append((text, camera, field, replace(seen, points=larger, sigmas=sigmas)))
         for i, j in combinations(range(min(n, _EXCHANGED)), 2):
             order = np.arange(n)
             order[[i, j]] = j, i
@@ -280,13 +284,24 @@ def _with_free_distance(camera: Camera, factor: float = 1.0) -> Camera:
     return replace(camera, values=values, covariance=covariance)
 
 
+def _find_names(given: Iterable[str]) -> dict[str, str]:
+    """Return the given names of columns or properties by what they mean.
+
+    Capitals and spaces do not matter, but x is not X.
+    """
+
+    def key(name: str) -> str:
+        lower = name.lower().replace(" ", "_")
+        return name if lower in ("x", "y", "sx", "sy") else lower
+
+    by_key = {key(name): name for name in reversed([*given])}
+    found = {w: [by_key[k] for k in map(key, names) if k in by_key] for w, names in _NAMES.items()}
+    return {wanted: names[0] for wanted, names in found.items() if names}
+
+
 def _from_table(path: Path, unit: str) -> ControlPoints:
     table = Table(path, (), DataError)
-    there = {
-        wanted: found
-        for wanted, names in _NAMES.items()
-        if (found := next((n for n in names if n in table.columns), None)) is not None
-    }
+    there = _find_names(table.columns)
     missing = [w for w in ("target", "X", "Y", "Z", "sX", "sY", "sZ") if w not in there]
     clicked = ["x", "y", "sx", "sy"] if "x" in there else []
     Table(path, (*missing, *clicked), DataError)  # raises the table's error
@@ -321,6 +336,15 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
     )
 
 
+def read_document(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file, {} for anything else. Raises DataError naming the file."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {error}") from error
+    return document if isinstance(document, dict) else {}
+
+
 def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
     gcps = document["gcps"]
     points = np.array(gcps["dst"], dtype=float)
@@ -341,21 +365,21 @@ def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
 
 
 def _from_features(document: dict[str, Any], where: str) -> ControlPoints:
-    names, rows, sigmas, image, missing = [], [], [], [], 0
+    names, rows, sigmas, image, clicked, missing = [], [], [], [], [], 0
     for i, feature in enumerate(document["features"]):
         if feature["geometry"]["type"] != "Point":
             continue
-        properties = feature.get("properties") or {}
-        asked = {w: _property(properties, w) for w in ("target", "Z", "sX", "sY", "sZ", "x", "y")}
+        properties = {k: v for k, v in (feature.get("properties") or {}).items() if v is not None}
+        asked = {wanted: properties[n] for wanted, n in _find_names(properties).items()}
         at = [float(v) for v in feature["geometry"]["coordinates"]]
         if len(at) == 2:
-            at.append(np.nan if asked["Z"] is None else float(asked["Z"]))
-        names.append(f"p{i + 1}" if asked["target"] is None else str(asked["target"]))
+            at.append(float(asked.get("Z", np.nan)))
+        names.append(str(asked.get("target", f"p{i + 1}")))
         rows.append(at[:3])
-        stated = [asked[w] for w in ("sX", "sY", "sZ")]
-        missing += None in stated
-        sigmas.append([_SURVEYED_MM / 1000 if s is None else float(s) for s in stated])
-        image.append([np.nan if asked[w] is None else float(asked[w]) for w in ("x", "y")])
+        missing += not {"sX", "sY", "sZ"} <= asked.keys()
+        sigmas.append([float(asked.get(w, _SURVEYED_MM / 1000)) for w in ("sX", "sY", "sZ")])
+        image.append([float(asked.get(w, np.nan)) for w in ("x", "y")])
+        clicked.append([float(asked.get(w, _CLICKED_PX)) for w in ("sx", "sy")])
     points = np.array(rows).reshape(-1, 3)
     if len(points) and (np.abs(points[:, 0]) <= 180).all() and (np.abs(points[:, 1]) <= 90).all():
         crs = str(document.get("crs", "")).upper()
@@ -365,14 +389,5 @@ def _from_features(document: dict[str, Any], where: str) -> ControlPoints:
                 "national grid"
             )
     assumed = f"{where}: {missing} points without standard deviations: {_SURVEYED_MM:g} mm assumed"
-    seen = np.array(image).reshape(-1, 2)
-    return ControlPoints.build(
-        names, points, sigmas, "m", where, (seen, np.full(seen.shape, _CLICKED_PX)),
-        assumed if missing else "",
-    )  # fmt: skip
-
-
-def _property(properties: dict[str, Any], wanted: str) -> Any:
-    names = [name.lower() for name in _NAMES[wanted]] if wanted not in "xy" else [wanted]
-    given = {str(k) if wanted in "xy" else str(k).lower(): v for k, v in properties.items()}
-    return next((given[n] for n in names if given.get(n) is not None), None)
+    seen = np.array(image).reshape(-1, 2), np.array(clicked).reshape(-1, 2)
+    return ControlPoints.build(names, points, sigmas, "m", where, seen, assumed if missing else "")

@@ -8,31 +8,25 @@ no row has the status `ok`, so that a study or a fit does not take a prediction 
 
     predicted      interior orientation only: there are no control points, or none gives a pose
     resected       also the pose from the control points, with the predicted camera as prior
-    last_pose      control points hidden or too few: the last pose, with the mount's possible
-                   motion, unless most of those seen contradict it
+    last_pose      control points hidden, or too few to check each other: the last pose, with the
+                   mount's possible motion, unless most of those seen contradict it
     outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
                    all if too far
-    no_temperature the last reading is too old, or there is none
+    no_temperature the last reading is too old or has jumped, or there is none
     repeated_frame the frame of the epoch before again, which says nothing of the present
-
-The temperatures before the first reading and within a gap are unknown, but effects with a memory
-depend on them. A second camera is therefore predicted that was warmer during the unknown time, by
-one standard deviation of the change of temperature in such a time. The difference between the two
-cameras is one standard deviation of what is unknown. It fades as the memories of the effects do.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
-from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.analysis.thermal.predictor import LONGEST_GAP_S, PredictedCamera, Predictor
 from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -50,13 +44,12 @@ from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.linalg import inverse_of_determined
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.camera.camera import Camera
-    from thermocald.analysis.thermal.thermal_camera import LiveCamera, ThermalCamera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.targets.image_file import EncodedImage
@@ -64,142 +57,15 @@ if TYPE_CHECKING:
 
 
 _FEWEST = 3  # control points, if there is an earlier pose
+_FEW = 4  # redundancy up to which a pose may follow a wrong control point
 _MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
 _ELSEWHERE_CHI2 = 18.4  # two degrees of freedom, one in ten thousand
 _SUDDEN_K = 2.0  # change between two frames below which a missing effect has little influence
 _UNMODELLED_PX = 0.05  # error of a control point from frame to frame: light, air, the template
-_LONG_S = 30 * 86400.0  # after this long at one temperature everything has settled
-_CORRELATED_S = 6 * 3600.0  # temperatures further apart in time are hardly correlated
-_USUAL_RANGE_K = 20.0  # for a model that does not state its range of temperature
-_CHANGED_S = 60.0  # in which the second camera reaches the first reading
-_GAP_S = 120.0  # longest gap that a straight line bridges
-_BACK_S = 10.0  # a reading that is early by less is ignored; by more, the clock was set back
-_REMEMBERED = 4000  # readings
 _USUAL = {
     "predicted": "predicted by its thermal model",
     "resected": "predicted by its thermal model, posed by control points",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class PredictedCamera:
-    """A predicted camera, whose covariance includes model, thermometer and unknown past.
-
-    age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age and
-    the excess over the limits of the fit; unknown (10,): one standard deviation due to the unknown
-    past, and unknown_px, its largest effect in the image.
-    """
-
-    camera: Camera
-    age_s: float
-    temperature_sd: float
-    unknown: Array
-    unknown_px: float
-
-
-class Predictor:
-    """A predictor that follows the readings of one camera's thermometers."""
-
-    def __init__(self, thermal: ThermalCamera) -> None:
-        self.thermal = thermal
-        # `at` checks the range of temperature itself, for each epoch and without a warning
-        self._free = replace(thermal, model=replace(thermal.model, validity={}))
-        self._channels = thermal.channels
-        model = thermal.model  # rays of a grid, which temperature hardly changes
-        self._across = directions(model.sensor, model.interior.as_array(), image_grid(model.sensor))
-        self._pair: tuple[LiveCamera, LiveCamera] | None = None
-        self._now: tuple[Camera, Camera] | None = None
-        self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
-        self._since_begin = 0
-
-    def take(self, time: float, readings: Mapping[str, float]) -> None:
-        """Take readings {channel: °C}, the reference first; failed ones are NaN or missing.
-
-        time: s UTC.
-        """
-        row = self._row(readings)
-        if row is None or not math.isfinite(time):
-            return
-        if self._recent and time <= (last := self._recent[-1][0]):
-            if time > last - _BACK_S:
-                return
-            self._pair = None  # the clock was set back: the age of earlier readings is unknown
-            self._recent.clear()
-        self._since_begin += 1
-        if self._pair is not None and self._pair[0].keeps_all and self._since_begin > _REMEMBERED:
-            # such a model needs all readings: begin again with the last of them
-            kept = list(self._recent)[_REMEMBERED // 2 :]
-            self._begin(*kept[0])
-            for then, reading in kept:
-                for one in self._pair:
-                    one.update(then, reading)
-        if self._pair is None:
-            self._begin(time, row)
-        elif (gap := time - self._recent[-1][0]) > _GAP_S:
-            # the second camera is warmer than the straight line across the gap; both ends are
-            # known: the deviation is largest in the middle
-            last, before = self._recent[-1]
-            self._pair[1].update(last + 0.1 * gap, self._warmer(before, 0.5 * gap))
-            self._pair[1].update(time - 0.1 * gap, self._warmer(row, 0.5 * gap))
-        self._recent.append((time, row))
-        assert self._pair is not None
-        self._now = (self._pair[0].update(time, row), self._pair[1].update(time, row))
-
-    def at(self, time: float) -> PredictedCamera | None:
-        """Return the camera at a time, s UTC; None before the first reading."""
-        if self._now is None:
-            return None
-        camera, other = self._now
-        read = self._recent[-1][0]
-        age = max(time - read, 0.0)
-        if self._recent[0][0] < time < read - _BACK_S:  # an epoch that was processed late
-            times = [t for t, _ in self._recent]
-            rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
-            camera, age = self._free.along(times, rows, [time])[0], 0.0
-        T, unknown = camera.temperature, other.values - self._now[0].values
-        rates = self.thermal.model.rate_vector
-        drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > _GAP_S else 0.0)
-        beyond = float(self.thermal.validity.beyond(T))
-        covariance = camera.covariance + np.outer(unknown, unknown)
-        covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
-        now = replace(camera, covariance=covariance, extrapolated=beyond)
-        by = partials(camera.sensor, camera.values, np.zeros(6), self._across)[1][..., IOP]
-        largest = float(np.linalg.norm(by @ unknown, axis=1).max())
-        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest)
-
-    def settled(self) -> Camera:
-        """Return the steady camera at T₀, with the covariance of an unknown temperature."""
-        T = self.thermal.model.T0
-        return self._free.at(T, self._change(math.inf), dict.fromkeys(self._channels, T) or None)
-
-    def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
-        """Return the reference and the model's channels; None if one has not been read yet."""
-        reference = next(iter(readings), None)
-        if reference is None:
-            return None
-        row = {n: float(readings.get(n, math.nan)) for n in (reference, *self._channels)}
-        if math.isnan(row[reference]):
-            return None
-        missing = [n for n, v in row.items() if math.isnan(v)]
-        if missing and not self._recent:
-            return None
-        return row | {n: self._recent[-1][1][n] for n in missing}
-
-    def _begin(self, time: float, row: dict[str, float]) -> None:
-        self._pair = (self._free.live(), self._free.live())
-        self._since_begin = 0
-        warmer = self._warmer(row, math.inf)
-        self._pair[1].update(time - _LONG_S, warmer)
-        self._pair[1].update(time - _CHANGED_S, warmer)
-
-    def _warmer(self, row: Mapping[str, float], seconds: float) -> dict[str, float]:
-        return {name: value + self._change(seconds) for name, value in row.items()}
-
-    def _change(self, seconds: float) -> float:
-        """Return the standard deviation of a temperature's change in a time, K."""
-        span = self.thermal.validity.high - self.thermal.validity.low
-        spread = (span if math.isfinite(span) else _USUAL_RANGE_K) / math.sqrt(12.0)
-        return spread * math.sqrt(-math.expm1(-2.0 * seconds / _CORRELATED_S))
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,9 +232,12 @@ class GaugeCalibrator(EpochCalibrator):
             extra["event"] = 1.0
         if outside:
             result = replace(result, status="outside_range", reason=f"{outside}: sds are widened")
-        elif now.age_s > _GAP_S:
+        elif now.age_s > LONGEST_GAP_S:
             old = f"the last reading is {now.age_s:.0f} s old: the covariance grows"
             result = replace(result, status="no_temperature", reason=old)
+        elif now.jump:
+            jumped = f"the reading jumped by {now.jump:.1f} K: the covariance includes it"
+            result = replace(result, status="no_temperature", reason=jumped)
         return CalibratedEpoch(epoch, result, extra)
 
     def _measured(
@@ -413,6 +282,13 @@ class GaugeCalibrator(EpochCalibrator):
             result = again if again.ok else result
         if not result.ok:
             return self._without_pose(epoch, now, seen, f"{result.status}: {result.reason}")
+        if (last := self.pose) is not None and result.redundancy <= _FEW:
+            used = seen.select(~np.isin(seen.targets, result.rejected))
+            share = self._share_elsewhere(last, now, used, self._since(last, now, epoch))
+            # most of them move with the camera; of three points, nothing checks even that
+            if share > 0.0 and (share <= 0.5 or not result.redundancy):
+                why = "a control point contradicts the last pose, and too few are seen to check it"
+                return self._without_pose(epoch, now, used, why)
         if in_order:
             self.pose = _pose_of(epoch, now, seen, result)
             self._watch(self.pose)
@@ -440,10 +316,8 @@ class GaugeCalibrator(EpochCalibrator):
         still = f"; the mount may have moved for {hours:.2f} h"
         if self._mount is None:
             still = "; the mount is taken not to have moved since, as its movement is not known"
-        since = np.zeros((16, 16))  # the covariance of what may have changed
-        since[IOP, IOP] = self._change(last.predicted, now)
-        since[range(10, 13), range(10, 13)] = math.radians(self._mount or 0.0) ** 2 * hours
-        if seen is not None and len(seen) and self._most_are_elsewhere(last, now, seen, since):
+        since = self._since(last, now, epoch)
+        if seen is not None and len(seen) and self._share_elsewhere(last, now, seen, since) > 0.5:
             why = f"{why}; most are not where the last pose puts them: was the camera moved?"
             return self._unposed("predicted", why, now, seen)
         result = self._unposed("last_pose", why + still, now, seen)
@@ -455,10 +329,18 @@ class GaugeCalibrator(EpochCalibrator):
             exterior=ExteriorOrientation.from_array(last.values[EOP]),
         )
 
-    def _most_are_elsewhere(
+    def _since(self, last: Pose, now: PredictedCamera, epoch: Epoch) -> Array:
+        """Return the covariance (16, 16) of what may have changed since the last pose."""
+        hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
+        since = np.zeros((16, 16))
+        since[IOP, IOP] = self._change(last.predicted, now)
+        since[range(10, 13), range(10, 13)] = math.radians(self._mount or 0.0) ** 2 * hours
+        return since
+
+    def _share_elsewhere(
         self, last: Pose, now: PredictedCamera, seen: Observations, since: Array
-    ) -> bool:
-        """Test whether more than half of the control points contradict the last pose.
+    ) -> float:
+        """Return the share of the control points that contradict the last pose.
 
         Those that it used are compared with their image then, others with their coordinates; since
         (16, 16): the covariance of what may have changed.
@@ -473,7 +355,7 @@ class GaugeCalibrator(EpochCalibrator):
         C[1][:, range(2), range(2)] += new.sigmas**2
         left = np.concatenate([moved, new.points - at])
         chi2 = np.einsum("ni,nij,nj->n", left, np.linalg.inv(np.concatenate(C)), left)
-        return bool(np.mean(chi2 > _ELSEWHERE_CHI2) > 0.5)
+        return float(np.mean(chi2 > _ELSEWHERE_CHI2))
 
     def _moved_since(
         self, then: Pose, now: PredictedCamera, seen: Observations

@@ -306,12 +306,6 @@ def measure_places(
     points, covariance = place_on(
         sensor, states[member], pose.covariance, image, sigmas, surface, now.covariance, member
     )
-    if not (inside := sensor.contains(image, -1.0)).all():
-        row = int(np.argmin(inside))
-        raise DataError(
-            f"image point {names[row]} at {image[row, 0]:.0f}, {image[row, 1]:.0f} px is outside "
-            f"the camera's {sensor.width} × {sensor.height} px"
-        )
     exact: Plane | Line | Profile = replace(surface, sd_mm=0.0)
     if isinstance(exact, Plane):
         exact = replace(exact, sd_tilt=0.0)

@@ -88,7 +88,8 @@ def resect(
         return failed("no_orientation", why, observations)
     pose, suspects = start, None
     if pose is None:
-        pose, suspects = _approximate_pose(sensor, interior, points, observations.points)
+        sigmas = control.sigmas[observations.targets]
+        pose, suspects = _approximate_pose(sensor, interior, points, observations.points, sigmas)
     if pose is None:
         why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
         return failed("no_orientation", why, observations)
@@ -121,7 +122,7 @@ def resect(
 
 
 def _approximate_pose(
-    sensor: Sensor, interior: InteriorOrientation, points: Array, uv: Array
+    sensor: Sensor, interior: InteriorOrientation, points: Array, uv: Array, sigmas: Array
 ) -> tuple[ExteriorOrientation | None, Mask | None]:
     """Return a pose to start from and a mask (n,) of the points that it does not fit."""
     pose = suspects = None
@@ -130,7 +131,7 @@ def _approximate_pose(
         suspects = ~fits
     if suspects is None or suspects.any():
         # the pose of three or four points that it draws may miss the others
-        whole = possible_poses(sensor, interior, points, uv)
+        whole = possible_poses(sensor, interior, points, uv, sigmas)
         if whole:
             return whole[0], None
     return pose, suspects
@@ -169,7 +170,8 @@ def _has_twin(
 
     seen = observations.select(~np.isin(observations.targets, pose.rejected))
     worst = pose.sigma0**2 * pose.redundancy + _FITS * max(pose.sigma0**2, 1.0)
-    for start in possible_poses(sensor, interior, control.points[seen.targets], seen.points):
+    at, sigmas = control.points[seen.targets], control.sigmas[seen.targets]
+    for start in possible_poses(sensor, interior, at, seen.points, sigmas):
         if counts(start.centre):
             other = adjust(sensor, control, seen, interior, start, settings, None, covariance)
             fits = other.ok and other.sigma0**2 * other.redundancy < worst
@@ -264,9 +266,16 @@ def place_on(
     times; member (n,): time of each point. For a line, rays meet the plane through it that faces
     the camera, and points are projected onto the line: an image point's distance from the line's
     image has no effect, and points have variance along the line, and across it that of the line.
-    Raises GeometryError for a ray that does not meet the surface in front of the camera.
+    Raises GeometryError for a point outside the image, and for a ray that does not meet the surface
+    in front of the camera.
     """
     uv = np.atleast_2d(np.asarray(image_points, dtype=float))
+    if not (inside := sensor.contains(uv, -1.0)).all():
+        x, y = uv[np.argmin(inside)]
+        raise GeometryError(
+            f"image point {x:.0f}, {y:.0f} px is outside the camera's {sensor.width} × "
+            f"{sensor.height} px"
+        )
     values = np.broadcast_to(values, (len(uv), 16))
     pose = values[0, EOP]
     centre = pose[3:]

@@ -20,8 +20,10 @@ import numpy as np
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
 from thermocald.names import checked
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.linalg import correlations
+from thermocald.photogrammetry.series.covariances import count_moved
 from thermocald.store.recording.reader import interpolate_readings
 from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
@@ -197,6 +199,9 @@ def measured_series(
         some = np.flatnonzero(ok[of] & adjustment.ok)
         some = some[spread_rows(len(some), _MOST_MATRICES)]
         covariances = adjustment.covariance[some][:, :10, :10]
+    choice, moved = "" if adjustment is None else adjustment.choice, count_moved(table.stillness)[0]
+    if moved:
+        choice += f"; but the camera did not stand still in {counted(moved, 'epoch')}"
     time_s, thermometers = table.frame_time[ok], []
     for name, channel in source.head.channels.items():
         read, readings = source.columns.readings_of(name)
@@ -210,7 +215,7 @@ def measured_series(
         time_s - time_s[0], tuple(thermometers),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
         correlations(covariances), exterior, without_result, float(time_s[0]),
-        "" if adjustment is None else adjustment.choice,
+        choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
         slow=table.slow_between_ends[:10],
     )  # fmt: skip

@@ -48,6 +48,7 @@ from thermocald.photogrammetry.series.covariances import (
     line_weights,
     perspective_cofactor_roots,
     scaled_covariances,
+    shown_movement,
     slow_target_covariance,
     stillness,
     typical_sensitivity,
@@ -93,7 +94,7 @@ def choose_exterior(
     series: SeriesEstimator, asked: Exterior, good: int, estimate: Estimate | None = None
 ) -> SeriesEstimator:
     """Choose how the exterior orientation is estimated, from the good epochs and an estimate."""
-    if estimate is None or (asked == "auto" and good < FEWEST_EPOCHS):
+    if estimate is None or good < FEWEST_EPOCHS:
         why = f"too few epochs ({good} of {FEWEST_EPOCHS}) to show how the mount moves"
         s = replace(series.s, exterior="per_epoch")
         return replace(series, s=s, bound=None, choice=why)
@@ -211,8 +212,8 @@ def adjusted(
     series = SeriesEstimator(
         sensor, testfield, grid, s, windows=windows, field_variance=field_variance
     )
-    if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
-        series = choose_exterior(series, "auto", len(use))
+    if s.exterior in ("mount", "auto") and len(use) < FEWEST_EPOCHS:
+        series = choose_exterior(series, s.exterior, len(use))
     elif s.exterior in ("mount", "auto"):
         # The mount is loose at first, so that movements do not look like gross errors.
         A = linearise(sensor, testfield, start[IOP], start[EOP]).A[..., EOP]
@@ -260,6 +261,8 @@ def result(
     movement = series.movement
     if held and len(use) >= FEWEST_EPOCHS:
         movement = estimate_mount_movement(series, estimate)
+    elif held:
+        movement = replace(movement, white=shown_movement(system, estimate.residuals, unit))
     slow: list[tuple[Array, Array]] = []
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
@@ -454,7 +457,7 @@ def judge_epochs(
     values[[word != "ok" for word in status]] = np.nan
     still = np.full(len(use), np.nan)
     if s.exterior == "series":
-        score = stillness(estimate.system, estimate.residuals)
+        score = stillness(estimate.system, estimate.residuals)[0]
         still = score / np.where(redundancy > 0, unit, 1.0)
     return SeriesAdjustment(
         s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, use, observed & ~use,

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
-from thermocald.analysis.series.course import Course, carried_by_c, table_of
+from thermocald.analysis.series.course import Course, carried_by_c, say_carried, table_of
 from thermocald.errors import DataError, DriverMissing, UsageError
 from thermocald.figures import BAND
 from thermocald.files import write_parts
-from thermocald.numbers import counted, parameter_label, percent, with_sd
+from thermocald.numbers import counted, parameter_label, with_sd
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.covariances import AFFINITY, count_moved
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
@@ -332,11 +332,7 @@ class Epochs(Result):
         ]
         out += table_of(self.drifts)
         if hang := document.get("changes_hang_on_c"):
-            out.append(
-                f"the field determines c only to {percent(hang['c_known_to'], 2)}, and changes "
-                f"have the same relative error: up to {hang['sds']:.1f} of their standard "
-                "deviations; use a field with depth whose coordinates are known better"
-            )
+            out.append(say_carried(hang["c_known_to"], hang["sds"]))
         if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
             out.append(

@@ -84,7 +84,8 @@ class MeasuredSeries:
     the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
     image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that
     moved, for which the observations are corrected; doubts: implausible recorded data; slow (10,):
-    variances of last minus first by which slow errors exceed independent ones.
+    variances of last minus first by which slow errors exceed independent ones; c_known_to: relative
+    sd of the level of c, 0 if unknown.
     """
 
     label: str
@@ -107,6 +108,7 @@ class MeasuredSeries:
     field_movements: tuple[FieldMovement, ...] = ()
     doubts: tuple[str, ...] = ()
     slow: Array = field(default_factory=lambda: np.zeros(10))
+    c_known_to: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -218,4 +220,5 @@ def measured_series(
         choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
         slow=table.slow_between_ends[:10],
+        c_known_to=float(np.nan_to_num(table.level_sd[0]) / np.median(table.values[ok, 0])),
     )  # fmt: skip

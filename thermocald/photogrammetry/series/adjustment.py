@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.numbers import percent
+from thermocald.numbers import counted, percent
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     EOP_COLUMNS,
@@ -87,6 +87,7 @@ if TYPE_CHECKING:
 
 _LOOSE_PX = 3.0  # far beyond the tremble of a mount, and beyond the noise of an epoch's perspective
 _QUIETEST = 0.1  # variance of unit weight of an epoch, over that of the series
+_MENTIONED = 0.05  # share of the movement's variance
 _HIDABLE = 3.0  # times the mean noise, a movement beyond which that noise cannot hide
 
 
@@ -122,10 +123,10 @@ def choose_exterior(
         why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px){doubt}"
         return replace(series, s=replace(series.s, exterior="series"), bound=None, choice=why)
     how = ""
-    if movement.memory:
-        part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
-        slowly = f"over about {movement.memory:.0f} epochs"
-        how = f", {100 * part:.0f} % of it {slowly if movement.memory < good / 3 else 'slowly'}"
+    part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
+    if part > _MENTIONED:
+        slowly = f"over about {counted(round(movement.memory), 'epoch')}"
+        how = f", {percent(part)} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
         at = f"at row {', '.join(map(str, movement.jumps))}"
         how += f", with jumps {'in a sample of the epochs' if series.windows else at}"

@@ -335,10 +335,11 @@ class Epochs(Result):
             out.append(say_carried(hang["c_known_to"], hang["sds"]))
         if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
+            nor = ", nor faster changes of the camera from the mount's"
             out.append(
                 f"movements of the mount slower than {FASTEST_DRIFT_S / 60:.0f} min cannot be "
-                "separated from the camera's; last - first by the perspective alone, whatever the "
-                f"mount does: {sds} µm"
+                f"separated from the camera's{nor if self.exterior == 'mount' else ''}; last - "
+                f"first by the perspective alone, whatever the mount does: {sds} µm"
             )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
         out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]

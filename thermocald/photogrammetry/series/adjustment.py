@@ -260,7 +260,7 @@ def result(
     level *= pooled
     trend *= pooled
     movement = series.movement
-    if held and len(use) >= FEWEST_EPOCHS:
+    if held and sound.sum() >= FEWEST_EPOCHS:
         movement = estimate_mount_movement(series, estimate)
     elif held:
         movement = replace(movement, white=shown_movement(system, estimate.residuals, unit))

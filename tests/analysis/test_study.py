@@ -18,9 +18,9 @@ from thermocald.analysis.study.study import (
     study_camera,
     study_series,
 )
-from thermocald.errors import DataError
+from thermocald.errors import DataError, UsageError
 from thermocald.output.study.report import answer_sentences
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.series import EpochResult
@@ -155,6 +155,8 @@ def with_a_gap(series):
                      "No Monte-Carlo: .*no ray", {"Monte-Carlo"}, id="a camera without rays"),
         pytest.param({"drift": {}}, lambda s: s, "mostly the noise of an epoch's calibration",
                      set(), id="nothing but noise"),
+        pytest.param({}, lambda s: replace(s, c_known_to=0.03), r"The field determines c only to "
+                     r"3.00 %, .* error: up to \d\d", set(), id="c hardly known"),
     ],
 )  # fmt: skip
 def test_what_the_data_do_not_allow_is_said(warm_up, options, change, words, lacks):
@@ -198,6 +200,8 @@ def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
     assert cold.correlations.epochs == 300
     assert cold.sds[1] == pytest.approx(0.0194 * 0.2527, rel=0.01)
     assert warm.montecarlo.overall_mean < 0.6 * cold.montecarlo.overall_mean
+    with pytest.raises(UsageError, match=r"^cold: its series have different sensors"):
+        study([pair[0], replace(pair[1], sensor=Sensor(640, 480, 0.006))], SETTINGS)
     # one that holds a parameter does not reduce its sd
     one, other = pair
     k = IOP_NAMES.index("B1")

@@ -139,6 +139,14 @@ def test_the_pose_of_a_series_is_as_uncertain_as_its_mount_moves(how):
     assert 0.8 < rms(z, axis=0).max() < 1.4
 
 
+@pytest.mark.parametrize(("exterior", "least"), [("series", 0.1), ("mount", 0.7)])
+def test_a_knock_in_few_epochs_is_in_their_standard_deviations(exterior, least):
+    """Regression: errors were 8 to 40 standard deviations, as nothing was examined."""
+    how = {"exterior": exterior, "knocked": 6}
+    _, z = adjusted(FIELD, range(3), 12, columns=PRINCIPAL_POINT, **how)
+    assert least < rms(z) < 1.2
+
+
 STAYS = 10**9
 
 

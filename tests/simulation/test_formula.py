@@ -121,6 +121,7 @@ def test_every_operator_is_tested():
         ("square(" * 20 + "temperature" + ")" * 20, "more than 8 nested operators"),
         ("square(" * 200, "at most 300 characters"),
         ("lag(", "cannot be read"),
+        ("exponential(temperature, 0)", "w of exponential is not above 0"),
     ],
 )
 def test_other_texts_than_formulas_are_refused(text, reason):

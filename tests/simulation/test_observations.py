@@ -85,6 +85,16 @@ def test_another_camera_and_a_view_without_targets_are_refused(simulation):
         next(replace(simulation, model=model).observations())
 
 
+def test_nothing_is_written_of_a_camera_that_cannot_be(simulation, tmp_path):
+    course = simulation.programme
+    cold = replace(simulation, programme=replace(course, initial=-400.0))
+    collapsing = replace(simulation, model=replace(simulation.model, rates={"c": -1.0}))
+    for impossible, reason in ((cold, "would be between -400"), (collapsing, "would fall to")):
+        with pytest.raises(ConfigurationError, match=reason):
+            impossible.write(tmp_path / "M1")
+    assert not list(tmp_path.iterdir())
+
+
 def run(*arguments):
     return answer("simulate", *arguments)
 

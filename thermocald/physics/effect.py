@@ -361,8 +361,8 @@ class Effect:
                 raise ConfigurationError(f"{place}: {name} = {value!r} is not a finite number")
             if given is None or given.low < 0 or not (given.log or self.is_drive):
                 continue
-            if value < 0:
-                raise ConfigurationError(f"{place}: {name} = {value} {given.unit} is negative")
+            if value < 0 or (value == 0 and name not in self.optional):
+                raise ConfigurationError(f"{place}: {name} = {value} {given.unit} is not above 0")
         if self.linear and not any(name in values for name in self.linear):
             raise ConfigurationError(
                 f"{place} needs at least one of the coefficients {', '.join(self.linear)}"

@@ -280,6 +280,9 @@ def _parse_node(tree: ast.expr, text: str, depth: int) -> Node:
         )
     inputs = tuple(_parse_node(a, text, depth + 1) for a in arguments[: kind.inputs])
     constants = tuple(_parse_constant(a, text) for a in arguments[kind.inputs :])
+    for value, constant in zip(constants, kind.constants, strict=True):
+        if constant.positive and not (isinstance(value, str) or value > 0):
+            raise ConfigurationError(f"formula {text!r}: {constant.name} of {name} is not above 0")
     return Node(name, inputs, constants)
 
 

@@ -189,7 +189,8 @@ def read_thermometer(reader: QuantityReader) -> SimulatedThermometer:
     if reader.mapping.get("stuck") is not None:
         inner = reader.inner("stuck")
         inner.only(("from", "to"))
-        stuck = (inner.number("from", "s"), inner.number("to", "s"))
+        begin = inner.number("from", "s")
+        stuck = begin, inner.number("to", "s", above=begin)
     return SimulatedThermometer(
         reader.text("body"),
         reader.number("lag", "s", 0.0, low=0.0),
@@ -219,6 +220,8 @@ class HeatNetwork:
         for first, second, _ in self.links:
             if first not in self.capacities and second not in self.capacities:
                 raise ConfigurationError(f"neither {first!r} nor {second!r} is a body")
+            if first == second:
+                raise ConfigurationError(f"a link is between {first!r} and itself")
 
     @property
     def boundaries(self) -> tuple[str, ...]:
@@ -322,4 +325,7 @@ def read_network(reader: QuantityReader) -> HeatNetwork:
         if not isinstance(ends, list) or len(ends) != 2:
             raise link.fail("between", "must be a list of two names")
         links.append((str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
-    return HeatNetwork(capacities, tuple(links))
+    try:
+        return HeatNetwork(capacities, tuple(links))
+    except ConfigurationError as error:
+        raise reader.fail("links", str(error)) from error

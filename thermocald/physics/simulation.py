@@ -21,6 +21,7 @@ import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, GeometryError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.history import History
@@ -43,6 +44,7 @@ _CHUNK = 64  # epochs at a time
 _MARGIN_PX = 5.0  # a target nearer to the image's edge is not measured
 _FINEST_STEPS = 10  # knots of the true temperature per interval
 _LONG = 20_000  # epochs above which there is one knot per interval
+_COLDEST, _HOTTEST = -273.15, 220.0  # °C; a recording of hotter ones would be taken for kelvin
 
 
 @dataclass(frozen=True)
@@ -105,13 +107,25 @@ class Simulation:
             initial = float(p.boundaries["ambient"].at(0.0))
         bodies = self.device.network.solve(grid, initial, p.sources, p.boundaries)
         channels = {name: bodies[t.body] for name, t in self.device.thermometers.items()}
+        for name, T in channels.items():
+            if not (T.min() >= _COLDEST and T.max() <= _HOTTEST):
+                raise ConfigurationError(
+                    f"programme {p.name}: thermometer {name} would be between {T.min():.0f} and "
+                    f"{T.max():.0f} °C; check initial, ambient and sources"
+                )
         return History(frames, grid, channels, self.device.reference, self.model.T0)
 
     @cached_property
     def truth(self) -> Prediction:
         """The model's prediction for the frames' times."""
         model = replace(self.model, exterior=self.exterior)
-        return model.predict(self.true_history, self.field)
+        truth = model.predict(self.true_history, self.field)
+        if not (c := truth.iop[:, 0]).min() > 0:
+            raise ConfigurationError(
+                f"model {model.name or model.camera}: the principal distance would fall to "
+                f"{c.min():.3g} mm; check the rate and the effects of c"
+            )
+        return truth
 
     @cached_property
     def readings(self) -> dict[str, Array]:
@@ -245,6 +259,7 @@ class Simulation:
             "temperature": {
                 "first": float(temperature[0]),
                 "last": float(temperature[-1]),
+                "lowest": float(temperature.min()),
                 "highest": float(temperature.max()),
             },
             "drift": {
@@ -261,10 +276,8 @@ class Simulation:
         document = self.as_dict()
         drift, T = document["drift"], document["temperature"]
         return [
-            (
-                f"{document['epochs']} epochs, {document['targets']} targets, {T['first']:.1f} to "
-                f"{T['highest']:.1f} °C, principal point moved by up to "
-                f"{drift['principal_point_px']:.1f} px, principal distance by "
-                f"{drift['c_mm'] * 1000:.1f} µm"
-            )
+            f"{counted(document['epochs'], 'epoch')}, {document['targets']} targets, "
+            f"{T['lowest']:.1f} to {T['highest']:.1f} °C, principal point moved by up to "
+            f"{drift['principal_point_px']:.1f} px, principal distance by "
+            f"{1000 * drift['c_mm']:z.1f} µm".replace("-", "−")
         ]

@@ -296,7 +296,7 @@ class RunningSeries:
         elif series.sample.exterior == "series":
             still = "the camera stands still" if asked == "auto" else "as configured"
             text = f"{still}: one orientation for {n} epochs"
-        elif asked == "auto":
+        elif asked != "per_epoch":
             good = int(series.estimate.system.good.sum())
             text = (
                 f"each epoch has its own orientation until {FEWEST_EPOCHS} good epochs show "

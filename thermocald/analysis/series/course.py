@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from thermocald.numbers import signed
+from thermocald.numbers import percent, signed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,6 +24,15 @@ def carried_by_c(share: float, changes: Mapping[str, tuple[float, float]]) -> di
     """
     sds = {name: abs(v) * share / sd for name, (v, sd) in changes.items() if v and sd > 0}
     return sds if max(sds.values(), default=0.0) > _CARRIED else {}
+
+
+def say_carried(share: float, sds: float) -> str:
+    """State the largest error of changes due to the uncertainty of c, in their sds."""
+    return (
+        f"the field determines c only to {percent(share, 2)}, and changes have the same relative "
+        f"error: up to {sds:.1f} of their standard deviations; use a field with depth whose "
+        "coordinates are known better"
+    )
 
 
 @dataclass(frozen=True, slots=True)

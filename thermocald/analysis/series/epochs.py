@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
-from thermocald.analysis.series.course import Course, carried_by_c, table_of
+from thermocald.analysis.series.course import Course, carried_by_c, say_carried, table_of
 from thermocald.errors import DataError, DriverMissing, UsageError
 from thermocald.figures import BAND
 from thermocald.files import write_parts
-from thermocald.numbers import counted, parameter_label, percent, with_sd
+from thermocald.numbers import counted, parameter_label, with_sd
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.series.covariances import AFFINITY
+from thermocald.photogrammetry.series.covariances import AFFINITY, count_moved
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, csv_text, document_of, in_parts, jsonable, new_figure
@@ -233,14 +233,11 @@ class Epochs(Result):
         if hang := self._hang_on_c():
             document["changes_hang_on_c"] = hang
         if adjustment is not None and self.exterior == "series":
-            from scipy.special import chdtri
-
             # test of single epochs for another exterior orientation
-            values = self.stillness[np.isfinite(self.stillness)]
-            bound = float(chdtri(6, 0.01 / max(len(values), 1)))
+            moved, bound = count_moved(self.stillness)
             document["stood_still"] = {
-                "epochs_that_moved": int((values > bound).sum()),
-                "largest_chi2": float(values.max(initial=0.0)),
+                "epochs_that_moved": moved,
+                "largest_chi2": float(np.nan_to_num(self.stillness).max(initial=0.0)),
                 "bound": bound,
             }
         converted: dict[str, Any] = jsonable(document)
@@ -268,6 +265,7 @@ class Epochs(Result):
         count = document["rejected"]
         rejected = counted(count, "rejected observation")
         out = [f"{calibrated}, exterior orientation {exterior}, {rejected}"]
+        still = document.get("stood_still")
         if (sigma0 := document["sigma0"]) is not None:
             cause = ""
             if moved := document.get("targets_moved_before_epoch"):
@@ -280,6 +278,8 @@ class Epochs(Result):
                     "; so few observations show the errors of the test field rather than theirs, "
                     "so that the stated standard deviations are kept, untested"
                 )
+            elif still and still["epochs_that_moved"]:
+                cause = "; the camera did not stand still"
             elif sigma0 > 1.0 + MATERIAL:
                 cause = f"; {CAUSES_OF_SIGMA0}"
                 if self.adjustment is not None and np.isfinite(self.adjustment.offsets).any():
@@ -332,21 +332,17 @@ class Epochs(Result):
         ]
         out += table_of(self.drifts)
         if hang := document.get("changes_hang_on_c"):
-            out.append(
-                f"the field determines c only to {percent(hang['c_known_to'], 2)}, and changes "
-                f"have the same relative error: up to {hang['sds']:.1f} of their standard "
-                "deviations; use a field with depth whose coordinates are known better"
-            )
+            out.append(say_carried(hang["c_known_to"], hang["sds"]))
         if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
+            nor = ", nor faster changes of the camera from the mount's"
             out.append(
                 f"movements of the mount slower than {FASTEST_DRIFT_S / 60:.0f} min cannot be "
-                "separated from the camera's; last - first by the perspective alone, whatever the "
-                f"mount does: {sds} µm"
+                f"separated from the camera's{nor if self.exterior == 'mount' else ''}; last - "
+                f"first by the perspective alone, whatever the mount does: {sds} µm"
             )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
         out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]
-        still = document.get("stood_still")
         if still and still["epochs_that_moved"]:
             moved, bound = still["epochs_that_moved"], f"bound {still['bound']:.0f}"
             out.append(

@@ -20,8 +20,10 @@ import numpy as np
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
 from thermocald.names import checked
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.linalg import correlations
+from thermocald.photogrammetry.series.covariances import count_moved
 from thermocald.store.recording.reader import interpolate_readings
 from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
@@ -82,7 +84,8 @@ class MeasuredSeries:
     the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
     image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that
     moved, for which the observations are corrected; doubts: implausible recorded data; slow (10,):
-    variances of last minus first by which slow errors exceed independent ones.
+    variances of last minus first by which slow errors exceed independent ones; c_known_to: relative
+    sd of the level of c, 0 if unknown.
     """
 
     label: str
@@ -105,6 +108,7 @@ class MeasuredSeries:
     field_movements: tuple[FieldMovement, ...] = ()
     doubts: tuple[str, ...] = ()
     slow: Array = field(default_factory=lambda: np.zeros(10))
+    c_known_to: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -197,6 +201,9 @@ def measured_series(
         some = np.flatnonzero(ok[of] & adjustment.ok)
         some = some[spread_rows(len(some), _MOST_MATRICES)]
         covariances = adjustment.covariance[some][:, :10, :10]
+    choice, moved = "" if adjustment is None else adjustment.choice, count_moved(table.stillness)[0]
+    if moved:
+        choice += f"; but the camera did not stand still in {counted(moved, 'epoch')}"
     time_s, thermometers = table.frame_time[ok], []
     for name, channel in source.head.channels.items():
         read, readings = source.columns.readings_of(name)
@@ -210,7 +217,8 @@ def measured_series(
         time_s - time_s[0], tuple(thermometers),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
         correlations(covariances), exterior, without_result, float(time_s[0]),
-        "" if adjustment is None else adjustment.choice,
+        choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
         slow=table.slow_between_ends[:10],
+        c_known_to=float(np.nan_to_num(table.level_sd[0]) / np.median(table.values[ok, 0])),
     )  # fmt: skip

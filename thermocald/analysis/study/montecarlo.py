@@ -254,9 +254,9 @@ def plane_errors(
     measured = image_to_mm(sensor, points).T[..., None, None]
     solved = solve_distortion(sets, measured, ideal, _CONVERGED * sensor.pixel_pitch)
     errors = ideal[..., 0]
+    errors[:, :, ~solved.all(axis=(0, 2))] = np.nan  # they may be so large that a product overflows
     errors *= scale
     errors -= middle
-    errors[:, :, ~solved.all(axis=(0, 2))] = np.nan
     return np.asarray(errors)
 
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, image_grid
+from thermocald.analysis.series.course import carried_by_c, say_carried
 from thermocald.analysis.statistics.dependence import (
     Dependence,
     IopCorrelations,
@@ -43,7 +44,7 @@ from thermocald.analysis.study.montecarlo import (
     simulate_errors,
     trajectories,
 )
-from thermocald.errors import GeometryError
+from thermocald.errors import GeometryError, UsageError
 from thermocald.names import tell_apart
 from thermocald.numbers import counted, enumerated, parameter_label, percent
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, partials, project
@@ -141,7 +142,7 @@ def depth_of_field(
 _COURSE = 500
 _GAP_IN_INTERVALS = 1.5
 _LEAST_DEPENDENCE = 4
-_MOSTLY_NOISE = 0.5  # of the variance of the errors in object space
+_PRINCIPAL = IOP_NAMES[:3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +230,13 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     significance = _significance(series, settings, notes)
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
+    changes = {n: (d.change, d.sd_change) for n, d in deviations.items() if n in _PRINCIPAL}
+    for one in channels:
+        slopes = {n: d for n, d in one.dependences.items() if n in _PRINCIPAL}
+        changes |= {f"{n}/{one.thermometer.name}": (d.slope, d.sd_slope) for n, d in slopes.items()}
+    if carried := carried_by_c(series.c_known_to, changes):
+        said = say_carried(series.c_known_to, max(carried.values()))
+        notes.append(f"{said[0].upper()}{said[1:]}.")
     short = {
         parameter_label(c.thermometer.name): enumerated(
             [parameter_label(n) for n, d in c.dependences.items() if d.too_short]
@@ -443,15 +451,25 @@ def study(
     progress: Callable[[int], None] | None = None,
 ) -> Study:
     """Study every camera; `progress` receives the number of IOP sets simulated."""
-    s = settings or StudySettings()
+    settings = settings or StudySettings()
     labels = dict.fromkeys(one.label for one in series)
     cameras = []
     for label in labels:
         own = [one for one in series if one.label == label]
+        sensors = {one.sensor: one.source for one in own}
+        if len(sensors) > 1:
+            each = [
+                f"{s.width} × {s.height} px of {1000 * s.pixel_pitch:g} µm in {source}"
+                for s, source in sensors.items()
+            ]
+            raise UsageError(
+                f"{label}: its series have different sensors ({', '.join(each)}); a label is one "
+                "camera: give the others labels of their own, LABEL=RECORDING"
+            )
         names = tell_apart([one.name for one in own], [one.source for one in own])
         own = [replace(one, name=name) for one, name in zip(own, names, strict=True)]
-        cameras.append(study_camera(label, own, s, progress))
-    return Study(s, tuple(cameras))
+        cameras.append(study_camera(label, own, settings, progress))
+    return Study(settings, tuple(cameras))
 
 
 def study_camera(
@@ -484,7 +502,7 @@ def study_camera(
         except GeometryError as error:
             notes.append(f"No Monte-Carlo: {error}.")
         else:
-            notes += _simulation_notes(montecarlo, draw_root(noise, correlations.median))
+            notes += _simulation_notes(montecarlo, sds, noise, correlations.median)
     try:
         paths = trajectories(series, settings.distance_mm, settings.grid, settings.clusters_mm)
     except GeometryError as error:
@@ -496,17 +514,20 @@ def study_camera(
     )  # fmt: skip
 
 
-def _simulation_notes(simulated: MonteCarlo, noise: Array) -> list[str]:
-    """State what limits a simulation; noise (m, 10): root of an epoch's covariance."""
+def _simulation_notes(simulated: MonteCarlo, sds: Array, noise: Array, r: Array) -> list[str]:
+    """State what limits a simulation.
+
+    sds, noise (10,): standard deviations over time and of an epoch; r (10, 10): correlations.
+    """
     notes = []
-    by_noise, by_all = (
-        np.trace(plane_covariance(simulated.jacobian, root).sum(axis=0))
-        for root in (noise, simulated.root)
+    by_noise, by_drift = (
+        np.trace(plane_covariance(simulated.jacobian, draw_root(each, r)).sum(axis=0))
+        for each in (noise, np.sqrt(np.maximum(sds**2 - noise**2, 0.0)))
     )
-    if by_noise > _MOSTLY_NOISE * by_all:
+    if by_noise > by_drift:
         notes.append(
             "The errors on the plane are mostly the noise of an epoch's calibration "
-            f"({percent(min(by_noise / by_all, 1.0))} of their variance), not changes of the "
+            f"({percent(by_noise / (by_noise + by_drift))} of their variance), not changes of the "
             "camera."
         )
     if simulated.folded:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.numbers import percent
+from thermocald.numbers import counted, percent
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     EOP_COLUMNS,
@@ -48,6 +48,7 @@ from thermocald.photogrammetry.series.covariances import (
     line_weights,
     perspective_cofactor_roots,
     scaled_covariances,
+    shown_movement,
     slow_target_covariance,
     stillness,
     typical_sensitivity,
@@ -86,6 +87,7 @@ if TYPE_CHECKING:
 
 _LOOSE_PX = 3.0  # far beyond the tremble of a mount, and beyond the noise of an epoch's perspective
 _QUIETEST = 0.1  # variance of unit weight of an epoch, over that of the series
+_MENTIONED = 0.05  # share of the movement's variance
 _HIDABLE = 3.0  # times the mean noise, a movement beyond which that noise cannot hide
 
 
@@ -93,7 +95,7 @@ def choose_exterior(
     series: SeriesEstimator, asked: Exterior, good: int, estimate: Estimate | None = None
 ) -> SeriesEstimator:
     """Choose how the exterior orientation is estimated, from the good epochs and an estimate."""
-    if estimate is None or (asked == "auto" and good < FEWEST_EPOCHS):
+    if estimate is None or good < FEWEST_EPOCHS:
         why = f"too few epochs ({good} of {FEWEST_EPOCHS}) to show how the mount moves"
         s = replace(series.s, exterior="per_epoch")
         return replace(series, s=s, bound=None, choice=why)
@@ -121,10 +123,10 @@ def choose_exterior(
         why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px){doubt}"
         return replace(series, s=replace(series.s, exterior="series"), bound=None, choice=why)
     how = ""
-    if movement.memory:
-        part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
-        slowly = f"over about {movement.memory:.0f} epochs"
-        how = f", {100 * part:.0f} % of it {slowly if movement.memory < good / 3 else 'slowly'}"
+    part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
+    if part > _MENTIONED:
+        slowly = f"over about {counted(round(movement.memory), 'epoch')}"
+        how = f", {percent(part)} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
         at = f"at row {', '.join(map(str, movement.jumps))}"
         how += f", with jumps {'in a sample of the epochs' if series.windows else at}"
@@ -211,8 +213,8 @@ def adjusted(
     series = SeriesEstimator(
         sensor, testfield, grid, s, windows=windows, field_variance=field_variance
     )
-    if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
-        series = choose_exterior(series, "auto", len(use))
+    if s.exterior in ("mount", "auto") and len(use) < FEWEST_EPOCHS:
+        series = choose_exterior(series, s.exterior, len(use))
     elif s.exterior in ("mount", "auto"):
         # The mount is loose at first, so that movements do not look like gross errors.
         A = linearise(sensor, testfield, start[IOP], start[EOP]).A[..., EOP]
@@ -258,8 +260,10 @@ def result(
     level *= pooled
     trend *= pooled
     movement = series.movement
-    if held and len(use) >= FEWEST_EPOCHS:
+    if held and sound.sum() >= FEWEST_EPOCHS:
         movement = estimate_mount_movement(series, estimate)
+    elif held:
+        movement = replace(movement, white=shown_movement(system, estimate.residuals, unit))
     slow: list[tuple[Array, Array]] = []
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
@@ -454,7 +458,7 @@ def judge_epochs(
     values[[word != "ok" for word in status]] = np.nan
     still = np.full(len(use), np.nan)
     if s.exterior == "series":
-        score = stillness(estimate.system, estimate.residuals)
+        score = stillness(estimate.system, estimate.residuals)[0]
         still = score / np.where(redundancy > 0, unit, 1.0)
     return SeriesAdjustment(
         s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, use, observed & ~use,

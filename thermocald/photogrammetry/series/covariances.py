@@ -250,8 +250,9 @@ def pose_equations(N: Array, b: Array, own: Index, Q: Array) -> tuple[Array, Arr
     return reduced, b[:, EOP] - np.einsum("epi,ep->ei", QC, b[:, own])
 
 
-def stillness(system: SeriesSystem, residuals: Array) -> Array:
-    """Test whether an epoch's exterior orientation is the series'; return χ² (E,).
+def stillness(system: SeriesSystem, residuals: Array) -> tuple[Array, Array]:
+    """Test whether an epoch's exterior orientation is the series'; return χ² (E,), and by how much
+    it differs (E, 6).
 
     Rao's score test: the gradient of the six parameters, with the epoch's own ones reduced.
     """
@@ -260,8 +261,33 @@ def stillness(system: SeriesSystem, residuals: Array) -> Array:
         N = normal_matrices(system.used(), system.design.at.A)
     V, g = pose_equations(N, b, system.design.own, system.Q)
     inverse, good = cofactors(V)
-    score = np.einsum("ei,eij,ej->e", g, inverse, g)
-    return np.where(good & system.good, score, np.nan)
+    moved = (inverse @ g[..., None])[..., 0]
+    score = np.einsum("ei,ei->e", g, moved)
+    return np.where(good & system.good, score, np.nan), moved
+
+
+def count_moved(stillness: Array) -> tuple[int, float]:
+    """Return how many epochs moved by their χ² (E,), NaN if unknown, and the bound of that test.
+
+    One epoch or more of a series that stands still exceeds it in one of 100 series.
+    """
+    from scipy.special import chdtri
+
+    bound = float(chdtri(6, 0.01 / max(int(np.isfinite(stillness).sum()), 1)))
+    return int((stillness > bound).sum()), bound
+
+
+def shown_movement(system: SeriesSystem, residuals: Array, unit: Array) -> Array:
+    """Return the mean square (6, 6) of the movements that single epochs show, with their noise; 0
+    if the camera stood still.
+
+    unit (E,): variances of unit weight. For a series too short to estimate how the mount moves.
+    """
+    score, moved = stillness(system, residuals)
+    moved = moved[np.isfinite(score)]
+    if not count_moved(score / np.maximum(unit, 1e-12))[0]:
+        return np.zeros((6, 6))
+    return np.asarray(moved.T @ moved / len(moved))
 
 
 def line_weights(good: Mask) -> Array:

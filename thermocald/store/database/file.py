@@ -107,7 +107,7 @@ class StoreFile:
             os.close(self._handle)
             raise _taken(path) from error
         except OSError as error:
-            self.discard_empty()
+            self.discard_new()
             os.close(self._handle)
             raise StoreError(
                 f"{path}: its folder cannot lock files ({error.strerror}), as some network folders "
@@ -120,10 +120,11 @@ class StoreFile:
         _CLAIMED.discard(self.identity)
         os.close(self._handle)
 
-    def discard_empty(self) -> None:
-        """Remove the file if it was created for the lock and is still empty."""
-        if self._made and os.fstat(self._handle).st_size == 0 and self.there:
-            self.path.unlink(missing_ok=True)
+    def discard_new(self) -> None:
+        """Remove the file, and what SQLite put beside it, if it was created for the lock."""
+        if self._made and self.there:
+            for path in (self.path, *(helper(self.path, kind) for kind in HELPERS)):
+                path.unlink(missing_ok=True)
 
     @property
     def deleted(self) -> bool:
@@ -368,7 +369,6 @@ def copy_database(source: sqlite3.Connection, target: Path) -> None:
     with new_file(target) as partial:
         if partial == target:
             raise OSError(errno.EINVAL, "is not a regular file")
-        partial.touch()  # raises with the reason, which SQLite would not give
         with closing(sqlite3.connect(partial)) as copy:
             source.backup(copy)
             copy.execute("PRAGMA journal_mode = DELETE")

@@ -25,7 +25,7 @@ import struct
 import tempfile
 import time
 import uuid
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
@@ -129,7 +129,8 @@ class StoreFile:
         """Remove the file, and what SQLite put beside it, if it was created for the lock."""
         if self._made and self.there:
             for path in (self.path, *(helper(self.path, kind) for kind in HELPERS)):
-                path.unlink(missing_ok=True)
+                with suppress(OSError):  # its name may be too long
+                    path.unlink()
 
     @property
     def deleted(self) -> bool:

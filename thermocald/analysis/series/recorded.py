@@ -201,7 +201,8 @@ def _open_series(
     store: Store, recording: Recording, settings: AdjustmentSettings, further: list[str]
 ) -> StoredSeries:
     """Return the store's series of a recording, created if there is none."""
-    wanted = {"exterior": "per_epoch", "free": list(settings.free), "columns": further}
+    wanted = {"exterior": "per_epoch", "free": list(settings.free)}
+    wanted |= {"columns": further} if further else {}
     series = store.series_of(recording.camera.name, recording.series)
     if series is None:
         return store.create_series(

@@ -7,7 +7,6 @@ import math
 import os
 import shutil
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -77,7 +76,7 @@ class RecordingWriter:
         self,
         epoch: Epoch,
         image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None,
-        extra: Mapping[str, float] = MappingProxyType({}),
+        extra: Mapping[str, float] | None = None,
     ) -> None:
         """Write one epoch; `image` is its frame as JPEG bytes or as grey values (written as PNG).
 
@@ -97,7 +96,7 @@ class RecordingWriter:
             frame = self._keep_frame(epoch, image)
             times = f"{epoch.frame_time:.6f}", _number(epoch.temperature_time, ".6f")
             read = [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
-            more = [_number(extra.get(name, math.nan), "") for name in self._further]
+            more = [_number((extra or {}).get(name, math.nan), "") for name in self._further]
             self._epochs.writerow([epoch.number, *times, *read, frame, *more])
             if epoch.observations is not None:
                 self._write_observations(epoch.number, epoch.observations)

@@ -72,13 +72,16 @@ class Section(BaseModel):
             known = cls.model_fields.get(key)
             if known is None and cls.model_config["extra"] == "forbid":
                 raise _of_key(str(key), f"unknown{nearest(str(key), list(cls.model_fields))}")
-            # a number, with limits and None or without
+            # a number or a mapping to numbers, with limits and None or without
             kinds = (known.annotation, *get_args(known.annotation)) if known else ()
-            if isinstance(value, bool) and any(
-                kind in (int, float) or get_args(kind)[:1] in ((int,), (float,)) for kind in kinds
-            ):
-                message = f"is {_short(value)}, as YAML reads yes, no, on, off; a number is needed"
-                raise _of_key(key, message)
+            if not any(k in (int, float) or get_args(k)[:1] in ((int,), (float,)) for k in kinds):
+                continue
+            for name, one in value.items() if isinstance(value, dict) else [(None, value)]:
+                if isinstance(one, bool):
+                    raise _of_key(
+                        key if name is None else f"{key}.{name}",
+                        f"is {_short(one)}, as YAML reads yes, no, on, off; a number is needed",
+                    )
         return data
 
 
@@ -372,7 +375,7 @@ class DashboardConfig(Section):
 
     enabled: bool = False
     """Whether the daemon serves the page."""
-    host: str = "127.0.0.1"
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     """Address to listen on; one that other machines can reach needs a token_file."""
     port: Annotated[int, Field(ge=1, le=65535)] = 8437
     """Port to listen on."""

@@ -192,6 +192,7 @@ def new_file(path: Path) -> Iterator[Path]:
         # shortened: a long name leaves no room for the suffix
         partial = place.with_name(f".{place.name[:_LONGEST_NAME]}.partial")
         _remove(partial)  # so that nothing is written through a link of this name
+        partial.touch()  # raises with the system's reason, not with a library's
         yield partial
         if place.exists():
             with contextlib.suppress(OSError):

@@ -240,6 +240,9 @@ class Device:
 
     device_classes: ClassVar[tuple[str, ...]] = ()
     """The device nodes that it opens, as systemd's DeviceAllow= names them: `char-i2c`."""
+    recorded: ClassVar[bool] = False
+    """Whether it plays a recording: a camera then waits for the calibration of its epochs, and a
+    thermometer is read up to the time of each frame, not at a rhythm."""
 
     def __init__(self, *, clock: Clock, **options: Any) -> None:
         self.clock = clock
@@ -310,9 +313,6 @@ class Camera(Device):
 
 class Thermometer(Device):
     """The base class of thermometers."""
-
-    recorded: ClassVar[bool] = False
-    """Whether it plays a recording: it is read up to the time of each frame, not at a rhythm."""
 
     def read(self) -> Reading:
         """Read all channels as they are now; raises a DeviceError if none could be read."""

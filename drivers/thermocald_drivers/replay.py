@@ -51,6 +51,8 @@ def _permanent_errors() -> Iterator[None]:
 class _Replay(Device):
     """The epochs of a recording, in order; re-opening continues with the next epoch."""
 
+    recorded = True
+
     class Options(DriverOptions):
         recording: support.Text | Path
         loop: bool = False
@@ -140,8 +142,6 @@ class ReplayCamera(_Replay, Camera):
 
 class ReplayThermometer(_Replay, Thermometer):
     """A thermometer that delivers the readings of all channels of a recording."""
-
-    recorded = True
 
     def read(self) -> Reading:
         epoch = self._next()

@@ -66,6 +66,8 @@ ONE_LINE = [
     ("session start --camera a --config no.yaml", "error: no.yaml: "),
     ("dashboard --store notes.txt", "notes.txt: is not a"),
     ("dashboard --store no.db", "no.db: does not exist"),
+    ("archive postgresql://u@h/db", "postgresql://h/db: is a server; this command needs a store's"),
+    ("check postgresql://u@h/db", "postgresql://h/db: is a server; this command needs a store's"),
     ("study", "give recordings or stores"),
     ("study nowhere", "nowhere: does not exist"),
     ("study --reference x", "give no recordings with it"),

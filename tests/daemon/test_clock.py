@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import columns_of
-from thermocald.store.database.archive import archive_series
+from thermocald.store.archive import archive_series
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 

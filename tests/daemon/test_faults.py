@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import closing, suppress
 
@@ -19,6 +20,7 @@ from tests.marks import mostly_slow
 from tests.recordings import read_rows
 from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.acquisition.steady_clock import SteadyClock
+from thermocald.acquisition.thermometers import Thermometers
 from thermocald.config import load_config
 from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.series_run import Runtime
@@ -27,7 +29,7 @@ from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.hal import Frame
+from thermocald.hal import Frame, Reading
 from thermocald.store.database.store import Store
 
 
@@ -286,6 +288,29 @@ def test_a_frame_stamped_before_the_new_time_was_followed_is_not_trusted(line, m
     monkeypatch.setattr(line.run.pipeline, "submit", lambda _, trust: seen.append(trust))
     line._capture()
     assert seen == [False]
+    station, reading = line.station, Reading({"temperature": 20.0}, 0.0, 1.7e9)
+    followed.clear()  # likewise a reading without an epoch
+    monkeypatch.setattr(station.thermometers, "read", lambda _: followed.append(True) or reading)
+    monkeypatch.setattr(line.runtime.guard, "reading", lambda one: seen.append(one.clock_trusted))
+    station._read("recorded")
+    assert seen == [False, False]
+
+
+def test_a_thermometer_that_is_being_read_does_not_delay_the_end(daemon, devices, monkeypatch):
+    """A serial one with its usual time-out of 10 s did, by 10 s."""
+    daemon.configure(**devices())
+    ended, answered = [], threading.Event()
+    monkeypatch.setattr(Thermometers, "read", lambda *_: answered.wait(60.0))
+
+    def end(service) -> bool:
+        if service.station.cameras[0].run.stored:
+            ended.append(time.monotonic())
+        return bool(ended)
+
+    Service(load_config(daemon.config), on_turn=end).run()
+    took_s = time.monotonic() - ended[0]
+    answered.set()
+    assert took_s < 8.0
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])

@@ -7,6 +7,7 @@ import re
 import resource
 import signal
 import sqlite3
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from tests.daemon.conftest import columns_of, make_recording
 from tests.marks import mostly_slow
 from tests.recordings import read_rows, write_rows
 from tests.store.small import stored_numbers
+from thermocald.acquisition.calibrator import Calibrator
 from thermocald.daemon.plan import recording_config
 from thermocald.daemon.service import Service
 from thermocald.output.dashboard.view import View
@@ -76,6 +78,15 @@ def test_what_a_recording_lacks_does_not_shift_the_rest(tmp_path, fast):
     found = columns_of(config.store.path, "frame_time", "temperature_time")
     skew_s = (found["temperature_time"] - found["frame_time"]).round(3).tolist()
     assert skew_s[:9] + skew_s[16:] == [0.001] * 17
+
+
+def test_a_recording_in_real_time_waits_for_a_slow_machine(tmp_path, monkeypatch):
+    """Epochs whose calibration was deferred had neither a result nor image points, for good."""
+    calibrate = Calibrator.calibrate
+    monkeypatch.setattr(Calibrator, "calibrate", lambda *a: time.sleep(0.15) or calibrate(*a))
+    config = recording_config(make_recording(tmp_path / "R", 12), tmp_path / "t.db")
+    assert Service(config, until_finished=True).run()
+    assert set(columns_of(config.store.path, "status")["status"].tolist()) == {"ok"}
 
 
 @pytest.fixture

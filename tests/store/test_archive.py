@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sqlite3
 from contextlib import closing
@@ -12,12 +13,15 @@ import numpy as np
 import pytest
 
 import thermocald as tc
+from tests.commands import finish
+from tests.daemon.conftest import make_recording
+from tests.recordings import read_rows, write_rows, write_table
 from tests.store.small import change, write_recording
 from tests.store.test_bad_recordings import refused, set_field
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.store.database import archive
-from thermocald.store.database.archive import archive_series, archive_store
+from thermocald.store import archive
+from thermocald.store.archive import archive_series, archive_store
 from thermocald.store.database.columns import KEPT, row_checksum
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
@@ -43,6 +47,26 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch, monkeypatch)
         assert (epoch.number, epoch.temperatures) == (made.number, made.temperatures)
         assert epoch.frame_time == pytest.approx(made.frame_time, abs=1e-6)
         assert np.array_equal(epoch.observations.points, made.observations.points)
+
+
+def test_a_replayed_log_and_further_columns_come_back(tmp_path):
+    """A store had only the readings of the epochs: the first frame was 0.06 K off."""
+    played = make_recording(tmp_path / "R", 12, interval=10.0)
+    rows = read_rows(played / "epochs.csv")
+    for i, row in enumerate(rows):
+        row |= {"wind": "" if i == 3 else f"{0.1 + i}", "c": "1", "sky": "clear"}
+    write_rows(played / "epochs.csv", rows)
+    times = np.arange(1.7e9 - 20.0, 1.7e9 + 140.0, 7.0)
+    write_table(played / "readings.csv", ("time", "temperature"), [(t, t % 13) for t in times])
+    set_field(played / "readings.csv", 5, "temperature", "")
+    finish("replay", played, "--store", tmp_path / "t.db")
+    finish("archive", tmp_path / "t.db", "--to", tmp_path, "--json", tmp_path / "j")
+    assert not json.loads((tmp_path / "j").read_text())["readings"]
+    first, *others = (tc.open(tmp_path / name).observed() for name in ("R", "t.db", "rpi-M1"))
+    for other in others:
+        np.testing.assert_array_equal(other.reading_times, first.reading_times)
+        np.testing.assert_array_equal(other.readings["temperature"], first.readings["temperature"])
+        np.testing.assert_array_equal(other.columns["wind"], first.columns["wind"])
 
 
 def test_a_clock_that_was_set_back_is_in_the_head(filled, tmp_path, make_epoch):

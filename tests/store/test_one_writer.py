@@ -7,6 +7,7 @@ import errno
 import os
 import stat
 import time
+from functools import partial
 
 import pytest
 import yaml
@@ -16,6 +17,7 @@ from tests.daemon.conftest import make_recording
 from tests.store.small import create_small_series, small_epoch, small_result, stored_numbers
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError
+from thermocald.store import schema
 from thermocald.store.database.store import Store
 
 
@@ -164,7 +166,12 @@ def test_a_place_where_no_store_can_be_made_stays_as_it_was(tmp_path, monkeypatc
     def flock(*_):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr("fcntl.flock", flock)
-    with pytest.raises(StoreError, match=r"s\.db: its folder cannot lock files \(No locks avail"):
-        Store.open(tmp_path / "s.db", "append")
+    with monkeypatch.context() as without:
+        without.setattr("fcntl.flock", flock)
+        with pytest.raises(StoreError, match=r"s\.db: its folder cannot lock files \(No locks"):
+            Store.open(tmp_path / "s.db", "append")
+    monkeypatch.setattr(schema, "FILE_STEPS", (("CREATE TABLE a (b)", "no SQL"),))  # a full disk
+    for open_new in (StoreGuard, partial(Store.open, mode="append")):
+        with pytest.raises(StoreError, match="cannot be opened"):
+            open_new(tmp_path / "s.db")
     assert {path.name for path in tmp_path.iterdir()} == {"t.db", "t.db-wal"}

@@ -105,7 +105,7 @@ def archive(
     """
     from thermocald.config import load_config
     from thermocald.daemon.control import enforce_retention
-    from thermocald.store.database.archive import archive_store
+    from thermocald.store.archive import archive_store
 
     read = None
     if config is not None:
@@ -141,7 +141,7 @@ def backup(
     """
     from thermocald.config import load_config
     from thermocald.files import make_folder
-    from thermocald.store.database.archive import back_up
+    from thermocald.store.archive import back_up
 
     if config is not None:
         to, store = to or store, str(load_config(config).store.path)

@@ -145,7 +145,7 @@ def _acquire(
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import VirtualClock, open_device
-    from thermocald.store.database.archive import archive_series
+    from thermocald.store.archive import archive_series
     from thermocald.store.database.store import Store
 
     make_folder(out)

@@ -141,7 +141,7 @@ def _ask(config: Config, do: str, **values: Any) -> dict[str, Any]:
 
 
 def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
-    from thermocald.store.database.archive import archive_series
+    from thermocald.store.archive import archive_series
     from thermocald.store.database.store import Store
 
     with Store.open(config.store.path) as store:

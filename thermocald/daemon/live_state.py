@@ -136,7 +136,8 @@ class LiveState:
 
 
 def _beside(store: Path) -> Path:
-    return store.with_name(store.name + ".live")
+    place = os.path.realpath(store)  # the same through any link, as the -wal file
+    return Path(f"{place}.live")
 
 
 def _without_secrets(value: Any) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.acquisition.thermometers import require_columns
 from thermocald.config import parse_config
-from thermocald.errors import ConfigurationError, RecordingError
+from thermocald.errors import ConfigurationError, RecordingError, ThermocaldError
 from thermocald.hal import load_driver, open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -85,9 +85,13 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     if one.thermal_model is not None:
         return _plan_gauge(one, calibration, camera, corrected=config.frames.corrected)
     sensor, targets = _sensor(one), None
+    try:
+        scene = camera.known_scene()
+    except ThermocaldError as error:
+        raise ConfigurationError(f"camera {one.name!r}: driver {one.driver!r}: {error}") from error
     if one.testfield is not None:
         targets = read_testfield(one.testfield)
-    elif (scene := camera.known_scene()) is not None:
+    elif scene is not None:
         targets, sensor = scene[1], sensor or scene[0]
     _check_size(one, camera, sensor)
     calibrator = None

@@ -23,6 +23,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from thermocald import __version__
+from thermocald.acquisition.pipeline import PATIENCE_S
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
 from thermocald.daemon.control import ControlSocket
@@ -203,7 +204,8 @@ class Service:
                 if self._session is not None:
                     with suppress(DataError):  # it has come to its end
                         self.sessions.stop(self._session.camera)
-                done = self.station.stop(_GRACE_S)
+                # no epoch waits longer for a reading; the device is closed with the process
+                done = self.station.stop(_GRACE_S, PATIENCE_S)
                 self._record("stopped", "thermocald stopped")
                 self._guard.flush()
                 self.live.remove()  # while the page still runs and can report it

@@ -17,6 +17,7 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
+from thermocald.store.sources import require_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -107,7 +108,7 @@ def examine(source: Path, probe: bool, say: Callable[[str], None]) -> dict[str, 
     takes long. `lines` is the summary as text. Raises the first error; damaged rows of a store
     raise none, but are listed in `damaged`.
     """
-    if not source.exists():
+    if not require_file(source).exists():
         raise DataError(f"{source}: does not exist")
     if _is_system(source):
         raise DataError(f"{source}: belongs to the system; give a recording, config.yaml or store")

@@ -12,6 +12,7 @@ a cold start.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -52,6 +53,8 @@ class CameraLine:
     def __post_init__(self) -> None:
         plan, runtime = self.plan, self.station.runtime
         self.runtime = runtime
+        # what waits of a recording could not be calibrated later: no frame is stored
+        self.waits = runtime.fast or plan.camera.recorded
         self.checked: tuple[list[str], str] | None = None  # the result of `check_frame`
         self.run: SeriesRun | None = None
         self._checking = False
@@ -126,9 +129,10 @@ class CameraLine:
     def _capture(self) -> None:
         runtime, run = self.runtime, self.run
         # each tick of a virtual clock is an epoch, however long the earlier ones take
-        patience_s = 1.0 if runtime.free_running else _VIRTUAL_PATIENCE_S
+        virtual = runtime.fast and not runtime.free_running
+        patience_s = _VIRTUAL_PATIENCE_S if virtual else 1.0
         if run is not None and (
-            run.full or (runtime.fast and not run.pipeline.wait_for_room(patience_s))
+            run.full or (self.waits and not run.pipeline.wait_for_room(patience_s))
         ):
             return
         trusted = runtime.clock.trusted()
@@ -233,8 +237,11 @@ class Station:
             camera.start()
         self._started = True
 
-    def stop(self, grace_s: float) -> bool:
-        """Finish the current epochs and stop; return False if a device or output hangs."""
+    def stop(self, grace_s: float, reading_s: float = math.inf) -> bool:
+        """Finish the current epochs and stop; return False if a device or output hangs.
+
+        reading_s: how long to wait for thermometers that are being read.
+        """
         deadline = time.monotonic() + grace_s
         self.stopping.set()
         for loop in self._loops:
@@ -243,12 +250,13 @@ class Station:
         for loop in self._loops:
             hangs = loop.busy_s() > self.runtime.hang_after_s  # is not waited for
             left_s = 0.0 if hangs else deadline - time.monotonic() - 0.5 * grace_s
+            if loop in self._readers.values():
+                left_s = min(left_s, reading_s)
             done &= loop.join(max(0.1, left_s))
         for camera in self.cameras:
             if camera.run is not None:
                 pipeline = camera.run.pipeline
-                # what waits of a recording could not be calibrated later: no frame is stored
-                stop = pipeline.finish if self.runtime.fast else pipeline.stop
+                stop = pipeline.finish if camera.waits else pipeline.stop
                 done &= stop(max(0.1, deadline - time.monotonic()))
         for output in self.outputs:
             done &= output.stop(max(0.1, min(2.0, deadline - time.monotonic())))
@@ -341,6 +349,8 @@ class Station:
 
     def _read(self, name: str) -> None:
         """Read a thermometer; store the reading if no epoch will contain it."""
+        clock = self.runtime.clock
+        trusted = clock.trusted()
         reading = self.thermometers.read(name)
         in_epochs = any(
             name in line.plan.config.thermometers
@@ -349,7 +359,8 @@ class Station:
             for line in self.cameras
         )
         if not in_epochs:
-            trusted = self.runtime.clock.trusted()
+            # a step may be followed between the reading's time stamp and now
+            trusted &= clock.trusted()
             self.runtime.guard.reading(LoggedReading(name, reading.utc, reading.values, trusted))
 
     def retain(self) -> list[str]:

@@ -77,7 +77,7 @@ class FollowedStore:
         try:
             self.store = Store.open(self.path, "append", durable=self._durable, claimed=True)
         except BaseException:
-            self._file.discard_empty()
+            self._file.discard_new()
             self._file.release()
             raise
         self.series: dict[tuple[str, str], StoredSeries] = {}

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
 
 NOT_CALIBRATED = "not_calibrated"  # status of an epoch that is not adjusted yet
+LOG = "log of series "
 _LISTED = 20
 _CLOCK_TOLERANCE_S = 10.0
 
@@ -99,6 +100,11 @@ class StoredSeries:
     @property
     def name(self) -> str:
         return self.head.series
+
+    @property
+    def log_name(self) -> str:
+        """The thermometer that stands for a recording's log; a configured one has no blanks."""
+        return f"{LOG}{self.id}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +180,10 @@ class SeriesReader(ABC):
     @abstractmethod
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """Return covariances (E, 16, 16) of the epochs `numbers`, NaN without a result."""
+
+    def logged(self, series: StoredSeries) -> list[LoggedReading]:  # noqa: ARG002
+        """Return every reading of the log that a replayed recording had; a server has none."""
+        return []
 
     @abstractmethod
     def _epochs(

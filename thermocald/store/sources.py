@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import StoreError
+from thermocald.errors import StoreError, UsageError
 from thermocald.files import is_database, shown
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.observation_file import grid_runs
-from thermocald.store.recording.reader import EpochColumns
+from thermocald.store.recording.reader import EpochColumns, TemperatureLog
 from thermocald.store.server.connection import ServerAddress, is_server
 
 if TYPE_CHECKING:
@@ -56,6 +56,13 @@ def is_store(source: Path) -> bool:
     return is_server(source) or is_database(source)
 
 
+def require_file(source: Path) -> Path:
+    """Return the path of a store. Raises UsageError for a server's address."""
+    if is_server(source):
+        raise UsageError(f"{source_name(source)}: is a server; this command needs a store's file")
+    return source
+
+
 def source_name(source: Path) -> str:
     """Return a source's name for messages and results: an address without its password."""
     if not is_server(source):
@@ -81,6 +88,18 @@ def require_source(source: Path) -> Path:
     except OSError as cause:
         raise StoreError(f"{shown(source)}: cannot be read: {cause.strerror}") from cause
     return source
+
+
+def stored_log(store: SeriesReader, series: StoredSeries) -> TemperatureLog | None:
+    """Return the log that a replayed recording had beside its epochs, None without one."""
+    kept = store.logged(series)
+    if not kept:
+        return None
+    channels = {
+        name: np.array([reading.values.get(name, np.nan) for reading in kept])
+        for name in series.head.channels
+    }
+    return TemperatureLog(np.array([reading.utc for reading in kept]), channels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +131,13 @@ class StoredRecording:
         found = self.store.series_columns(self.series, names)
         return EpochColumns(
             found["epoch"].astype(np.int64), found["frame_time"], found["temperature_time"],
-            {name: found[name] for name in channels}, (), {},
+            {name: found[name] for name in channels}, (), {}, stored_log(self.store, self.series),
         )  # fmt: skip
+
+    def further_columns(self) -> dict[str, Array]:
+        """Return the numeric columns (E,) that a replayed recording had besides the usual ones."""
+        names = self.series.settings.get("columns")
+        return self.store.series_columns(self.series, names) if names else {}
 
     def extra_columns(self) -> dict[str, Array]:
         """Return the further columns (E,) by name, NaN for an epoch without a value."""

@@ -319,7 +319,7 @@ def series_input(
             every.temperature_time, every.temperatures,
             ObservationGrid(nothing[..., :2], nothing),
         )  # fmt: skip
-        return condensed(replace(whole, columns=_read_columns(source)), source)
+        return condensed(replace(whole, columns=source.further_columns()), source)
     if isinstance(source, Recording) and not source.has_observations:
         if say is not None:
             say(f"measuring the {len(source)} frames of {source.title}")
@@ -338,19 +338,7 @@ def series_input(
         rows = rows[:: max(1, len(rows) // (_READINGS_A_FRAME * len(found.frame_times)))]
         channels = {name: values[rows] for name, values in log.channels.items()}
         found = replace(found, reading_times=log.times[rows], readings=channels)
-    return replace(found, columns=_read_columns(source))
-
-
-def _read_columns(source: Recording | StoredRecording) -> dict[str, NDArray[np.float64]]:
-    """Read the further numeric columns of epochs.csv, such as a humidity."""
-    out = {}
-    for name, texts in source.columns.extra.items():
-        try:
-            values = np.array([float(t) if t.strip() else np.nan for t in texts])
-        except ValueError:
-            continue  # a column of text, such as notes
-        out[name] = np.where(np.isfinite(values), values, np.nan)
-    return out
+    return replace(found, columns=source.further_columns())
 
 
 def _start_input(

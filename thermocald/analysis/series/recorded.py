@@ -28,11 +28,12 @@ from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.store.database.store import Store
 from thermocald.store.recording.sense import target_doubts
-from thermocald.store.series import EpochResult
-from thermocald.store.sources import StoredRecording
+from thermocald.store.schema import COLUMN_NAMES
+from thermocald.store.series import EpochResult, LoggedReading
+from thermocald.store.sources import StoredRecording, require_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -156,9 +157,16 @@ def replay_into(
     Raises StoreError; DataError if the store's series of this name is of another recording.
     """
     # not durable: a replay can be repeated after a power cut; the end of the process loses nothing
-    with Store.open(path, "append", durable=False) as store:
-        series = _open_series(store, recording, settings)
-        last = store.last_epoch(series)
+    columns = recording.further_columns()
+    further = {name: column for name, column in columns.items() if name not in COLUMN_NAMES}
+    with Store.open(require_file(path), "append", durable=False) as store:
+        series = _open_series(store, recording, settings, list(further))
+        log, last = recording.columns.readings, store.last_epoch(series)
+        if log is not None and not store.logged(series):
+            store.add_readings([
+                LoggedReading(series.log_name, time, _known_of(log.channels, row))
+                for row, time in enumerate(log.times.tolist())
+            ])  # fmt: skip
         calibrator = Calibrator.of_recording(recording, settings)
         stored = 0 if last is None else int(np.searchsorted(recording.columns.numbers, last + 1))
         stored -= stored % EPOCHS_OF_A_BLOCK
@@ -175,16 +183,26 @@ def replay_into(
                 if frame is not None:
                     frame = inside and inside / frame.relative_to(recording.path)
                 epoch = replace(done.epoch, frame=frame)
-                store.append(series, epoch, result, extra=done.extra)
+                row = int(np.searchsorted(recording.columns.numbers, epoch.number))
+                extra = {**_known_of(further, row), **done.extra}
+                store.append(series, epoch, result, extra=extra)
             advance(1)
         # inside `with`: to leave targets out of a long series, the store is read again
         source = StoredRecording(store, series)
         return with_drifts(series_epochs(source, settings, exterior, jobs=jobs))
 
 
-def _open_series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
+def _known_of(columns: Mapping[str, Array], row: int) -> dict[str, float]:
+    """Return the values in a row of columns, without those that are missing."""
+    return {name: float(c[row]) for name, c in columns.items() if np.isfinite(c[row])}
+
+
+def _open_series(
+    store: Store, recording: Recording, settings: AdjustmentSettings, further: list[str]
+) -> StoredSeries:
     """Return the store's series of a recording, created if there is none."""
     wanted = {"exterior": "per_epoch", "free": list(settings.free)}
+    wanted |= {"columns": further} if further else {}
     series = store.series_of(recording.camera.name, recording.series)
     if series is None:
         return store.create_series(

@@ -25,9 +25,12 @@ import struct
 import tempfile
 import time
 import uuid
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, BinaryIO, Literal
+
+import numpy as np
 
 from thermocald.errors import (
     OutputError,
@@ -42,7 +45,9 @@ from thermocald.store import schema
 from thermocald.store.database.columns import DamageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
+
+    from numpy.typing import NDArray
 
 
 log = logging.getLogger(__name__)
@@ -107,7 +112,7 @@ class StoreFile:
             os.close(self._handle)
             raise _taken(path) from error
         except OSError as error:
-            self.discard_empty()
+            self.discard_new()
             os.close(self._handle)
             raise StoreError(
                 f"{path}: its folder cannot lock files ({error.strerror}), as some network folders "
@@ -120,10 +125,12 @@ class StoreFile:
         _CLAIMED.discard(self.identity)
         os.close(self._handle)
 
-    def discard_empty(self) -> None:
-        """Remove the file if it was created for the lock and is still empty."""
-        if self._made and os.fstat(self._handle).st_size == 0 and self.there:
-            self.path.unlink(missing_ok=True)
+    def discard_new(self) -> None:
+        """Remove the file, and what SQLite put beside it, if it was created for the lock."""
+        if self._made and self.there:
+            for path in (self.path, *(helper(self.path, kind) for kind in HELPERS)):
+                with suppress(OSError):  # its name may be too long
+                    path.unlink()
 
     @property
     def deleted(self) -> bool:
@@ -368,7 +375,6 @@ def copy_database(source: sqlite3.Connection, target: Path) -> None:
     with new_file(target) as partial:
         if partial == target:
             raise OSError(errno.EINVAL, "is not a regular file")
-        partial.touch()  # raises with the reason, which SQLite would not give
         with closing(sqlite3.connect(partial)) as copy:
             source.backup(copy)
             copy.execute("PRAGMA journal_mode = DELETE")
@@ -445,22 +451,28 @@ def read_wal_tail(path: Path) -> tuple[int, bool]:
 def _read_tail(path: Path) -> tuple[int, bool]:
     committed = _committed_frames(path)  # first: later commits may be read half-written
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:  # of a writer that a reader kept from checkpoints it is long
+            return _read_frames(file, committed)
     except OSError:
-        data = b""
-    if len(data) < _HEADER.size:
         return 0, False
-    magic, _, page_size, _, *salts, first, second = _HEADER.unpack_from(data)
+
+
+def _read_frames(file: BinaryIO, committed: Mapping[bytes, int]) -> tuple[int, bool]:
+    header = file.read(_HEADER.size)
+    if len(header) < _HEADER.size:
+        return 0, False
+    magic, _, page_size, _, *salts, first, second = _HEADER.unpack(header)
     order = ">" if magic & 1 else "<"
-    sums = _checksum(order, data[:24], (0, 0))
+    sums = _checksum(order, header[:24], (0, 0))
     if magic & ~1 != _MAGIC or sums != (first, second) or page_size % 512:
         return -1, False
     broken = earlier = False
     whole = ended = 0  # number of frames, and of those up to the last end of a transaction
     commits: list[int] = []  # numbers of frames that end a transaction, from the broken one on
     step = _FRAME.size + page_size
-    for number, at in enumerate(range(_HEADER.size, len(data) - step + 1, step), 1):
-        _, commit, *frame_salts, first, second = _FRAME.unpack_from(data, at)
+    while len(frame := file.read(step)) == step:
+        number = whole + 1
+        _, commit, *frame_salts, first, second = _FRAME.unpack_from(frame)
         if frame_salts != salts:
             pairs = zip(frame_salts, salts, strict=True)
             if sum((one ^ two).bit_count() for one, two in pairs) > _DAMAGED_SALT_BITS:
@@ -468,15 +480,14 @@ def _read_tail(path: Path) -> tuple[int, bool]:
                 break
             broken = True
         if not broken:
-            head, page = data[at : at + 8], data[at + _FRAME.size : at + step]
-            sums = _checksum(order, page, _checksum(order, head, sums))
+            sums = _checksum(order, frame[:8] + frame[_FRAME.size :], sums)
             broken = sums != (first, second)
         whole, ended = number, number if commit else ended
         if broken and commit:
             commits.append(number)
-    frames = committed.get(data[16:24], 0)
+    frames = committed.get(header[16:24], 0)
     if not broken:
-        cut = ended < whole or (not earlier and (len(data) - _HEADER.size) % step)
+        cut = ended < whole or (not earlier and frame)
         return int(whole < frames), bool(cut) and whole >= frames
     lost = len([n for n in commits if n != commits[-1] or n <= frames])
     return lost, not lost
@@ -498,9 +509,19 @@ def _committed_frames(wal: Path) -> dict[bytes, int]:
 
 
 def _checksum(order: str, data: bytes, start: tuple[int, int]) -> tuple[int, int]:
-    a, b = start
-    words = struct.unpack(f"{order}{len(data) // 4}I", data)
-    for one, two in zip(words[::2], words[1::2], strict=True):
-        a = (a + one + b) & 0xFFFFFFFF
-        b = (b + two + a) & 0xFFFFFFFF
-    return a, b
+    given = np.concatenate([np.array(start, np.uint32), np.frombuffer(data, f"{order}u4")])
+    a, b = _checksum_matrix(len(data) // 8) @ given.astype(np.uint32)
+    return int(a), int(b)
+
+
+@cache
+def _checksum_matrix(pairs: int) -> NDArray[np.uint32]:
+    """Return the checksum's derivative by its start and by words: it is linear modulo 2³².
+
+    A pair of words x, y turns (a, b) into (a + b + x, a + 2b + x + y).
+    """
+    after, of_words = np.eye(2, dtype=np.uint32), []
+    for _ in range(pairs):
+        of_words.append(after @ np.array([[1, 0], [1, 1]], np.uint32))
+        after = after @ np.array([[1, 1], [1, 2]], np.uint32)
+    return np.hstack([after, *of_words[::-1]])

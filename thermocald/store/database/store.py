@@ -33,6 +33,7 @@ from thermocald.store.database.file import (
 from thermocald.store.recording.head import head_document, parse_head
 from thermocald.store.schema import COLUMN_NAMES, sql_name
 from thermocald.store.series import (
+    LOG,
     NOT_CALIBRATED,
     EpochResult,
     Event,
@@ -97,7 +98,7 @@ class Store(SeriesReader):
                 )
             return cls(path, connect(path, mode, durable=durable), file)
         except BaseException:
-            file.discard_empty()
+            file.discard_new()
             file.release()
             raise
 
@@ -200,11 +201,15 @@ class Store(SeriesReader):
         after = -1
         while page := self.rows_after("reading", after, _READINGS_AT_ONCE):
             after = page[-1]["id"]
-            for row in _intact(page):
-                name = file_name(row["thermometer"], "thermometer", StoreError)
-                if thermometer in (None, name):
-                    values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
-                    yield LoggedReading(name, row["utc"], values, trusted)
+            for one in _parse_readings(page):
+                if thermometer in (None, one.thermometer) and not one.thermometer.startswith(LOG):
+                    yield one
+
+    def logged(self, series: StoredSeries) -> list[LoggedReading]:
+        with self._reads("readings") as connection:
+            condition = "WHERE thermometer = ? ORDER BY utc"
+            rows = epochs.whole_rows(connection, "reading", condition, (series.log_name,))
+            return list(_parse_readings(rows))
 
     def events(self) -> list[Event]:
         """Return the events, oldest first."""
@@ -449,6 +454,13 @@ def _intact(rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
             log.warning("%s; it is skipped", row["damage"])
         else:
             yield row
+
+
+def _parse_readings(rows: Iterable[dict[str, Any]]) -> Iterator[LoggedReading]:
+    for row in _intact(rows):
+        name = file_name(row["thermometer"], "thermometer", StoreError)
+        values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
+        yield LoggedReading(name, row["utc"], values, trusted)
 
 
 def _chunk_name(name: str, series: StoredSeries) -> str:

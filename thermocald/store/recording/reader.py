@@ -128,6 +128,17 @@ class Recording:
         """Return the unknown columns of epochs.csv, as text."""
         return self.columns.extra
 
+    def further_columns(self) -> dict[str, Array]:
+        """Return the unknown numeric columns (E,) of epochs.csv, such as a humidity."""
+        out = {}
+        for name, texts in self.columns.extra.items():
+            try:
+                values = np.array([float(t) if t.strip() else np.nan for t in texts])
+            except ValueError:
+                continue  # a column of text, such as notes
+            out[name] = np.where(np.isfinite(values), values, np.nan)
+        return out
+
     @cached_property
     def epochs(self) -> list[Epoch]:
         """All epochs with their observations, which are read at the first access."""

@@ -20,7 +20,7 @@ from thermocald.store.recording.reader import READINGS, TemperatureLog
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
     from typing import Any, TextIO
 
@@ -39,11 +39,15 @@ class RecordingWriter:
     Use it as a context manager. Everything is written into `.<name>.partial` next to `path`, which
     is renamed to `path` at the end, or removed if an error ends the block. Image points are written
     to 1e-5 px, times to 1e-6 s, temperatures and coordinates with all their digits. Raises
-    RecordingError if `path` exists and is not an empty folder, or if the disk is full.
+    RecordingError if `path` exists and is not an empty folder, or if the disk is full. further:
+    names of further columns of epochs.csv.
     """
 
-    def __init__(self, path: Path, head: Head, testfield: TestField) -> None:
+    def __init__(
+        self, path: Path, head: Head, testfield: TestField, further: Iterable[str] = ()
+    ) -> None:
         self.path = path
+        self._further = list(further)
         self._head = head
         self._field = testfield
         self._partial = path.absolute().with_name(f".{path.absolute().name}.partial")
@@ -65,15 +69,18 @@ class RecordingWriter:
             ):
                 (self._partial / name).write_text(text, encoding="utf-8")
             names = ["epoch", "frame_time", "temperature_time", *self._head.channels, "frame"]
-            self._epochs = self._new("epochs.csv", names)
+            self._epochs = self._new("epochs.csv", [*names, *self._further])
         return self
 
     def append(
-        self, epoch: Epoch, image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None
+        self,
+        epoch: Epoch,
+        image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None,
+        extra: Mapping[str, float] | None = None,
     ) -> None:
         """Write one epoch; `image` is its frame as JPEG bytes or as grey values (written as PNG).
 
-        Without `image`, the frame that the epoch names is copied.
+        Without `image`, the frame that the epoch names is copied. extra: its further columns.
         """
         # what `open_recording` would refuse
         where = f"{self.path}: epoch {epoch.number}"
@@ -89,7 +96,8 @@ class RecordingWriter:
             frame = self._keep_frame(epoch, image)
             times = f"{epoch.frame_time:.6f}", _number(epoch.temperature_time, ".6f")
             read = [_number(epoch.temperatures.get(n, math.nan), "") for n in self._head.channels]
-            self._epochs.writerow([epoch.number, *times, *read, frame])
+            more = [_number((extra or {}).get(name, math.nan), "") for name in self._further]
+            self._epochs.writerow([epoch.number, *times, *read, frame, *more])
             if epoch.observations is not None:
                 self._write_observations(epoch.number, epoch.observations)
         self._last = epoch

@@ -15,6 +15,7 @@ from thermocald.result import csv_text
 from thermocald.store.database.store import Store
 from thermocald.store.recording.writer import RecordingWriter
 from thermocald.store.series import series_times
+from thermocald.store.sources import require_file, stored_log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,7 +41,7 @@ def archive_store(
     """
     written: list[dict[str, Any]] = []
     readings: dict[str, Path] = {}
-    with Store.open(path) as opened:
+    with Store.open(require_file(path)) as opened:
         every = opened.all_series()
         chosen = every if series is None else [opened.only_series(series)]
         if finished:
@@ -90,11 +91,15 @@ def archive_series(
     known = {key: value for key, value in known.items() if value}
     head = replace(series.head, extra={**series.head.extra, **known})
     folder = FileFolder(frames or Path())
-    with RecordingWriter(path, head, series.testfield) as writer:
+    further = series.settings.get("columns", ())
+    with RecordingWriter(path, head, series.testfield, further) as writer:
+        if (log := stored_log(store, series)) is not None:
+            writer.keep_readings(log)
         for stored in store.epochs(series):
             frame = stored.epoch.frame
             found = None if frame is None else folder.find(frame)
-            writer.append(replace(times.correct(stored).epoch, frame=found))
+            epoch = replace(times.correct(stored).epoch, frame=found)
+            writer.append(epoch, extra=stored.extra)
 
 
 def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
@@ -135,7 +140,7 @@ def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
         raise DataError(f"{target}: exists already; choose another name for the backup")
     if not target.absolute().parent.is_dir():
         raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
-    with Store.open(store) as opened:
+    with Store.open(require_file(store)) as opened:
         opened.copy_to(target)
     try:
         with Store.open(target) as copy:

@@ -26,6 +26,7 @@ _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d{1,3})(?![\w.]*\w)")
 _UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
+_MEASURED = re.compile(r"(?<![\w.,-])[+−]?\d[\d,]*(?:\.\d+)?(?: ± [\d.]*\d)?(?!\w)")
 _DEGREES = re.compile(r"(?<=[\d)] )degC\b")
 _MINUS = "−"
 
@@ -54,6 +55,36 @@ def shortened(text: str, most: int) -> str:
         return text
     tail = (most - 1) // 2
     return f"{text[: most - 1 - tail].rstrip()}…{text[-tail:].lstrip()}"
+
+
+def told_apart(names: Sequence[str], most: int) -> list[str]:
+    """Shorten names to `most` letters each; those that would look alike begin where they differ."""
+    short = [shortened(name, most) for name in names]
+    if len(set(short)) == len(set(names)):
+        return short
+    differ = (len(set(letters)) > 1 for letters in zip(*names, strict=False))
+    start = names[0][: next((k for k, one in enumerate(differ) if one), 0)]
+    same = max(start.rfind(" "), start.rfind("_")) + 1
+    short = [f"…{name[same : same + most - 2]}…" for name in names]
+    if len(set(short)) == len(set(names)):
+        return short
+    return [shortened(f"{names.index(name) + 1}: {name}", most) for name in names]
+
+
+def without_numbers(text: str) -> str:
+    """Return a text with a mark in place of each number and its standard deviation."""
+    return _MEASURED.sub("#", text)
+
+
+def spanned(texts: Sequence[str]) -> str:
+    """Return one text for several that differ only in numbers: `3.1 ± 0.2 to 4.5 ± 0.1 px`."""
+
+    def value(number: str) -> float:
+        return float(number.split(" ")[0].replace(_MINUS, "-").replace(",", ""))
+
+    rows = zip(*map(_MEASURED.findall, texts), strict=True)
+    spans = iter([dict.fromkeys((min(row, key=value), max(row, key=value))) for row in rows])
+    return _MEASURED.sub(lambda _: " to ".join(next(spans)), texts[0])
 
 
 def superscript(exponent: int) -> str:
@@ -119,7 +150,7 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
 def _times_power(value: float, exponent: int, decimals: int, unit: str) -> str:
     """Write a number as a multiple of a power of ten, if that is not 1."""
     power = f"·10{superscript(exponent)}" if exponent else ""
-    body = f"{value / 10**exponent:.{decimals}f}{power}"
+    body = f"{value / 10**exponent:z.{decimals}f}{power}"
     return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 

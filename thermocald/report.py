@@ -29,7 +29,9 @@ _A_YEAR = 31_557_600.0
 _RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
 # no line break between a number, its standard deviation and their unit, or within an option
 _PROSE = re.compile(r"<(p|li|figcaption)\b[^>]*>.*?</\1>", re.DOTALL)
-_BEFORE_UNIT = re.compile(r"(?<=[\d)¹²³⁰-⁹]) (?=[±%°]|(?:px|[mµc]?m|[hsKσ]|min|minutes)\b)|(?<=±) ")
+_BEFORE_UNIT = re.compile(
+    r"(?<=[\d)¹²³⁰-⁹]) (?=[±%°]|(?:px|[mµc]?m|[hsKσ]|min|minutes)\b)|(?<=±) | (?==)"
+)
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 _WORDS_TO_LEFT = re.compile(
     f"[{_RIGHT_TO_LEFT}](?:[{_RIGHT_TO_LEFT}\\s\u200c\u200d-]*[{_RIGHT_TO_LEFT}])?"

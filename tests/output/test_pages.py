@@ -39,7 +39,7 @@ from thermocald.figures import Curve, Figure, Panel, draw_panel
 from thermocald.fleet.overview import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
-from thermocald.output.study.report import render_study, save_figures
+from thermocald.output.study.report import render_study, save_figures, study_lines
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
@@ -425,13 +425,30 @@ def test_the_page_is_whole_and_holds_the_numbers_of_the_study(page_text):
     assert [(f.count(">x₀</text>"), f.count(">B2</text>")) for f in figures] == 3 * [(2, 2)]
 
 
-@pytest.mark.parametrize("names", [[f"M{k}" for k in range(1, 8)], list("abcdefghij"), [LONG, "M"]])
+RUNS = [f"Run of 2024-05-0{k} in the climate chamber, camera A" for k in (1, 2)]
+MORE = [*(f"{RUNS[0]}{k}" for k in "12"), RUNS[1]]
+
+
+@pytest.mark.parametrize("names", [[f"M{k}" for k in range(1, 8)], [LONG, "M"], RUNS, MORE])
 def test_a_legend_stays_in_its_drawing(names):
-    """The seventh series of a study was cut off."""
+    """The seventh series of a study was cut off; two with long names were one."""
     x = np.arange(3.0)
     drawing = draw_panel(Panel("c", "x in px", "y in px", tuple(Curve(n, x, x) for n in names)))
     drawing.draw_without_rendering()
-    assert drawing.axes[0].get_legend().get_window_extent().x1 <= drawing.bbox.x1
+    legend = drawing.axes[0].get_legend()
+    assert legend.get_window_extent().x1 <= drawing.bbox.x1
+    assert len({text.get_text() for text in legend.get_texts()}) == len(names)
+
+
+def test_series_that_differ_only_in_their_numbers_share_a_sentence():
+    """Seven series were fourteen nearly equal sentences."""
+    measured = study([WarmUp(seed=k)(f"M{k}", label="cam") for k in range(1, 8)], FEW)
+    (rates,) = (line for line in study_lines(measured) if "µm/K" in line)
+    one, *_ = series = measured.cameras[0].series
+    slopes = [s.channels[0].dependences["x0"].slope / one.series.sensor.pixel_pitch for s in series]
+    assert rates.startswith("  All 7 series: between ")
+    assert f"x₀ moves by {min(slopes):+.4f} ± " in rates
+    assert f" to {max(slopes):+.4f} ± " in rates
 
 
 def test_a_calibration_without_a_result_says_why(undrawn):

@@ -20,7 +20,7 @@ import numpy as np
 
 from thermocald.errors import DriverMissing
 from thermocald.files import new_file
-from thermocald.numbers import coefficient, shortened, superscript, told_apart
+from thermocald.numbers import coefficient, shortened, superscript, distinct_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -348,7 +348,7 @@ def legend_above(axis: Any) -> int:
     """Put the legend above the axes, clear of the data; return its number of rows."""
     handles, names = axis.get_legend_handles_labels()
     handle_of = dict(zip(names, handles, strict=True))
-    short = told_apart(list(handle_of), 18)
+    short = distinct_names(list(handle_of), 18)
     columns = max(1, int(_LEGEND_LETTERS / (max(map(len, short)) + _KEY_LETTERS)))
     rows = -(-len(short) // columns)
     axis.legend(
@@ -415,7 +415,7 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
 def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
     """Draw correlation coefficients (n, n) as coloured cells with numbers; NaN is grey."""
     n = len(names)
-    short = told_apart(names, _MATRIX_LETTERS)
+    short = distinct_names(names, _MATRIX_LETTERS)
     size = 1.3 + 0.31 * n
     with new_drawing(size, size + 0.3) as drawing:
         axis = drawing.subplots()

@@ -57,7 +57,7 @@ def shortened(text: str, most: int) -> str:
     return f"{text[: most - 1 - tail].rstrip()}…{text[-tail:].lstrip()}"
 
 
-def told_apart(names: Sequence[str], most: int) -> list[str]:
+def distinct_names(names: Sequence[str], most: int) -> list[str]:
     """Shorten names to `most` letters each; those that would look alike begin where they differ."""
     short = [shortened(name, most) for name in names]
     if len(set(short)) == len(set(names)):

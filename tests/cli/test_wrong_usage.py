@@ -35,7 +35,7 @@ ONE_LINE = [
     ("predict --temperature 35,5", f"error: --temperature: {NO_NUMBER}; s"),
     ("fit M1 -o", "error: option '-o' requires an argument; see 'thermocald fit --help'"),
     ("predict --model m --temperature nan", "--temperature: nan is no finite"),
-    ("testfield check --from 0 inf 0", "--from: inf is no finite number"),
+    ("testfield check --from 0 inf 0", "--from: inf is not a finite number"),
     ("testfield print --out f --square 30", "--square, --marker: give --char"),
     ("predict --model m --log l --separator abc", "--separator abc: must be one character"),
     # options that would do nothing

@@ -32,7 +32,7 @@ from thermocald.numbers import (
     plain,
     spanned,
     superscript,
-    told_apart,
+    distinct_names,
     with_sd,
     without_numbers,
 )
@@ -202,7 +202,7 @@ def _movement_figure(camera: CameraStudy) -> Figure | None:
     if not moved:
         return None
     longest = max(float(np.linalg.norm(vectors, axis=1).max()) for *_, vectors in moved)
-    titles = told_apart([study.series.name for study, *_ in moved], 18)
+    titles = distinct_names([study.series.name for study, *_ in moved], 18)
     panels, words = [], []
     for title, (study, colour, vectors) in zip(titles, moved, strict=True):
         sensor, covariance = study.series.sensor, study.displacement_covariance

@@ -15,7 +15,7 @@ from thermocald.numbers import (
     percent,
     plain,
     rounded,
-    told_apart,
+    distinct_names,
     with_sd,
 )
 from thermocald.output.study.figures import cluster_names
@@ -77,7 +77,7 @@ def _by_parameter(
     found: Sequence[tuple[SeriesStudy, Mapping[str, _Found]]],
 ) -> list[tuple[str, SeriesStudy, _Found, str]]:
     """Return rows (parameter, series, result, the series' short name) in order of parameters."""
-    short = told_apart([study.series.name for study, _ in found], _NAME_LETTERS)
+    short = distinct_names([study.series.name for study, _ in found], _NAME_LETTERS)
     rows = [
         (name, study, result, label)
         for (study, results), label in zip(found, short, strict=True)

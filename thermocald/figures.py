@@ -20,7 +20,7 @@ import numpy as np
 
 from thermocald.errors import DriverMissing
 from thermocald.files import new_file
-from thermocald.numbers import coefficient, shortened, superscript, distinct_names
+from thermocald.numbers import coefficient, distinct_names, shortened, superscript
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -26,13 +26,13 @@ from thermocald.figures import (
 )
 from thermocald.numbers import (
     UNITS,
+    distinct_names,
     enumerated,
     parameter_label,
     percent,
     plain,
     spanned,
     superscript,
-    distinct_names,
     with_sd,
     without_numbers,
 )

@@ -9,13 +9,13 @@ import numpy as np
 from thermocald.numbers import (
     UNITS,
     coefficient,
+    distinct_names,
     duration,
     p_text,
     parameter_label,
     percent,
     plain,
     rounded,
-    distinct_names,
     with_sd,
 )
 from thermocald.output.study.figures import cluster_names

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -62,10 +63,11 @@ def distinct_names(names: Sequence[str], most: int) -> list[str]:
     short = [shortened(name, most) for name in names]
     if len(set(short)) == len(set(names)):
         return short
-    differ = (len(set(letters)) > 1 for letters in zip(*names, strict=False))
-    start = names[0][: next((k for k, one in enumerate(differ) if one), 0)]
-    same = max(start.rfind(" "), start.rfind("_")) + 1
-    short = [f"…{name[same : same + most - 2]}…" for name in names]
+    same = sum(
+        1 for _ in takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    )
+    word = max(names[0].rfind(" ", 0, same), names[0].rfind("_", 0, same)) + 1
+    short = [f"…{name[word : word + most - 2]}…" for name in names]
     if len(set(short)) == len(set(names)):
         return short
     return [shortened(f"{names.index(name) + 1}: {name}", most) for name in names]

@@ -73,30 +73,26 @@ def _coloured(camera: CameraStudy) -> Iterator[tuple[SeriesStudy, str]]:
 
 
 def by_series(
-    camera: CameraStudy, texts: Iterable[tuple[SeriesStudy, str]], everywhere: str | None = None
+    camera: CameraStudy, texts: Iterable[tuple[SeriesStudy, str]], *, name_all: bool = True
 ) -> list[str]:
     """Return texts on single series, each once, with the names of its series in front.
 
     From three series on, texts that differ only in their numbers are one, with the smallest and the
-    largest of them. everywhere: what stands before a text on all series in place of their names.
+    largest of them. name_all: whether a text on all series has their names too.
     """
-    holders: dict[str, list[SeriesStudy]] = {}
+    groups: dict[object, dict[str, list[str]]] = {}
     for study, text in texts:
         if text:
-            holders.setdefault(text, []).append(study)
-    groups: dict[object, list[str]] = {}
-    for text, studies in holders.items():
-        channels = tuple(t.name for t in studies[0].series.thermometers)
-        groups.setdefault((without_numbers(text), channels), []).append(text)
+            alike = without_numbers(text), tuple(t.name for t in study.series.thermometers)
+            groups.setdefault(alike, {}).setdefault(text, []).append(study.series.name)
     said = []
-    for alike in groups.values():
-        several = sum(len(holders[text]) for text in alike) >= _SEVERAL
-        for shown in [alike] if several else [[text] for text in alike]:
-            names = [study.series.name for text in shown for study in holders[text]]
-            who = f"{enumerated(names)}: "
-            if len(names) == len(camera.series):
-                who = f"All {len(names)} series: " if len(names) >= _SEVERAL else who
-                who = who if everywhere is None else everywhere
+    for names in groups.values():
+        together = sum(map(len, names.values())) >= _SEVERAL
+        for shown in [list(names)] if together else [[text] for text in names]:
+            of = [name for text in shown for name in names[text]]
+            who = f"{enumerated(of)}: "
+            if len(of) == len(camera.series) and (len(of) >= _SEVERAL or not name_all):
+                who = f"All {len(of)} series: " if name_all else ""
             said.append(who + spanned(shown))
     return said
 

@@ -196,7 +196,7 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
 
 def _notes(camera: CameraStudy) -> list[str]:
     found = ((study, note) for study in camera.series for note in study.notes)
-    return by_series(camera, found, everywhere="") + list(camera.notes)
+    return by_series(camera, found, name_all=False) + list(camera.notes)
 
 
 def _doubts(camera: CameraStudy) -> list[str]:

@@ -25,11 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from thermocald.analysis.study.measured import StudySettings
-    from thermocald.analysis.study.study import (
-        CameraStudy,
-        Deviation,
-        SeriesStudy,
-    )
+    from thermocald.analysis.study.study import CameraStudy, Deviation, SeriesStudy
     from thermocald.arrays import Array
 
 _Found = TypeVar("_Found")

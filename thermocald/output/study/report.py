@@ -72,7 +72,7 @@ def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
                 _answer(camera, study.settings.distance_mm),
                 tuple(_sections(camera, study.settings)),
                 (f"{names}. Measured: {measured}.",),
-                (*map(as_sentence, _doubts(camera)), *_notes(camera)),
+                tuple(map(as_sentence, (*_doubts(camera), *_notes(camera)))),
             )
         )
     return render_report(title, chapters, _LEAD)

@@ -79,14 +79,18 @@ def without_numbers(text: str) -> str:
 
 
 def spanned(texts: Sequence[str]) -> str:
-    """Return one text for several that differ only in numbers: `3.1 ± 0.2 to 4.5 ± 0.1 px`."""
+    """Return one text for several that differ in numbers: `3.1 ± 0.2 to 4.5 ± 0.1 px`, `2–3 s`."""
 
     def value(number: str) -> float:
         return float(number.split(" ")[0].replace(_MINUS, "-").replace(",", ""))
 
-    rows = zip(*map(_MEASURED.findall, texts), strict=True)
-    spans = iter([dict.fromkeys((min(row, key=value), max(row, key=value))) for row in rows])
-    return _MEASURED.sub(lambda _: " to ".join(next(spans)), texts[0])
+    def span(row: tuple[str, ...]) -> str:
+        ends = dict.fromkeys((min(row, key=value), max(row, key=value)))
+        plain_numbers = all(end[0].isdigit() and " " not in end for end in ends)
+        return ("–" if plain_numbers else " to ").join(ends)
+
+    spans = map(span, zip(*map(_MEASURED.findall, texts), strict=True))
+    return _MEASURED.sub(lambda _: next(spans), texts[0])
 
 
 def superscript(exponent: int) -> str:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _Found = TypeVar("_Found")
-_NAME_LETTERS = 30
+_NAME_LETTERS = 18  # as in legends
 _FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from thermocald.errors import DriverMissing
 from thermocald.files import new_file
-from thermocald.numbers import coefficient, shortened, superscript
+from thermocald.numbers import coefficient, distinct_names, shortened, superscript
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -347,13 +347,16 @@ def use_logarithm(axis: Any) -> None:
 def legend_above(axis: Any) -> int:
     """Put the legend above the axes, clear of the data; return its number of rows."""
     handles, names = axis.get_legend_handles_labels()
-    first = {shortened(name, 18): handle for name, handle in zip(names, handles, strict=True)}
-    columns = max(1, min(len(first), int(_LEGEND_LETTERS / (max(map(len, first)) + _KEY_LETTERS))))
+    handle_of = dict(zip(names, handles, strict=True))
+    short = distinct_names(list(handle_of), 18)
+    columns = max(1, int(_LEGEND_LETTERS / (max(map(len, short)) + _KEY_LETTERS)))
+    rows = -(-len(short) // columns)
     axis.legend(
-        first.values(), first.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+        list(handle_of.values()), short, loc="lower left", bbox_to_anchor=(0.0, 1.0),
+        ncols=-(-len(short) // rows),
         handlelength=1.2, columnspacing=1.0, labelspacing=0.2, borderaxespad=0.1, borderpad=0.2,
     )  # fmt: skip
-    return int(-(-len(first) // columns))
+    return rows
 
 
 def _draw_curve(axis: Any, curve: Curve) -> None:
@@ -412,7 +415,7 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
 def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
     """Draw correlation coefficients (n, n) as coloured cells with numbers; NaN is grey."""
     n = len(names)
-    short = [shortened(name, _MATRIX_LETTERS) for name in names]
+    short = distinct_names(names, _MATRIX_LETTERS)
     size = 1.3 + 0.31 * n
     with new_drawing(size, size + 0.3) as drawing:
         axis = drawing.subplots()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d{1,3})(?![\w.]*\w)")
 _UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
+_MEASURED = re.compile(r"(?<![\w.,-])[+−]?\d[\d,]*(?:\.\d+)?(?: ± [\d.]*\d)?(?!\w)")
 _DEGREES = re.compile(r"(?<=[\d)] )degC\b")
 _MINUS = "−"
 
@@ -54,6 +56,41 @@ def shortened(text: str, most: int) -> str:
         return text
     tail = (most - 1) // 2
     return f"{text[: most - 1 - tail].rstrip()}…{text[-tail:].lstrip()}"
+
+
+def distinct_names(names: Sequence[str], most: int) -> list[str]:
+    """Shorten names to `most` letters each; those that would look alike begin where they differ."""
+    short = [shortened(name, most) for name in names]
+    if len(set(short)) == len(set(names)):
+        return short
+    same = sum(
+        1 for _ in takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    )
+    word = max(names[0].rfind(" ", 0, same), names[0].rfind("_", 0, same)) + 1
+    short = [f"…{name[word : word + most - 2]}…" for name in names]
+    if len(set(short)) == len(set(names)):
+        return short
+    return [shortened(f"{names.index(name) + 1}: {name}", most) for name in names]
+
+
+def without_numbers(text: str) -> str:
+    """Return a text with a mark in place of each number and its standard deviation."""
+    return _MEASURED.sub("#", text)
+
+
+def spanned(texts: Sequence[str]) -> str:
+    """Return one text for several that differ in numbers: `3.1 ± 0.2 to 4.5 ± 0.1 px`, `2–3 s`."""
+
+    def value(number: str) -> float:
+        return float(number.split(" ")[0].replace(_MINUS, "-").replace(",", ""))
+
+    def span(row: tuple[str, ...]) -> str:
+        ends = dict.fromkeys((min(row, key=value), max(row, key=value)))
+        plain_numbers = all(end[0].isdigit() and " " not in end for end in ends)
+        return ("–" if plain_numbers else " to ").join(ends)
+
+    spans = map(span, zip(*map(_MEASURED.findall, texts), strict=True))
+    return _MEASURED.sub(lambda _: next(spans), texts[0])
 
 
 def superscript(exponent: int) -> str:
@@ -119,7 +156,7 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
 def _times_power(value: float, exponent: int, decimals: int, unit: str) -> str:
     """Write a number as a multiple of a power of ten, if that is not 1."""
     power = f"·10{superscript(exponent)}" if exponent else ""
-    body = f"{value / 10**exponent:.{decimals}f}{power}"
+    body = f"{value / 10**exponent:z.{decimals}f}{power}"
     return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 

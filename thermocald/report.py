@@ -29,7 +29,10 @@ _A_YEAR = 31_557_600.0
 _RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
 # no line break between a number, its standard deviation and their unit, or within an option
 _PROSE = re.compile(r"<(p|li|figcaption)\b[^>]*>.*?</\1>", re.DOTALL)
-_BEFORE_UNIT = re.compile(r"(?<=[\d)¹²³⁰-⁹]) (?=[±%°]|(?:px|[mµc]?m|[hsKσ]|min|minutes)\b)|(?<=±) ")
+_BEFORE_UNIT = re.compile(
+    r"(?<=[\d)¹²³⁰-⁹]) (?=[±%°]|(?:px|[mµc]?m|[hsKσ]|min|minutes)\b)|(?<=±) | (?==)"
+)
+_SYMBOL = re.compile(r"[cσxy][₀\s:,]")
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 _WORDS_TO_LEFT = re.compile(
     f"[{_RIGHT_TO_LEFT}](?:[{_RIGHT_TO_LEFT}\\s\u200c\u200d-]*[{_RIGHT_TO_LEFT}])?"
@@ -136,9 +139,9 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
 
 
 def as_sentence(text: str) -> str:
-    """Return a line with a capital letter and a full stop."""
+    """Return a line with a full stop and a capital letter, unless it begins with a symbol."""
     text = text.strip().rstrip(".")
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{text if _SYMBOL.match(text) else text[:1].upper() + text[1:]}."
 
 
 def day(start_utc: float) -> str:

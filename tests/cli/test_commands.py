@@ -182,6 +182,8 @@ def test_a_backup_is_never_written_over(store_path, tmp_path):
     assert call("backup", store_path, tmp_path / "there.db").returncode == 1
     assert (tmp_path / "there.db").read_text() == "mine"
     assert call("backup", store_path, tmp_path / "away/there.db").returncode == 2
+    assert call("backup", tmp_path / "none.db", f"{tmp_path}/new/").returncode == 1
+    assert not (tmp_path / "new").exists()
     os.mkfifo(tmp_path / "pipe")
     assert call("backup", store_path, tmp_path / "pipe").returncode == 1
     assert (tmp_path / "pipe").is_fifo()

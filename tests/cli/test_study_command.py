@@ -66,14 +66,6 @@ def test_a_store_gives_the_same_as_its_recording(recording, tmp_path):
 
 
 @pytest.mark.slow
-def test_frames_that_are_not_measured_yet_are_measured(tmp_path):
-    tc.simulate("rpi-v2.1-heating", seed=3, epochs=3, frames=True, out=tmp_path / "frames")
-    run(tmp_path / "frames", "--sets", "200", "--free", "c,x0,y0", "--report", tmp_path / "r.html")
-    page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "The F-test needs 31 consecutive epochs; the series has 3" in page
-
-
-@pytest.mark.slow
 def test_the_reference_table_is_reproduced():
     """Bounds of the issue: shares 3 points, means 0.1 cm, maxima 15 %, |r| 0.98.
 

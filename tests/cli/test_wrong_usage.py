@@ -34,8 +34,8 @@ ONE_LINE = [
     ("study M1 --distance -3", f"error: --distance: {TOO_SMALL}; see"),
     ("predict --temperature 35,5", f"error: --temperature: {NO_NUMBER}; s"),
     ("fit M1 -o", "error: option '-o' requires an argument; see 'thermocald fit --help'"),
-    ("predict --model m --temperature nan", "--temperature: nan is no finite"),
-    ("testfield check --from 0 inf 0", "--from: inf is no finite number"),
+    ("predict --model m --temperature nan", "--temperature: nan is not a finite"),
+    ("testfield check --from 0 inf 0", "--from: inf is not a finite number"),
     ("testfield print --out f --square 30", "--square, --marker: give --char"),
     ("predict --model m --log l --separator abc", "--separator abc: must be one character"),
     # options that would do nothing

@@ -37,6 +37,7 @@ from thermocald.discovery.result import discover_series
 from thermocald.errors import DriverMissing
 from thermocald.figures import Curve, Figure, Panel, draw_panel
 from thermocald.fleet.overview import render_fleet
+from thermocald.numbers import spanned
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
 from thermocald.output.study.report import render_study, save_figures
@@ -425,13 +426,27 @@ def test_the_page_is_whole_and_holds_the_numbers_of_the_study(page_text):
     assert [(f.count(">x₀</text>"), f.count(">B2</text>")) for f in figures] == 3 * [(2, 2)]
 
 
-@pytest.mark.parametrize("names", [[f"M{k}" for k in range(1, 8)], list("abcdefghij"), [LONG, "M"]])
+RUNS = [f"Run of 2024-05-0{k} in the climate chamber, camera A" for k in (1, 2)]
+MORE = [*(f"{RUNS[0]}{k}" for k in "12"), RUNS[1]]
+
+
+@pytest.mark.parametrize("names", [[f"M{k}" for k in range(1, 8)], [LONG, "M"], RUNS, MORE])
 def test_a_legend_stays_in_its_drawing(names):
-    """The seventh series of a study was cut off."""
+    """The seventh series of a study was cut off; two with long names were one."""
     x = np.arange(3.0)
     drawing = draw_panel(Panel("c", "x in px", "y in px", tuple(Curve(n, x, x) for n in names)))
     drawing.draw_without_rendering()
-    assert drawing.axes[0].get_legend().get_window_extent().x1 <= drawing.bbox.x1
+    legend = drawing.axes[0].get_legend()
+    assert legend.get_window_extent().x1 <= drawing.bbox.x1
+    assert len({text.get_text() for text in legend.get_texts()}) == len(names)
+
+
+def test_series_that_differ_only_in_their_numbers_share_a_sentence(page_text):
+    """Seven series were fourteen nearly equal sentences."""
+    words = words_of(page_text("study-names"))
+    assert words.count("All 3 series: between ") == words.count("All 3 series: in 25 minutes") == 1
+    rates = [f"x₀ by {rate} px/K in {k} s" for k, rate in enumerate(("−0.35 ± 0.1", "+2", "−0.36"))]
+    assert spanned(rates) == "x₀ by −0.36 to +2 px/K in 0–2 s"
 
 
 def test_a_calibration_without_a_result_says_why(undrawn):

@@ -217,6 +217,7 @@ def test_the_order_of_day_month_and_year_is_found(tmp_path, rows, near, order, d
     ("gb18030", "时间;外壳温度(℃)", "外壳温度"), ("big5", "時間;溫度", "溫度"),
     ("euc-kr", "측정시간;온도(℃)", "온도"), ("cp1250", "Čas;Teplota", "Teplota"),
     ("cp1253", "Ώρα;Θερμοκρασία", "Θερμοκρασία"), ("cp1252", "Tid;Kåpa °C", "Kåpa"),
+    ("cp1252", "Zeit;Gerät ä ä (%);Gehäuse °C", "Gehäuse"),  # ä is a small delta in cp1253
     ("cp850", "Zeit;Gehäuse °C", "Gehäuse"), ("mac-roman", "Heure;Température °C", "Température"),
     *((utf, "Zeit;Gehäuse °C", "Gehäuse")
       for utf in ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be")),

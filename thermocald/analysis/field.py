@@ -407,9 +407,11 @@ def _remarks(check: FieldCheck) -> list[str]:
         notes.append(f"{outside} targets are outside of the image: step back, or look elsewhere")
     level, epoch = check.precision["level"][:3], check.precision["epoch"][:3]
     if np.all(np.isfinite(level)) and np.any(level > 2 * epoch):
+        sd = np.median(check.field.sigmas[check.visible])
         notes.append(
-            "the test field's own uncertainty limits the precision of the image: survey the field "
-            "(thermocald testfield survey)"
+            f"the coordinates of the targets, ± {sd:.2g} mm, limit the precision of one image (not "
+            "that of changes in a series): survey the field (thermocald testfield survey), or a "
+            "surveyed one again with more photographs and more accurate distances"
         )
     return notes
 

@@ -30,8 +30,7 @@ def import_(
     camera_timezone: str | None = expert(None, help="Time zone of the camera; overrides EXIF."),
     camera_clock: str = expert("0", help="Advance of the camera's clock, such as +00:03:12."),
     times: str = expert(
-        "exif",
-        help="Source of the photographs' times: exif, name (of the file), file (its date).",
+        "exif", help="Source of the photographs' times: exif, name (of the file), file (its date)."
     ),
     principal_distance: float | None = expert(
         None, help="Principal distance, mm; default: the focal length in EXIF.", min=0.1
@@ -147,7 +146,7 @@ def backup(
         to, store = to or store, str(load_config(config).store.path)
     if store is None or to is None:
         raise UsageError("give STORE and TO, or --config FILE and TO")
-    if to.endswith("/"):
+    if to.endswith("/") and Path(store).exists():
         make_folder(Path(to))
     document = back_up(Path(store), Path(to), keep)
     copied = f"{document['backup']}: {document['epochs']} epochs, every row verified"

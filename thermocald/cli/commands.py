@@ -161,7 +161,7 @@ class Command(TyperCommand):
         ]
         for name, value in values:
             if isinstance(value, float) and not math.isfinite(value):
-                raise UsageError(f"{options[name]}: {value} is no finite number")
+                raise UsageError(f"{options[name]}: {value} is not a finite number")
         if not ctx.params.get("dry_run"):
             _check_outputs(command, options, values)
         # an option that does nothing without another, or beside it

@@ -81,7 +81,7 @@ def _print_drift(document: dict[str, Any]) -> None:
     typer.echo("Drift from the first epoch to the hottest, px:")
     typer.echo("       true  estimated     sd  scatter / sd")
     for row in document["parameters"]:
-        drifts = f"{row['drift_in_px']:+8.3f}  {row['drift_found_px']:+9.3f}"
+        drifts = f"{row['drift_in_px']:+8.3f}  {row['drift_found_px']:+9.3f}".replace("-", "−")
         scatter = f"{row['sd_drift_found_px']:.3f}  {row['scatter_over_sd']:12.2f}"
         typer.echo(f"{row['name']:<2} {drifts}  {scatter}")
     typer.echo(f"store:     {document['store']}")

@@ -53,8 +53,7 @@ Free = Annotated[
 ]
 DEFAULT_FREE = "c,x0,y0,A1,A2,A3,B1,B2"
 Jobs = Annotated[
-    int,
-    expert(..., min=1, max=256, help="Number of processes; the results do not depend on it."),
+    int, expert(..., min=1, max=256, help="Number of processes; the results do not depend on it.")
 ]
 Exterior = Annotated[
     str,

@@ -142,11 +142,7 @@ def _sections(d: Discovery) -> list[Section]:
         *(_effect(e) for e in d.effects),
         *([_noise_test(d)] if tested else []),
         _candidates(d),
-        Section(
-            "Misfit of the base model, in numbers",
-            tables=(_misfit_table(d),),
-            folded=True,
-        ),
+        Section("Misfit of the base model, in numbers", tables=(_misfit_table(d),), folded=True),
     ]
 
 

@@ -69,7 +69,7 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
 
 def _plain(text: str) -> str:
     """Replace characters that could end a comment in C or a docstring."""
-    return re.sub(r"[^\w .:()+-]", "?", text, flags=re.ASCII)
+    return re.sub(r"[^\w .:()+-]", "?", text)
 
 
 def _row(values: Array | tuple[float, ...]) -> str:

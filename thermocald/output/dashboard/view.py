@@ -101,7 +101,8 @@ class View:
         names = list(self.status().get("cameras", {}))
         if name is None:
             if len(names) != 1:
-                raise DataError(f"give ?camera=NAME; the cameras are: {', '.join(names) or 'none'}")
+                asked = f"give ?camera=NAME; the cameras are: {', '.join(names)}"
+                raise DataError(asked if names else "no daemon runs that has a camera")
             name = names[0]
         row = self.last_epoch(name).get("row", {})
         if not row.get("opencv"):

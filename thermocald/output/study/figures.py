@@ -12,24 +12,39 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.arrays import spread_rows
-from thermocald.figures import BAND, GREY, PALETTE, Arrows, Curve, Figure, Panel, draw_matrix, thin
+from thermocald.figures import (
+    BAND,
+    GREY,
+    PALETTE,
+    Arrows,
+    Curve,
+    Figure,
+    Panel,
+    draw_matrix,
+    image_panel,
+    thin,
+)
 from thermocald.numbers import (
     UNITS,
+    distinct_names,
     enumerated,
     parameter_label,
     percent,
     plain,
+    spanned,
     superscript,
     with_sd,
+    without_numbers,
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from thermocald.analysis.study.study import CameraStudy, SeriesStudy
     from thermocald.arrays import Array
 
+_SEVERAL = 3  # series that are described together
 _DRAWN = 400  # points of a cloud
 FEWEST_FOR_R = 10  # epochs: fewer are correlated by chance
 _ALIKE = 0.005  # correlations that differ by less are printed alike
@@ -55,6 +70,31 @@ def _coloured(camera: CameraStudy) -> Iterator[tuple[SeriesStudy, str]]:
     """Yield each series with its colour."""
     for i, study in enumerate(camera.series):
         yield study, PALETTE[i % len(PALETTE)]
+
+
+def by_series(
+    camera: CameraStudy, texts: Iterable[tuple[SeriesStudy, str]], *, name_all: bool = True
+) -> list[str]:
+    """Return texts on single series, each once, with the names of its series in front.
+
+    From three series on, texts that differ only in their numbers are one, with the smallest and the
+    largest of them. name_all: whether a text on all series has their names too.
+    """
+    groups: dict[object, dict[str, list[str]]] = {}
+    for study, text in texts:
+        if text:
+            alike = without_numbers(text), tuple(t.name for t in study.series.thermometers)
+            groups.setdefault(alike, {}).setdefault(text, []).append(study.series.name)
+    said = []
+    for names in groups.values():
+        together = sum(map(len, names.values())) >= _SEVERAL
+        for shown in [list(names)] if together else [[text] for text in names]:
+            of = [name for text in shown for name in names[text]]
+            who = f"{enumerated(of)}: "
+            if len(of) == len(camera.series) and (len(of) >= _SEVERAL or not name_all):
+                who = f"All {len(of)} series: " if name_all else ""
+            said.append(who + spanned(shown))
+    return said
 
 
 def _free_parameters(camera: CameraStudy) -> list[str]:
@@ -121,17 +161,19 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
         rows = spread_rows(len(s), 600)
         curves.append(Curve(s.name, x[rows], y[rows], "line", colour))
         curves.append(Curve("", x[:1], y[:1], "points", "#000000"))
-        words.append(f"{s.name}: {_direction(float(x[-1]), float(y[-1]))}")
+        way = _direction(float(x[-1]), float(y[-1]))
         farthest = float(np.max(np.hypot(x, y)))
         if farthest > 1.5 * np.hypot(x[-1], y[-1]):
-            words[-1] += f" at the end, at most {plain(farthest, 'px', 3)} away"
+            way += f" at the end, at most {plain(farthest, 'px', 3)} away"
+        words.append((study, way))
     panel = Panel(
         "Path of the principal point", "Δx₀ in px, right", "Δy₀ in px, up", tuple(curves),
         equal=True,
     )  # fmt: skip
     return Figure(
         "principal-point", "Principal point",
-        f"The path of the principal point from its first position (black dot). {'; '.join(words)}.",
+        "The path of the principal point from its first position (black dot). "
+        f"{'; '.join(by_series(camera, words))}.",
         (panel,),
     )  # fmt: skip
 
@@ -149,29 +191,30 @@ def _direction(x: float, y: float) -> str:
 def _movement_figure(camera: CameraStudy) -> Figure | None:
     """Draw the directional zoom: the movement of the image of a static scene (Figures 4 and 6)."""
     moved = [
-        (study.series, colour, study.grid, study.displacement, study.displacement_covariance)
+        (study, colour, study.displacement)
         for study, colour in _coloured(camera)
         if study.displacement is not None and np.any(study.displacement)
     ]
     if not moved:
         return None
-    longest = max(float(np.linalg.norm(vectors, axis=1).max()) for *_, vectors, _ in moved)
+    longest = max(float(np.linalg.norm(vectors, axis=1).max()) for *_, vectors in moved)
+    titles = distinct_names([study.series.name for study, *_ in moved], 18)
     panels, words = [], []
-    for s, colour, grid, vectors, covariance in moved:
-        frame = (s.sensor.width, s.sensor.height)
-        arrows = Arrows(grid, vectors, frame, colour, longest)
-        panels.append(Panel(s.name, "x in px", "y in px, down", (), arrows=arrows))
+    for title, (study, colour, vectors) in zip(titles, moved, strict=True):
+        sensor, covariance = study.series.sensor, study.displacement_covariance
+        arrows = Arrows(study.grid, vectors, (sensor.width, sensor.height), colour, longest)
+        panels.append(image_panel(title, arrows=arrows))
         lengths = np.linalg.norm(vectors, axis=1)
         k = int(lengths.argmax())
         length, along = float(lengths[k]), vectors[k] / lengths[k]
         sd = float("nan") if covariance is None else float(np.sqrt(along @ covariance[k] @ along))
-        words.append(f"{with_sd(length, sd, 'px')} in {s.name}")
+        words.append((study, with_sd(length, sd, "px")))
     return Figure(
         "movement", "Movement of the image",
         "Movement of the points of a static scene in the image from the first to the last epoch, "
-        "caused by the change of the interior orientation. The largest "
-        f"movement is {enumerated(words)}. Equal arrows show a shift of the principal point; "
-        "arrows that point outwards show a longer principal distance.",
+        "caused by the change of the interior orientation. Equal arrows show a shift of the "
+        "principal point; arrows that point outwards show a longer principal distance. The largest "
+        f"movement: {'; '.join(by_series(camera, words))}.",
         tuple(panels), columns=2,
     )  # fmt: skip
 

@@ -27,6 +27,7 @@ from thermocald.numbers import (
 from thermocald.output.study import tables
 from thermocald.output.study.figures import (
     FEWEST_FOR_R,
+    by_series,
     dependence_figure,
     file_name,
     principal_point_figure,
@@ -38,7 +39,7 @@ from thermocald.result import document_of, jsonable
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from thermocald.analysis.study.measured import StudySettings
@@ -71,7 +72,7 @@ def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
                 _answer(camera, study.settings.distance_mm),
                 tuple(_sections(camera, study.settings)),
                 (f"{names}. Measured: {measured}.",),
-                (*map(as_sentence, _doubts(camera)), *_notes(camera)),
+                tuple(map(as_sentence, (*_doubts(camera), *_notes(camera)))),
             )
         )
     return render_report(title, chapters, _LEAD)
@@ -193,21 +194,9 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
     return (f"If the lens were {lens}, {change}. Neither was measured.",)
 
 
-def _once(texts: Iterable[tuple[str, SeriesStudy]]) -> dict[str, list[str]]:
-    """Return every text once, with the names of the series to which it applies."""
-    holders: dict[str, list[str]] = {}
-    for text, study in texts:
-        holders.setdefault(text, []).append(study.series.name)
-    return holders
-
-
 def _notes(camera: CameraStudy) -> list[str]:
-    found = _once((note, study) for study in camera.series for note in study.notes)
-    notes = [
-        note if len(names) == len(camera.series) else f"{', '.join(names)}: {note}"
-        for note, names in found.items()
-    ]
-    return notes + list(camera.notes)
+    found = ((study, note) for study in camera.series for note in study.notes)
+    return by_series(camera, found, name_all=False) + list(camera.notes)
 
 
 def _doubts(camera: CameraStudy) -> list[str]:
@@ -255,15 +244,14 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
 def answer_sentences(camera: CameraStudy, distance_mm: float) -> list[str]:
     """Return the results in sentences, the rates first, without those the data do not support."""
     mc = camera.montecarlo
-    sentences = [s for study in camera.series if (s := rates(study, distance_mm))]
-    sentences += [s for study in camera.series if (s := _change(study))]
+    sentences = by_series(camera, ((s, rates(s, distance_mm)) for s in camera.series))
+    sentences += by_series(camera, ((s, _change(s)) for s in camera.series))
     if mc is not None:
         sentences.append(
-            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
-            "about the series' mean with the correlations of an epoch's adjustment (the "
-            f"reference's procedure) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
-            f"average and up to {plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of "
-            f"{mc.sets:,} draws); "
+            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn from a normal "
+            "distribution (the reference's procedure) cause errors of "
+            f"{plain(mc.overall_mean / 10, 'cm', 3)} on average and up to "
+            f"{plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of {mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
         sentences += _trajectory(camera, mc.clusters_mm[0])
@@ -272,9 +260,8 @@ def answer_sentences(camera: CameraStudy, distance_mm: float) -> list[str]:
 
 def detail_sentences(camera: CameraStudy) -> list[str]:
     """Return sentences on the dependence on temperature, and on noise other than the stated."""
-    found = _once((text, study) for study in camera.series if (text := _dependence(study)))
-    sentences = [f"{', '.join(names)}: {text}." for text, names in found.items()]
-    return sentences + [s for study in camera.series if (s := _noise(study))]
+    said = ((study, text(study)) for text in (_dependence, _noise) for study in camera.series)
+    return by_series(camera, said)
 
 
 def rates(study: SeriesStudy, distance_mm: float) -> str:
@@ -309,7 +296,7 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
     rough = " (standard deviations are rough, because the series is short)"
     where = parameter_label(channel.thermometer.name)
     return (
-        f"{study.series.name}: between {low:.0f} and {high:.0f} °C "
+        f"between {low:.0f} and {high:.0f} °C "
         f"{'' if where == 'temperature' else f'({where}) '}{enumerated(parts)}"
         f"{rough if any(d.too_short for *_, d in found) else ''}."
     )
@@ -334,6 +321,8 @@ def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
         for one in camera.trajectories
     ]
     parts[0] = parts[0].replace(" with", " of the points with") + " held fixed"
+    if all(one.fractions[0] == 1 for one in camera.trajectories):
+        parts = ["all points, whichever of its interior orientations is held fixed"]
     text = (
         f"The camera, along its own path, stays within {limit_mm / 10:g} cm at {enumerated(parts)}."
     )
@@ -377,7 +366,7 @@ def _change(study: SeriesStudy) -> str:
     if not words:
         return ""
     time = duration(float(s.time_s[-1] - s.time_s[0]))
-    return f"{s.name}: in {time} {', and '.join(words)}{_warmed(study)}."
+    return f"in {time} {', and '.join(words)}{_warmed(study)}."
 
 
 def _distance(c: Deviation) -> str:
@@ -429,8 +418,8 @@ def _noise(study: SeriesStudy) -> str:
     if not np.isfinite(ratio) or 1 / _NOISE_AGREES <= ratio <= _NOISE_AGREES:
         return ""
     return (
-        f"{study.series.name}: neighbouring epochs scatter {ratio:.2f} times as much as the "
-        f"standard deviations state (σ₀ {study.series.rms_sigma0:.2f})."
+        f"neighbouring epochs scatter {ratio:.2f} times as much as the standard deviations state "
+        f"(σ₀ {study.series.rms_sigma0:.2f})."
     )
 
 
@@ -444,11 +433,11 @@ def _dependence(study: SeriesStudy) -> str:
     significant = [parameter_label(n) for n, d in found if d.p_holm < _SIGNIFICANT]
     name = parameter_label(channel.thermometer.name)
     if not significant:
-        return f"no parameter depends significantly on {name}"
+        return f"no parameter depends significantly on {name}."
     depends = "depends" if len(significant) == 1 else "depend"
     text = f"{enumerated(significant)} {depends} significantly on {name}"
     which = "" if close == significant else f" {enumerated(close)}"
-    return text + (f",{which or ' and'} closely (|r| ≥ {_CLOSE})" if close else "")
+    return text + (f",{which or ' and'} closely (|r| ≥ {_CLOSE})." if close else ".")
 
 
 def study_document(study: Study) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from thermocald.numbers import (
     UNITS,
     coefficient,
+    distinct_names,
     duration,
     p_text,
     parameter_label,
@@ -21,17 +22,14 @@ from thermocald.output.study.figures import cluster_names
 from thermocald.report import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping, Sequence
 
     from thermocald.analysis.study.measured import StudySettings
-    from thermocald.analysis.study.study import (
-        CameraStudy,
-        Deviation,
-        SeriesStudy,
-    )
+    from thermocald.analysis.study.study import CameraStudy, Deviation, SeriesStudy
     from thermocald.arrays import Array
 
 _Found = TypeVar("_Found")
+_NAME_LETTERS = 18  # as in legends
 _FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
 
 
@@ -72,10 +70,15 @@ def overview_table(camera: CameraStudy) -> Table:
 
 
 def _by_parameter(
-    found: Iterable[tuple[SeriesStudy, Mapping[str, _Found]]],
-) -> list[tuple[str, SeriesStudy, _Found]]:
-    """Return rows (parameter, series, result), the series of a parameter together."""
-    rows = [(name, study, result) for study, results in found for name, result in results.items()]
+    found: Sequence[tuple[SeriesStudy, Mapping[str, _Found]]],
+) -> list[tuple[str, SeriesStudy, _Found, str]]:
+    """Return rows (parameter, series, result, the series' short name) in order of parameters."""
+    short = distinct_names([study.series.name for study, _ in found], _NAME_LETTERS)
+    rows = [
+        (name, study, result, label)
+        for (study, results), label in zip(found, short, strict=True)
+        for name, result in results.items()
+    ]
     order = list(dict.fromkeys(name for name, *_ in rows))
     return sorted(rows, key=lambda row: order.index(row[0]))
 
@@ -98,7 +101,7 @@ def deviation_table(camera: CameraStudy) -> Table:
         _by_parameter([(study, study.deviations) for study in camera.series]),
         {
             "parameter": lambda r: parameter_label(r[0]),
-            "series": lambda r: r[1].series.name,
+            "series": lambda r: r[3],
             "first": lambda r: level(r[0], r[2], r[2].first),
             "last": lambda r: level(r[0], r[2], r[2].last),
             "last − first ± sd": lambda r: change(r[0], r[2].change, r[2].sd_change),
@@ -132,7 +135,7 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
         _by_parameter([(study, study.significance) for study in camera.series]),
         {
             "parameter": lambda r: parameter_label(r[0]),
-            "series": lambda r: r[1].series.name,
+            "series": lambda r: r[3],
             "success ratio": lambda r: percent(r[2].success_ratio),
             "median variance ratio": lambda r: plain(r[2].median_ratio, digits=3),
             "limit": lambda r: f"{r[2].critical:.3f}",
@@ -174,7 +177,7 @@ def dependence_tables(camera: CameraStudy) -> list[Table]:
             _by_parameter([(s, c.dependences) for s, c in channels]),
             {
                 "parameter": lambda r: parameter_label(r[0]),
-                "series": lambda r: r[1].series.name,
+                "series": lambda r: r[3],
                 "r": lambda r: coefficient(r[2].r),
                 "n": lambda r: f"{r[2].n}",
                 "n effective": lambda r: f"{r[2].n_effective:.0f}",

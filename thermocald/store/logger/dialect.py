@@ -304,7 +304,7 @@ def _count_words(text: str) -> int:
     """Return how many words for times, temperatures and others a text has in letters beyond A-Z."""
     patterns = (TIME_NAME, TEMPERATURE_NAME, OTHER_NAME)
     words = [found[0] for pattern in patterns for found in pattern.finditer(text)]
-    return sum(not word.isascii() and word not in _LETTERS_ALONE for word in words)
+    return sum(not word.isascii() and word.upper() not in _LETTERS_ALONE for word in words)
 
 
 def _detect_separator(path: Path, lines: list[str]) -> str:

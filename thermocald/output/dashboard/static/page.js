@@ -290,7 +290,7 @@ $("camera").addEventListener("change", () => {
   shownEpoch = null;
   $("frame").hidden = true;
   $("overlay").replaceChildren();
-  $("frame-caption").textContent = "no frame yet";
+  $("frame-caption").textContent = "no frame from a running daemon yet";
   show(status);
   refreshCourse();
 });

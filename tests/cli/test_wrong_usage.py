@@ -86,7 +86,7 @@ ONE_LINE = [
     ("fit M3 -o c.yaml --effect thermal_lag:tau=fast", "tau=fast is not a number"),
     ("fit M3 -o c.yaml --effect thermal_lag:", "no parameter after the colon; there are: tau"),
     ("fit M3 -o c.yaml --effect thermal_lag:tau", "tau has no value; give tau=VALUE"),
-    ("fit M3 -o c.yaml --effect thermal_lag:tau=-3", "negative"),
+    ("fit M3 -o c.yaml --effect thermal_lag:tau=-3", "not above 0"),
     ("fit M3 -o c.yaml --effect second_heat_source", "as in --effect second_heat_source:channel="),
     (
         "fit M3 -o c.yaml --effect second_heat_source:channel=bord_temperature",

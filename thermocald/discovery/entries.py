@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.numbers import parameter_label
+from thermocald.numbers import enumerated, parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined, unit_diagonal
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
@@ -110,16 +110,16 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
     if tau < _SURE * sd or off > chdtri(len(a) - 1, _UNLIKE):
         return None
     said = say_estimate(_make_estimate(tau, sd, "s"))
-    return _describe_lag(tau, said, off, own.parameters)
+    return _describe_lag(tau, said, off, ", ".join(own.parameters))
 
 
-def _describe_lag(tau: float, said: str, worse: float, explains: Sequence[str]) -> dict[str, Any]:
+def _describe_lag(tau: float, said: str, worse: float, explains: str) -> dict[str, Any]:
     return {
         "effect": "lagging_thermometer",
         "score_difference": worse,
         "values": {"tau": tau},
         "statement": f"the thermometer lags behind the camera by {said}: it explains "
-        f"{', '.join(explains)} by one number",
+        f"{explains} by one number",
         "experiment": "put a small, fast thermometer beside the present one and record again: a "
         "lag of the thermometer disappears, any other cause remains",
     }
@@ -164,10 +164,10 @@ def replace_by_lag(x: Examination) -> tuple[dict[str, Any], tuple[Term, ...]] | 
         if tried[fewest][0] > score + criteria.BAND:
             break
         left, (score, tau, terms) = ways[fewest], tried[fewest]
-    explained_by_it = [t.effect for t in found if t not in terms]
+    explained_by_it = enumerated([t.effect for t in found if t not in terms])
     if not explained_by_it or score > best.score or fit_beside(terms, tau).chi2 > best.fit.chi2:
         return None
-    about = f"about {tau:.0f} s"
+    about = f"about {tau:.0f} s, which fits better"
     return _describe_lag(tau, about, score - best.score, explained_by_it), terms
 
 

@@ -356,7 +356,7 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
         elif any(_shows_once(t, best.fitter.series) for t in mine):
             worse = s.fit.chi2 - best.fit.chi2
         # the determinant counts how much the readings' errors blur a rate, which excludes none
-        elif len(mine) == len(theirs) == 1 and theirs[0].kind.follows_rate:
+        elif len(mine) == len(theirs) == 1 and theirs[0].kind.follows_rate and not mine[0].is_drive:
             worse -= s.fit.logdet - best.fit.logdet
         close = worse < band
         different = sorted(s.names) != sorted(best.names)

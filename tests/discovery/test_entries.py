@@ -93,19 +93,31 @@ def test_only_what_follows_the_cameras_rates_may_be_a_lag_of_the_thermometer():
     assert alternative(2, **{n: -v for n, v in late.items()}) is None  # the thermometer is early
 
 
+def late(source, tau):
+    """Return a series whose thermometer lags by tau s."""
+    fine = np.arange(source.reading_times[0], source.reading_times[-1])
+    name, warm = next(iter(source.readings.items()))
+    slow = lagged(np.interp(fine, source.reading_times, warm), tau)
+    return replace(source, readings={name: np.interp(source.reading_times, fine, slow)})
+
+
 def test_a_slow_thermometer_is_offered_beside_a_negative_delay(evidence_of):
     """A lag of 12 s of the thermometer itself looks like a pure delay of as much."""
     (series,), _ = evidence_of(seed=2, epochs=60, with_m2=False)
-    source = series.source
-    fine = np.arange(source.reading_times[0], source.reading_times[-1])
-    name, warm = next(iter(source.readings.items()))
-    slow = np.interp(
-        source.reading_times, fine, lagged(np.interp(fine, source.reading_times, warm), 12.0)
-    )
 
-    (effect,) = discover_series([reduce_series(replace(source, readings={name: slow}))]).effects
+    (effect,) = discover_series([reduce_series(late(series.source, 12.0))]).effects
 
     assert (effect.effect, effect.alternative_names) == ("time_offset", ["lagging_thermometer"])
     assert effect.statement.startswith("the thermometer follows the camera after a pure delay of 1")
     assert abs(effect.alternatives[-1]["values"]["tau"] - 12.0) < 1.0
     assert "thermometer" in effect.alternatives[-1]["experiment"]
+
+
+def test_a_slow_thermometer_is_offered_where_a_gradient_has_other_proportions(evidence_of):
+    """Regression: of a lag of 40 s, a gradient 60 sd off the rates was named alone."""
+    (series,), _ = evidence_of("permanent_set", seed=2, epochs=100, with_m2=False)
+
+    found = discover_series([reduce_series(late(series.source, 40.0))])
+
+    assert found.headline.endswith("thermal_gradient or lagging_thermometer, and permanent_set")
+    assert abs(found.effects[0].alternatives[-1]["values"]["tau"] - 40.0) < 1.0

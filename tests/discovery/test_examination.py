@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from tests.blind.score import discover_case, judge_discovery
 from thermocald.discovery import examination
 from thermocald.discovery.evidence import find_displaced_targets
 from thermocald.discovery.result import build_model, discover_series
-from thermocald.discovery.search import Search
+from thermocald.discovery.search import Search, Solution
 from thermocald.discovery.validation import compare_with_surrogates
 from thermocald.output.discovery import report_html
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.reduce import reduce_series, reduce_together
 from thermocald.thermal.series import in_blocks
 
@@ -55,6 +57,22 @@ def test_a_step_of_the_last_epoch_may_be_any_cause_that_begins_there(discovered)
     """Regression: a large softening was named `slip` alone, with equal χ²."""
     found, _ = discovered("softening", px=5.0, seed=7031, epochs=33, with_m2=False)
     assert found.headline == "effects_found: slip or softening"
+
+
+def test_a_gradient_that_fits_better_is_not_excluded_by_the_errors_of_its_readings():
+    """Regression: of 25 epochs of a flat board with a gradient, a late mount alone was named."""
+
+    def fitted(effect, chi2, logdet):
+        fit = SimpleNamespace(
+            terms=(Term(effect),), chi2=chi2, logdet=logdet, objective=chi2 + logdet
+        )
+        return Solution(fit, (36.0,), SimpleNamespace(series=()))
+
+    best, gradient = fitted("mount_motion", 449.4, 108.3), fitted("thermal_gradient", 430.5, 192.4)
+    late = fitted("thermal_gradient", 490.0, 192.4)
+
+    assert examination._list_rivals(best, (best, gradient)) == (gradient,)
+    assert examination._list_rivals(best, (best, late)) == ()
 
 
 def test_epochs_with_few_targets_have_no_weight(evidence_of):

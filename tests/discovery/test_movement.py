@@ -177,3 +177,9 @@ def test_epochs_in_which_the_tripod_was_touched_are_left_out(effects, brief, sai
     assert touch["epochs"] == source.numbers[37 : 37 + brief].tolist()
     (line,) = mount_lines(found.examination)
     assert line.endswith(f"left out: {said}")
+
+
+def test_a_movement_of_the_interior_in_few_epochs_is_no_mount(discovered):
+    """Regression: an influence of |dT/dt| was `adequate` beside a mount that moved by 0.6 px."""
+    found, _ = discovered("outside", px=1.0, seed=5, epochs=37, with_m2=False, influence="abs_rate")
+    assert found.headline == "unexplained: unnamed"

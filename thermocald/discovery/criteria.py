@@ -23,6 +23,7 @@ BAND = 14.0  # a solution with a score worse by less is not excluded: odds of 1 
 DRIVES_BAND = 120.0  # the same in χ², for one drive in place of another. Scored
 LEFT_SHARE = 0.03  # share of the base model's misfit; a model that leaves less is adequate. Scored
 LEFT_PX = 0.025  # a third of the noise; a larger misfit shows, whatever the base model left. Scored
+LEFT_SIGMAS = 3.0  # sd of a misfit left by two effects, above which a thermometer's lag is tried
 FURTHER_PX = 0.005  # least size of an effect beside an adequate model: an eighth of the noise
 FURTHER_SHARE = 0.15  # the same, as a share of the first effect; less refines that one. Scored
 CURVATURE_PX = 0.001  # accuracy of the projection's curvature where the image moves by 10 px
@@ -36,6 +37,9 @@ SLIP_NOT_KNOCK = 20.0  # χ² by which an internal slip must fit better than a k
 MOUNT_FURTHER = 40.0  # least gain of a further effect: a mount is no exact random walk. Scored
 MOUNT_SHARE = 0.25  # the same, as a share of the first effect's gain. Scored
 MOUNT_WORSE = 0.25  # share of its gain in one series by which an effect may worsen another. Scored
+# sd by which a movement exceeds what the exterior orientation explains, in too few epochs for
+# SMOOTH: -2 in real corners, 97 and more where the camera's interior moved by 0.3 px. Scored
+INTERIOR = 60.0
 
 # -- validation --------------------------------------------------------------------------------
 

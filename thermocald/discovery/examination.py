@@ -20,6 +20,7 @@ from thermocald.discovery.mounted import (
     fit_beside_walk,
     is_convincing,
     make_own_rates,
+    moves_interior,
     search_beside_mount,
     split_knocks,
 )
@@ -354,6 +355,9 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
         # the determinant counts only how much the readings' errors blur this epoch
         elif any(_shows_once(t, best.fitter.series) for t in mine):
             worse = s.fit.chi2 - best.fit.chi2
+        # the determinant counts how much the readings' errors blur a rate, which excludes none
+        elif len(mine) == len(theirs) == 1 and theirs[0].kind.follows_rate and not mine[0].is_drive:
+            worse -= s.fit.logdet - best.fit.logdet
         close = worse < band
         different = sorted(s.names) != sorted(best.names)
         if different and close and s.names not in [r.names for r in out]:
@@ -464,15 +468,15 @@ def _examine_beside_mount(
     """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
     It is then an influence that was not recorded; None also if the series contradict each other or
-    if what is left is smooth but for kinks.
+    if what is left is smooth but for kinks, or moves the camera's interior.
     guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of
     a strong one look like it.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
-    fitter = HypothesisFitter(
+    still = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
-    shaken = HypothesisFitter(add_tremble(fitter, fitter.fit(guide.terms if guide else ())))
+    shaken = HypothesisFitter(add_tremble(still, still.fit(guide.terms if guide else ())))
     beside, ranking, seen, like = search_beside_mount(shaken, say, given, guide is not None)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))
@@ -486,7 +490,7 @@ def _examine_beside_mount(
         best, blocks, tests = _keep_named(search, base, whole, jobs)
     if not is_convincing(base, best):
         best, blocks, tests = base, [], ()
-    if contradict(best) or leaves_kinks(fitter, best.fit):
+    if contradict(best) or leaves_kinks(fitter, best.fit) or moves_interior(still, best.terms):
         return None
     tried = iter(beside.as_slips)
     as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)

@@ -12,9 +12,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from thermocald.discovery import criteria
 from thermocald.discovery.search import Search, Solution, by_score, say_searched
-from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, PARAMETER_NAMES
+from thermocald.photogrammetry.linalg import explained
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Proportional
 from thermocald.thermal.fit import HypothesisFitter
@@ -26,6 +29,8 @@ from thermocald.thermal.movement import (
     find_combinations,
     guess_mount_motion,
 )
+from thermocald.thermal.scan import ORDERS
+from thermocald.thermal.series import cosines, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -226,6 +231,28 @@ def make_own_rates(series: int, count: int) -> Term:
     along_T = catalogue.find(lambda k: getattr(k, "formula", "") == Proportional.formula).name
     fresh = tuple(() if k == series else None for k in range(count))
     return Term(along_T, BASE, fresh=fresh, through_drive=True)
+
+
+def moves_interior(fitter: HypothesisFitter, terms: Sequence[Term]) -> bool:
+    """Test whether terms leave a slow movement that moves more than the exterior orientation.
+
+    It is no movement of a mount, which moves the whole camera. In many epochs its smoothness tells
+    more, since errors of the temperature move the interior too. fitter: of the series without one.
+    """
+    if max(len(e.times) for e in fitter.series) >= criteria.NO_WALK_EACH:
+        return False
+    fit = fitter.fit(terms)
+    own = np.array([PARAMETER_NAMES.index(name) for name in EOP_NAMES])
+    for e, weighting, (C, V, index) in zip(fitter.series, fit.weightings, fit.designs, strict=True):
+        trajectories = cosines(e.times, min(ORDERS, len(e.times) // 2))[:, :, None]
+        A, c, B = weighting.scan(trajectories, unit_directions(PARAMETER_NAMES), (C, V))
+        rest = (c - B @ fit.coefficients[index])[..., None]
+        whole = explained(A, rest, 1e-9)
+        camera = explained(A[:, own[:, None], own], rest[:, own], 1e-9)
+        free = len(c) * (len(PARAMETER_NAMES) - len(own))
+        if float(np.sum(whole - camera)) - free > criteria.INTERIOR * np.sqrt(2.0 * free):
+            return True
+    return False
 
 
 def contradict(best: Solution) -> bool:

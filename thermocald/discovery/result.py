@@ -23,6 +23,7 @@ from thermocald.discovery.entries import (
     estimate_term,
     lagging_thermometer,
     list_image_effects,
+    replace_by_lag,
 )
 from thermocald.discovery.examination import Examination, examine_series
 from thermocald.discovery.gap import Gap, Stage, fit_first, measure_gap, measure_stage
@@ -245,10 +246,11 @@ def discover_series(
     if not x.adequate:
         return _conclude_unexplained(x, fits[0], stages, n, progress)
     estimated = estimate_first(x, fits[-1].terms) if len(terms) > known else None
+    lag = replace_by_lag(x)
     for k in range(known, len(terms)):
         stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
         assert estimated is not None
-        found.append(_describe_effect(x, fits[-1], estimated[1], k))
+        found.append(_describe_effect(x, fits[-1], estimated[1], k, lag))
     verdict = "effects_found" if found else "adequate"
     return Discovery(
         verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], estimated=estimated
@@ -268,8 +270,17 @@ def estimate_first(x: Examination, terms: Sequence[Term]) -> tuple[HypothesisFit
     return fitter, fit if delayed else fitter.refine_in(sharpen_trajectories(fitter, fit), fit)
 
 
-def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> EffectFound:
-    """Describe a term beyond the base model; both fits are of M1 alone."""
+def _describe_effect(
+    x: Examination,
+    fit: Fit,
+    estimated: Fit,
+    k: int,
+    lag: tuple[dict[str, Any], tuple[Term, ...]] | None,
+) -> EffectFound:
+    """Describe a term beyond the base model; both fits are of M1 alone.
+
+    lag: of the thermometer, and the effects left beside it, if it explains others better.
+    """
     term = fit.terms[k]
     e = x.fitter.series[0]
     number = k - len(x.base.terms)
@@ -305,7 +316,11 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
     if alternatives:
         names = ", ".join(a["effect"] for a in alternatives)
         statement += f". Alternatives not excluded: {names}"
-    if (lags := _find_lagging_thermometer(x, fit, k)) is not None:
+    if lag is not None and term not in lag[1]:
+        lags: dict[str, Any] | None = lag[0]
+    else:
+        lags = _find_lagging_thermometer(x, fit, k)
+    if lags is not None:
         alternatives.append(lags)
         statement += f". Or {lags['statement']}"
     if len(x.adequacy) < 2:

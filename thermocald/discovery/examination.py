@@ -348,15 +348,16 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
         mine = [t for t in best.terms if t.effect not in s.names]
         theirs = [t for t in s.terms if t.effect not in best.names]
         worse, band = s.score - best.score, criteria.BAND
+        single = len(mine) == len(theirs) == 1
         # one drive in place of another is compared by the fit alone
-        if len(mine) == len(theirs) == 1 and mine[0].kind.is_drive and theirs[0].kind.is_drive:
+        if single and mine[0].kind.is_drive and theirs[0].kind.is_drive:
             worse, band = s.fit.chi2 - best.fit.chi2, criteria.DRIVES_BAND
         # and so is a step that one epoch shows: any cause that begins there fits it as well, and
         # the determinant counts only how much the readings' errors blur this epoch
         elif any(_shows_once(t, best.fitter.series) for t in mine):
             worse = s.fit.chi2 - best.fit.chi2
         # the determinant counts how much the readings' errors blur a rate, which excludes none
-        elif len(mine) == len(theirs) == 1 and theirs[0].kind.follows_rate and not mine[0].is_drive:
+        elif single and theirs[0].kind.follows_rate and not mine[0].kind.is_drive:
             worse -= s.fit.logdet - best.fit.logdet
         close = worse < band
         different = sorted(s.names) != sorted(best.names)

@@ -174,8 +174,6 @@ class Calibrator(EpochCalibrator):
             if image is not None:
                 measured = self._tracker.measure(image)
                 seen = measured.observations
-                # a corner in a uniform area, as of a damaged JPEG, is none: it has no residuals
-                seen = seen.select(np.flatnonzero((seen.sigmas > 0).all(axis=1)))
                 epoch = replace(epoch, observations=seen)
                 extra = frame_figures(seen, self.sensor)
                 if not measured.status.ok:

@@ -136,8 +136,8 @@ class LiveState:
 
 
 def _beside(store: Path) -> Path:
-    place = os.path.realpath(store)  # the same through any link, as the -wal file
-    return Path(f"{place}.live")
+    # the same through any link, as the -wal file
+    return Path(f"{store.resolve() if store.is_symlink() else store}.live")
 
 
 def _without_secrets(value: Any) -> Any:

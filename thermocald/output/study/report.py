@@ -248,10 +248,11 @@ def answer_sentences(camera: CameraStudy, distance_mm: float) -> list[str]:
     sentences += by_series(camera, ((s, _change(s)) for s in camera.series))
     if mc is not None:
         sentences.append(
-            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn from a normal "
-            "distribution (the reference's procedure) cause errors of "
-            f"{plain(mc.overall_mean / 10, 'cm', 3)} on average and up to "
-            f"{plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of {mc.sets:,} draws); "
+            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
+            "about the series' mean with the correlations of an epoch's adjustment (the "
+            f"reference's procedure) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
+            f"average and up to {plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of "
+            f"{mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
         sentences += _trajectory(camera, mc.clusters_mm[0])

@@ -474,12 +474,13 @@ class QuantityReader:
     ) -> float:  # fmt: skip
         """Read the value of a quantity: at least `low`, more than `above`, at most `high`."""
         value, _ = self.quantity(key, unit, default)
+        given = f"is {value:g} {unit}".removesuffix(" 1")
         if value <= above:
-            raise self.fail(key, f"is {value:g} {unit}; it must be above {above:g}")
+            raise self.fail(key, f"{given}; it must be above {above:g}")
         if value < low:
-            raise self.fail(key, f"is {value:g} {unit}; it must be at least {low:g}")
+            raise self.fail(key, f"{given}; it must be at least {low:g}")
         if value > high:
-            raise self.fail(key, f"is {value:g} {unit}; it is at most {high:g}")
+            raise self.fail(key, f"{given}; it is at most {high:g}")
         return value
 
     def share(self, key: str, default: float) -> float:
@@ -498,7 +499,7 @@ class QuantityReader:
         """
         raw = self.mapping.get(key, default)
         if raw is None:
-            raise self.fail(key, f"is missing; it is a number in {unit}")
+            raise self.fail(key, f"is missing; it is a number in {unit}".removesuffix(" in 1"))
         sd: float | None = None
         if isinstance(raw, dict):
             inner = type(self)(self._path, raw, f"{self._prefix}{key}.")
@@ -530,7 +531,7 @@ class QuantityReader:
         """Read a whole number, at least 1."""
         value = self.number(key, unit, low=1, high=high)
         if value != int(value):
-            raise self.fail(key, f"is {value:g} {unit}; it must be a whole number")
+            raise self.fail(key, f"is {value:g}; it must be a whole number")
         return int(value)
 
     def inner(self, key: str) -> Self:

@@ -104,7 +104,7 @@ class Discovery(discoveries.Discovery, Result):
                 lines.append(
                     f"    probability of a false name {evidence['false_alarm_probability']:.3f} "
                     f"(gain {drawn['gain']:.0f}; the largest of {drawn['count']} surrogates "
-                    f"{drawn['gains_of_surrogates'][-1]:.0f})"
+                    f"{drawn['gains_of_surrogates'][-1]:.0f})".replace("-", "−")
                 )
             if proposal := evidence.get("proposal"):
                 lines.append(

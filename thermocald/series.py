@@ -353,7 +353,7 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
         if name not in IOP_NAMES:
             choices = ", ".join(IOP_NAMES)
             raise UsageError(
-                f"--free: {name!r} is no parameter of the interior orientation; give some of "
+                f"--free: {name!r} is not a parameter of the interior orientation; give some of "
                 f"{choices}, or none"
             )
         if names.count(name) > 1:

@@ -77,7 +77,7 @@ def test_a_store_and_its_recording_are_the_same_series(inside, short):
     np.testing.assert_allclose(a.values, b.values, rtol=1e-6)
     with pytest.raises(StoreError, match=r"camera/series in this store: rpi-v2\.1/M1"):
         tc.open("thermocald.db", "M7")
-    with pytest.raises(StoreError, match="is no store; give a recording's folder or a store"):
+    with pytest.raises(StoreError, match="is not a store; give a recording's folder or a store"):
         tc.open("M1/epochs.csv")
 
 

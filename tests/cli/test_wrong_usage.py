@@ -74,7 +74,7 @@ ONE_LINE = [
     ("study =M1", "the label before = is empty"),
     ("study M1=", "M1=: the recording or store after = is empty"),
     ("study M1 --exterior both", "one of per_epoch, series"),
-    ("study M1 --free c,z0", "'z0' is no parameter"),
+    ("study M1 --free c,z0", "'z0' is not a parameter"),
     ("fit 20=cold.json 20.3=warm.json -o c.yaml", "at least two temperatures"),
     ("fit warm=cold.json 50=warm.json -o c.yaml", "'warm' is not a temperature"),
     ("fit 20=cold.json 50=free.json -o c.yaml", "calibrate both with the same --free"),

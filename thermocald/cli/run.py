@@ -118,7 +118,7 @@ def dashboard(
     from thermocald.config import load_config
     from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
-    from thermocald.store.sources import is_store
+    from thermocald.store.sources import is_store, require_file
 
     names = name or []
     if config is not None:
@@ -133,7 +133,7 @@ def dashboard(
     if store is None:
         raise UsageError("give --store FILE or --config FILE")
     # with --config the page may be started before the daemon has created its store
-    if config is None and live is None and not is_store(store):
+    if config is None and live is None and not is_store(require_file(store)):
         what = "is not a store" if store.exists() else "does not exist"
         raise StoreError(f"{store}: {what}; give the store that the daemon writes")
     serve(store, lambda: live or find_state(store), host, port, token_file, names)
@@ -220,10 +220,11 @@ def keys() -> Iterator[Callable[[float], str]]:
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
     from thermocald.config import load_config
     from thermocald.daemon.live_state import running_status
+    from thermocald.store.sources import require_file
 
     if store is None:
         store = load_config(require_config(config, "--config FILE or --store FILE")).store.path
-    return running_status(store)
+    return running_status(require_file(store))
 
 
 def devices(json: opt.Json = None) -> None:

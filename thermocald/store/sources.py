@@ -45,7 +45,9 @@ def open_source(source: Path) -> SeriesReader:
         from thermocald.store.database.store import Store
 
         if source.suffix.lower() in _NO_STORES and source.is_file() and not is_database(source):
-            raise StoreError(f"{shown(source)}: is no store; give a recording's folder or a store")
+            raise StoreError(
+                f"{shown(source)}: is not a store; give a recording's folder or a store"
+            )
         opened = Store.open(source)
     opened.corrected = True
     return opened

@@ -214,7 +214,7 @@ def _movement_figure(camera: CameraStudy) -> Figure | None:
         "Movement of the points of a static scene in the image from the first to the last epoch, "
         "caused by the change of the interior orientation. Equal arrows show a shift of the "
         "principal point; arrows that point outwards show a longer principal distance. The largest "
-        f"movement: {'; '.join(by_series(camera, words))}.",
+        f"movement: {'; '.join(by_series(camera, words, name_all=False))}.",
         tuple(panels), columns=2,
     )  # fmt: skip
 

@@ -460,9 +460,9 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
         where = np.argwhere(failed)[0]
         point = np.asarray(image_points, dtype=float)[tuple(where)]
         raise GeometryError(
-            f"{int(failed.sum())} image points have no ray: the first is ({point[0]:.1f}, "
-            f"{point[1]:.1f}) px. The distortion of this camera model folds back there; use points "
-            "inside the area in which it was calibrated"
+            f"there is no ray for {int(failed.sum())} of {failed.size} image points: the first is "
+            f"({point[0]:.1f}, {point[1]:.1f}) px. The distortion of this camera model folds back "
+            "there; use points inside the area in which it was calibrated"
         )
     direction = np.stack([x, y, np.broadcast_to(-i[..., None, 0], x.shape)], axis=-1)
     unit: Array = direction / np.linalg.norm(direction, axis=-1, keepdims=True)

@@ -314,8 +314,8 @@ def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[
             "is the image size that of another camera, mode, or crop?"
         )  # fmt: skip
         found.append(
-            f"the principal point lies {x0 / pitch:+.0f}, {-y0 / pitch:+.0f} px off the centre of "
-            f"{W} × {H} px: {why}"
+            f"the principal point lies {x0 / pitch:+.0f}, {-y0 / pitch:+.0f} px".replace("-", "−")
+            + f" off the centre of {W} × {H} px: {why}"
         )
     return found
 

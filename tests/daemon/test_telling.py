@@ -122,4 +122,5 @@ def test_the_daemon_of_a_store_is_found_also_as_one_of_several(tmp_path, monkeyp
             live_state.LiveState(place).write_status({"store": {"path": str(store)}})
         (tmp_path / f"link-{name}.db").symlink_to(store)
         for same in (store, folder / "../.." / store.name, tmp_path / f"link-{name}.db"):
-            assert live_state.find_state(same) == (beside if name == "other" else folder)
+            found = live_state.find_state(same).resolve()
+            assert found == (beside if name == "other" else folder)

@@ -220,11 +220,10 @@ def keys() -> Iterator[Callable[[float], str]]:
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
     from thermocald.config import load_config
     from thermocald.daemon.live_state import running_status
-    from thermocald.store.sources import require_file
 
     if store is None:
         store = load_config(require_config(config, "--config FILE or --store FILE")).store.path
-    return running_status(require_file(store))
+    return running_status(store)
 
 
 def devices(json: opt.Json = None) -> None:

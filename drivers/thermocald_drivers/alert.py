@@ -139,15 +139,16 @@ class Temperature(Condition):
     """A channel's temperature."""
 
     temperature: support.Text
-    above_c: support.Celsius = math.inf
-    below_c: support.Celsius = -math.inf
+    above_c: support.Celsius | None = None
+    below_c: support.Celsius | None = None
     hysteresis_k: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
 
     @model_validator(mode="after")
     def _something_between(self) -> Self:
-        if math.isinf(self.above_c) and math.isinf(self.below_c):
+        low, high = self._limits
+        if math.isinf(low) and math.isinf(high):
             raise ConfigurationError(f"temperature {self.temperature} needs above_c or below_c")
-        if self.above_c - self.below_c <= 2 * self.hysteresis_k:
+        if high - low <= 2 * self.hysteresis_k:
             raise ConfigurationError(
                 f"temperature {self.temperature}: above_c must exceed below_c by more than twice "
                 f"hysteresis_k ({2 * self.hysteresis_k:g} K)"
@@ -158,10 +159,15 @@ class Temperature(Condition):
     def name(self) -> str:
         return self.temperature
 
+    @property
+    def _limits(self) -> tuple[float, float]:
+        low, high = self.below_c, self.above_c
+        return -math.inf if low is None else low, math.inf if high is None else high
+
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
         value = support.number_or_nan(result.get(self.temperature))
         words = f"{self.temperature} is {value:.1f} °C"
-        return Measured(value, self.below_c, self.above_c, self.hysteresis_k, words, " °C")
+        return Measured(value, *self._limits, self.hysteresis_k, words, " °C")
 
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]

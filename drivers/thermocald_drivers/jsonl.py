@@ -20,7 +20,9 @@ import select
 import stat
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from thermocald.errors import DeviceGone, DeviceTimeout, TransientDeviceError
 from thermocald.files import is_unmounted, mount_point
@@ -45,7 +47,7 @@ class JsonLinesOutput(Output):
 
     class Options(DriverOptions):
         path: support.Text
-        timeout_s: support.Seconds = 1.0
+        timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

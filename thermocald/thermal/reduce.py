@@ -372,7 +372,8 @@ def _reduce(
     weak = ~enough | touched
     N[weak], b[weak], yy[weak], count[weak], w[weak], v[weak] = 0.0, 0.0, 0.0, 0, 0.0, np.nan
     return ReducedSeries(
-        source, times, history, instruments, at, scale, A, N=N / variance, b=b / variance,
+        source=source, times=times, history=history, thermometers=instruments, at=at, scale=scale,
+        columns=A, N=N / variance, b=b / variance,
         yy=yy / variance, values=values, residuals=v, weights=w / variance, n=count,
         sigma0=sigma0 / np.sqrt(variance), variance=variance, correlation=_measure_correlation(v),
         hidden=group_hidden_targets(w / variance, misclosure - offsets, A), distortion=distortion,

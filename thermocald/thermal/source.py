@@ -348,6 +348,8 @@ def _start_input(
     camera = head.camera
     resolutions = {channel: c.resolution for channel, c in head.channels.items()}
     return SeriesInput(
-        name, camera.name, camera.sensor, field, camera.principal_distance, frame_times,
-        reading_times, readings, resolutions, grid, numbers, head.series, camera.interior,
+        name=name, camera=camera.name, sensor=camera.sensor, field=field,
+        principal_distance=camera.principal_distance, frame_times=frame_times,
+        reading_times=reading_times, readings=readings, resolutions=resolutions, grid=grid,
+        numbers=numbers, series=head.series, interior=camera.interior,
     )  # fmt: skip

@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import Maps
+from thermocald.analysis.thermal.thermal_camera import steady_camera
 from thermocald.arrays import eight_bit, full_scale
 from thermocald.errors import DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -129,8 +130,7 @@ def _predict(
         log.times, log.channels, times, extrapolate, relative_to=target,
         temperature_sd=temperature_sd,
     )  # fmt: skip
-    others = dict.fromkeys(camera.channels, target)  # as warm
-    return camera.at(target, channels=others, extrapolate=True), along
+    return steady_camera(camera, target), along
 
 
 _QUALITY = 95  # of a JPEG: its losses are below the noise of a camera
@@ -145,8 +145,7 @@ class FrameCorrector:
     def __init__(self, thermal: ThermalCamera, camera: str, origin: Sequence[float]) -> None:
         self.sensor, self.to = thermal.model.sensor, thermal.model.T0
         self._camera, self._origin = camera, list(origin)
-        others = dict.fromkeys(thermal.channels, self.to)  # as warm
-        self._steady = thermal.at(self.to, channels=others, extrapolate=True)
+        self._steady = steady_camera(thermal, self.to)
         self._maps = Maps(self._steady.sensor, self._steady.values, self.to)
 
     def correct(self, encoded: bytes, calibrated: CalibratedEpoch) -> bytes:

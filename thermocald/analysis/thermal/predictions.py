@@ -17,6 +17,7 @@ import numpy as np
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
 from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.thermal_camera import steady_camera
 from thermocald.errors import DataError, UsageError
 from thermocald.numbers import percent, plain
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
@@ -167,7 +168,7 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
     """Describe a camera, and its uncertainty and drift on a plane at `distance` m."""
     error = camera.object_error(distance * 1000.0)
     T0 = thermal.model.T0
-    reference = thermal.at(T0, channels=dict.fromkeys(thermal.channels, T0), extrapolate=True)
+    reference = steady_camera(thermal, T0)
     moved = camera.object_distance(reference, distance * 1000.0)
     document = {
         "format": "thermocald-prediction/1",

@@ -437,6 +437,11 @@ def load_camera(path: Path | str) -> ThermalCamera:
     return ThermalCamera(read_model(Path(path)))
 
 
+def steady_camera(thermal: ThermalCamera, T: float) -> Camera:
+    """Return the camera in which every thermometer shows T °C, also beyond the model's validity."""
+    return thermal.at(T, channels=dict.fromkeys(thermal.channels, T), extrapolate=True)
+
+
 def _push(followers: list[Any], time: float, value: float) -> Array:
     """Pass a reading °C through the followers; return the temperature that drives now, (1,) °C."""
     for one in followers:
@@ -562,8 +567,7 @@ class LiveCamera:
             raise UsageError("there is no reading yet: call update(time, temperature) first")
         target = self.thermal.model.T0 if to is None else to
         if self._maps is None or self._maps.to != target:
-            others = dict.fromkeys(self.thermal.channels, target)  # as warm
-            steady = self.thermal.at(target, channels=others, extrapolate=True)
+            steady = steady_camera(self.thermal, target)
             self._maps = Maps(steady.sensor, steady.values, target)
         return self._maps.of(self._now.values)
 

@@ -531,7 +531,8 @@ class QuantityReader:
         """Read a whole number, at least 1."""
         value = self.number(key, unit, low=1, high=high)
         if value != int(value):
-            raise self.fail(key, f"is {value:g}; it must be a whole number")
+            given = f"is {value:g} {unit}".removesuffix(" 1")
+            raise self.fail(key, f"{given}; it must be a whole number")
         return int(value)
 
     def inner(self, key: str) -> Self:

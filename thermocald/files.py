@@ -39,7 +39,7 @@ _ADVICE = {
     errno.EROFS: "; choose another folder",
     errno.ENOSPC: "; free some space",
     errno.EDQUOT: "; free some space",
-    errno.ENOENT: "; its folder does not exist",
+    errno.ENOENT: "; its folder does not exist: make it, or mount its disk",
     errno.EISDIR: "; give the name of a file in it",
     errno.EEXIST: "; choose another name",
 }

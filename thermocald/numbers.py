@@ -30,6 +30,17 @@ _UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
 _MEASURED = re.compile(r"(?<![\w.,-])[+−]?\d[\d,]*(?:\.\d+)?(?: ± [\d.]*\d)?(?!\w)")
 _DEGREES = re.compile(r"(?<=[\d)] )degC\b")
 _MINUS = "−"
+_LETTERS = {"c": "degC", "℃": "degC", "k": "K"}  # others, also 华, stand for °F
+_STATED = re.compile(
+    r"(?:°|º|˚|(?<![^\W\d_])deg(?:rees?|\.)?|(?<![^\W\d_])grad)[\s_-]*(?P<degree>[CFK])(?![^\W\d_])"
+    r"|(?<![^\W\d_])(?P<before>[CFK])\s?[°º˚]"
+    r"|[(\[{<]\s*[o*]?(?P<bracket>[CFK])\.?\s*[)\]}>,]"
+    r"|(?P<word>celsius|f\w?[ah]r?h?r?[ae]n?h?ei[td]|fahr(?![^\W\d_])|kelvin)"
+    r"|(?P<sign>[℃℉])|(?P<chinese>[华華]氏)"
+    r"|te?mp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
+    r"|[_,/]\s*(?P<tail>[CFK])$",
+    re.IGNORECASE,
+)
 
 
 def parameter_label(name: str) -> str:
@@ -48,6 +59,26 @@ def column_label(name: str) -> str:
         r"[\s,(_]*(?:(?:°\s?|deg)[CFK][\W_]+)?(?<![^\W_])(?:LGR|SEN)(?![^\W_]).*\d", name
     )
     return (name[: serial.start()] if serial else "") or name
+
+
+def stated_unit(text: str) -> str | None:
+    """Return the unit, one of `UNITS`, that a column's head or a reading states, or None.
+
+    `(F)`, `[F]`, `°F`, `ºF`, `℉`, `degF`, `deg. F`, `TempF`, `temp_f`, `Temperature, F` and
+    `Fahrenheit` are equivalent.
+    """
+    found = _STATED.search(text)
+    if found is None:
+        return None
+    return _LETTERS.get(next(filter(None, found.groups()))[0].lower(), "degF")
+
+
+def without_unit(text: str) -> str:
+    """Return a column's head without the unit that it states: `Temp` of `Temp (°F)`, `temp_f`."""
+    while found := _STATED.search(text):
+        begin = found.start("temp") if found["temp"] else found.start()
+        text = f"{text[:begin]} {text[found.end() :]}"
+    return " ".join(text.split()).replace("_ _", "_").strip(" _.,/-()[]{}")
 
 
 def shortened(text: str, most: int) -> str:

@@ -67,6 +67,7 @@ ONE_LINE = [
     ("dashboard --store notes.txt", "notes.txt: is not a"),
     ("dashboard --store no.db", "no.db: does not exist"),
     ("archive postgresql://u@h/db", "postgresql://h/db: is a server; this command needs a store's"),
+    ("status --store postgresql://u@h/db", "postgresql://h/db: is a server; this command needs"),
     ("check postgresql://u@h/db", "postgresql://h/db: is a server; this command needs a store's"),
     ("study", "give recordings or stores"),
     ("study nowhere", "nowhere: does not exist"),

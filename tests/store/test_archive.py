@@ -34,7 +34,7 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch, monkeypatch)
 
     def times_and_one_more(*given):
         times = series_times(*given)
-        store.append(series, make_epoch(21))
+        store.append(series, make_epoch(21), extra={"camera_focus": 0.3})
         return times
 
     monkeypatch.setattr(archive, "series_times", times_and_one_more)
@@ -43,6 +43,7 @@ def test_a_series_becomes_a_recording(filled, tmp_path, make_epoch, monkeypatch)
     assert replace(recording.head, extra={}) == series.head
     assert recording.head.extra == {"start": "cold", "device": {"serial": "x1"}}
     assert recording.testfield.names == series.testfield.names
+    assert recording.further_columns()["camera_focus"][20:].tolist() == [0.3]
     for epoch, made in zip(recording.epochs, map(make_epoch, range(1, 22)), strict=True):
         assert (epoch.number, epoch.temperatures) == (made.number, made.temperatures)
         assert epoch.frame_time == pytest.approx(made.frame_time, abs=1e-6)

@@ -6,6 +6,7 @@ import sqlite3
 import threading
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,15 +85,19 @@ def test_what_cannot_be_stored_is_refused_and_leaves_nothing(filled, make_epoch,
 
 def test_a_later_calibration_replaces_what_is_read_but_not_what_is_kept(filled, make_result):
     store, series = filled
-    store.append(series, Epoch(21, 1.6e9 + 210, np.nan, {"temperature": 30.0}), None)
+    without = Epoch(21, 1.6e9 + 210, np.nan, {"temperature": 30.0})
+    store.append(series, replace(without, frame=Path("21.jpg")), None)
+    store.append(series, replace(without, number=22), None)  # no frame to calibrate it from
+    assert store.deferred_epochs(series, 1, 22, 9) == [21]
     assert store.series_columns(series, ["status"])["status"][-1] == NOT_CALIBRATED
     for number, made in ((21, 21), (4, 400), (4, 401)):
         store.amend(series, number, make_result(made))
+    assert store.deferred_epochs(series, 1, 22, 9) == []
     assert store.examine().epochs == store.last_epoch(series)  # a later calibration is no epoch
     (stored,) = store.epochs(series, 4, 4)
     assert stored.result.values.tolist() == make_result(401).values.tolist()
     assert (stored.revision, stored.extra, len(stored.epoch.observations)) == (2, {"blur": 2.0}, 12)
-    assert [s.epoch.number for s in store.epochs(series)] == list(range(1, 22))
+    assert [s.epoch.number for s in store.epochs(series)] == list(range(1, 23))
     with pytest.raises(StoreError, match="has no epoch 99"):
         store.amend(series, 99, make_result(1))
 

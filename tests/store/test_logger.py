@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from thermocald.errors import DataError, UsageError
+from thermocald.numbers import stated_unit
 from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment, time_zone
-from thermocald.store.logger.dialect import stated_unit
 from thermocald.store.logger.options import LogOptions, log_options
 from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import read_log
@@ -34,7 +34,8 @@ def rows_of(row: str, celsius=CELSIUS) -> list[str]:
     return [
         row.format(m=m, b=m + timedelta(hours=2), e=m - timedelta(hours=5), s=int(m.timestamp()),
                    t=t, c=f"{t:.2f}".replace(".", ","), f=1.8 * t + 32, k=t + 273.15, i=i + 1,
-                   d=round(10 * t), day=m.timestamp() / 86400 + 25569 + 2 / 24)
+                   d10=m.replace(tzinfo=None) + timedelta(hours=10), d=round(10 * t),
+                   day=m.timestamp() / 86400 + 25569 + 2 / 24)
         for i, (m, t) in enumerate(zip(MOMENTS, celsius, strict=True))
     ]  # fmt: skip
 
@@ -71,6 +72,10 @@ LOGS = {
     "NOAA, tenths and a code": ("DATE,TMP", '"{m:%Y-%m-%dT%H:%M:%SZ}","+0{d},1"'),
     "Excel in Korean": ("날짜;온도", "{b:%Y-%m-%d} 오후 {b:%I:%M:%S};{t:.2f}"),
     "HOBOware in Swedish": ("#,Datum Tid,Temp", "{i},{b:%m/%d/%y %I:%M:%S} em,{t:.2f}"),
+    "each line begins with a mark of UTF-16": ("\ufeffZeit;T °C", "\ufeff{b:%d.%m.%Y %X};{c}"),
+    "R leaves out the time of midnight": ("time (UTC+10:00),T °C", [
+        row.replace(" 00:00:00", "") for row in rows_of("{d10},{t:.2f}")]),
+    "pressures with a mark of thousands": ("Zeit;hPa;T °C", "{b:%d.%m.%Y %X};1.013;{c}"),
     "Windows in Hungarian": ("Dátum;Temp", "{b:%Y. %m. %d. %H:%M:%S};{c}"),
     "spaces, as a shell writes vcgencmd": ("", "{b:%Y-%m-%d %H:%M:%S}  temp={t:.2f}'C"),
     "commas, as a shell writes vcgencmd": ("", "{m:%Y-%m-%dT%H:%M:%S}Z,temp={t:.2f}'C"),
@@ -216,6 +221,7 @@ def test_the_order_of_day_month_and_year_is_found(tmp_path, rows, near, order, d
     ("shift_jis", "日時;湿度;筐体温度[℃]", "筐体温度"), ("euc-jp", "時刻;気温", "気温"),
     ("gb18030", "时间;外壳温度(℃)", "外壳温度"), ("big5", "時間;溫度", "溫度"),
     ("euc-kr", "측정시간;온도(℃)", "온도"), ("cp1250", "Čas;Teplota", "Teplota"),
+    ("cp1250", "Data;Temperatura wewnętrzna", "Temperatura wewnętrzna"),
     ("cp1253", "Ώρα;Θερμοκρασία", "Θερμοκρασία"), ("cp1252", "Tid;Kåpa °C", "Kåpa"),
     ("cp1252", "Zeit;Gerät ä ä (%);Gehäuse °C", "Gehäuse"),  # ä is a small delta in cp1253
     ("cp850", "Zeit;Gehäuse °C", "Gehäuse"), ("mac-roman", "Heure;Température °C", "Température"),

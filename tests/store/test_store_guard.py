@@ -10,11 +10,13 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tests.store.small import stored_numbers, write_recording
 from thermocald.daemon.store_guard import Row, StoreGuard
 from thermocald.errors import RecordingError, StoreBusyError, StoreError, StoreFullError
+from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database import file
 from thermocald.store.database.store import Store
 
@@ -152,6 +154,13 @@ def test_a_full_disk(store, series, make_epoch, make_result, small_disk):
     with pytest.raises(StoreError, match="disk"):
         append(last + 1)
     assert store.last_epoch(series) == last
+
+
+def test_a_store_without_room_for_its_first_series_is_removed(store, head, field):
+    store._db.execute("PRAGMA max_page_count = 1")
+    with pytest.raises(StoreFullError, match="series 'M1' was not begun: the disk is full"):
+        store.create_series(head, TestField.build([str(i) for i in range(999)], np.ones((999, 3))))
+    assert not store.path.exists()
 
 
 def test_the_wal_file_takes_a_quarter_of_a_small_disk(

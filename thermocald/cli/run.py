@@ -56,6 +56,7 @@ def run(
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import load_driver
+    from thermocald.store.server.connection import require_file
 
     if sum([config is not None, mock, recording is not None]) > 1:
         raise UsageError("give one of --config FILE, --mock, --recording FOLDER")
@@ -64,7 +65,7 @@ def run(
 
     def with_options(read: Config) -> Config:
         page = {"enabled": True} if dashboard else {}
-        place = {} if store is None else {"path": store.absolute()}
+        place = {} if store is None else {"path": require_file(store).absolute()}
         return read.model_copy(
             update={
                 "store": read.store.model_copy(update=place),
@@ -118,7 +119,8 @@ def dashboard(
     from thermocald.config import load_config
     from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve
-    from thermocald.store.sources import is_store, require_file
+    from thermocald.store.server.connection import require_file
+    from thermocald.store.sources import is_store
 
     names = name or []
     if config is not None:
@@ -220,10 +222,11 @@ def keys() -> Iterator[Callable[[float], str]]:
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
     from thermocald.config import load_config
     from thermocald.daemon.live_state import running_status
+    from thermocald.store.server.connection import require_file
 
     if store is None:
         store = load_config(require_config(config, "--config FILE or --store FILE")).store.path
-    return running_status(store)
+    return running_status(require_file(store))
 
 
 def devices(json: opt.Json = None) -> None:

@@ -90,7 +90,7 @@ _FAILED = 20  # epochs in a row without a result, which are reported
 _REMEMBERED = 200  # epochs, as many as a `RunningSeries` holds
 _LATEST = 4000  # epochs whose readings still act on effects with a memory
 _DETAILED = 100
-_CATCH_UP_BATCH = 200
+_CATCH_UP_BATCH, _SEARCHED_AT_ONCE = 200, 10_000
 
 
 @dataclass(eq=False)
@@ -368,22 +368,24 @@ class SeriesRun:
     def backlog(self, below: int) -> Epoch | None:
         """Return the oldest epoch that was stored without calibration and still has its frame.
 
-        A call searches at most 200 epochs, each once: all of a year take minutes, in which new
-        epochs would wait for their calibration.
+        A call searches some epochs, each once: all of a year take minutes, in which new epochs
+        would wait for their calibration.
         """
         series, first = self.series, self._searched_to + 1
         if series is not None and not self._backlog and first < below:
             try:
                 end = min(below - 1, self._guard.last_epoch(series, waiting=False))
+                end = min(end, first + _SEARCHED_AT_ONCE - 1)
+                found = self._guard.store.deferred_epochs(series, first, end, _CATCH_UP_BATCH)
                 # not tried again if they cannot be read: a damaged row stays damaged
-                self._searched_to = max(self._searched_to, min(end, first + _CATCH_UP_BATCH - 1))
-                for stored in self._guard.epochs(series, first, self._searched_to, details=False):
-                    frame = stored.epoch.frame
-                    if stored.result.status == NOT_CALIBRATED and frame is not None:
-                        path = self.frames.root / frame
-                        if path.is_file():
-                            self._backlog.append(replace(stored.epoch, frame=path))
-                            self.pipeline.dropped += stored.epoch.number < self.first
+                end = found[-1] if len(found) == _CATCH_UP_BATCH else end
+                self._searched_to = max(self._searched_to, end)
+                for number in found:
+                    (stored,) = self._guard.epochs(series, number, number, details=False)
+                    path = self.frames.root / (stored.epoch.frame or "")
+                    if path.is_file():
+                        self._backlog.append(replace(stored.epoch, frame=path))
+                        self.pipeline.dropped += number < self.first
             except StoreError as error:
                 log.warning("epochs with a deferred calibration cannot be read: %s", error)
         return self._backlog.pop(0) if self._backlog else None

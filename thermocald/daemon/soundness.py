@@ -17,7 +17,7 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
-from thermocald.store.sources import require_file
+from thermocald.store.server.connection import require_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

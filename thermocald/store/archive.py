@@ -15,7 +15,8 @@ from thermocald.result import csv_text
 from thermocald.store.database.store import Store
 from thermocald.store.recording.writer import RecordingWriter
 from thermocald.store.series import series_times
-from thermocald.store.sources import require_file, stored_log
+from thermocald.store.server.connection import require_file
+from thermocald.store.sources import stored_log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -74,9 +75,10 @@ def archive_series(
     """Write a series as a recording, in constant memory.
 
     frames: the folder to which paths of frames are relative; a frame that is not there is left out.
-    The head also holds `start`, `device` and `calibration` of the stored series. Times are
-    corrected (`series_times`); steps back of the clock are in the head as `clock_set_back`
-    [{epoch, seconds}]. Raises RecordingError, StoreError.
+    The head also holds `start`, `device` and `calibration` of the stored series, epochs.csv what
+    the frames reported of the camera's settings (`camera_…`). Times are corrected (`series_times`);
+    steps back of the clock are in the head as `clock_set_back` [{epoch, seconds}]. Raises
+    RecordingError, StoreError.
     """
     times = series_times(store, series)
     set_back = (-np.diff(times.corrections)).tolist()
@@ -91,7 +93,9 @@ def archive_series(
     known = {key: value for key, value in known.items() if value}
     head = replace(series.head, extra={**series.head.extra, **known})
     folder = FileFolder(frames or Path())
-    further = series.settings.get("columns", ())
+    extra = {name for stored in store.epochs(series, details=False) for name in stored.extra}
+    reported = sorted(name for name in extra if name.startswith("camera_"))
+    further = dict.fromkeys([*series.settings.get("columns", ()), *reported])
     with RecordingWriter(path, head, series.testfield, further) as writer:
         if (log := stored_log(store, series)) is not None:
             writer.keep_readings(log)

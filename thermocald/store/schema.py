@@ -92,6 +92,8 @@ _FILE_1 = (
         for change in ("update", "delete")
     ),
     "CREATE INDEX epoch_revised ON epoch (series_id, number) WHERE revision > 0",
+    """CREATE INDEX epoch_deferred ON epoch (series_id, number)
+        WHERE status = 'not_calibrated' AND frame <> ''""",
     # derived from `epoch`: whole columns as arrays, up to the row `last_id`
     """CREATE TABLE column_chunk (
         id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL REFERENCES series(id),

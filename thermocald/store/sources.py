@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import StoreError, UsageError
+from thermocald.errors import StoreError
 from thermocald.files import is_database, shown
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.observation_file import grid_runs
@@ -56,13 +56,6 @@ def open_source(source: Path) -> SeriesReader:
 def is_store(source: Path) -> bool:
     """Return whether a source is a store: a server's address, or a file that SQLite wrote."""
     return is_server(source) or is_database(source)
-
-
-def require_file(source: Path) -> Path:
-    """Return the path of a store. Raises UsageError for a server's address."""
-    if is_server(source):
-        raise UsageError(f"{source_name(source)}: is a server; this command needs a store's file")
-    return source
 
 
 def source_name(source: Path) -> str:

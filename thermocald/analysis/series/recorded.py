@@ -30,7 +30,8 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.sense import target_doubts
 from thermocald.store.schema import COLUMN_NAMES
 from thermocald.store.series import EpochResult, LoggedReading
-from thermocald.store.sources import StoredRecording, require_file
+from thermocald.store.server.connection import require_file
+from thermocald.store.sources import StoredRecording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

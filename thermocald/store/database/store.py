@@ -129,6 +129,18 @@ class Store(SeriesReader):
             f"{found!r}; restore a backup"
         )
 
+    def deferred_epochs(self, series: StoredSeries, first: int, last: int, most: int) -> list[int]:
+        """Return numbers from `first` to `last` of epochs to be calibrated from their frames."""
+        with self._reads("epochs") as connection:
+            found = connection.execute(
+                "SELECT number FROM epoch e WHERE series_id = ? AND number BETWEEN ? AND ? AND "
+                f"status = '{NOT_CALIBRATED}' AND frame <> '' AND NOT EXISTS (SELECT 1 FROM epoch "
+                "WHERE series_id = e.series_id AND number = e.number AND revision > e.revision) "
+                "ORDER BY number LIMIT ?",
+                (series.id, first, last, most),
+            )
+            return [number for (number,) in found]
+
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
@@ -314,16 +326,19 @@ class Store(SeriesReader):
         parse_head(head_document(head), self.path)  # refuses what could not be read again
         file_name(head.camera.name, "camera", StoreError)
         file_name(head.series, "series", StoreError)
-        with self._transaction(f"series {head.series!r} was not begun"):
-            if self.series_of(head.camera.name, head.series) is not None:
-                raise StoreError(
-                    f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
-                    "already; choose another name"
-                )
-            begun = StoredSeries(
-                0, head, testfield, start, identity or {}, settings or {}, created_utc
-            )
-            epochs.insert_series(self._db, begun)
+        begun = StoredSeries(0, head, testfield, start, identity or {}, settings or {}, created_utc)
+        try:
+            with self._transaction(f"series {head.series!r} was not begun"):
+                if self.series_of(head.camera.name, head.series) is not None:
+                    raise StoreError(
+                        f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
+                        "already; choose another name"
+                    )
+                epochs.insert_series(self._db, begun)
+        except StoreFullError:
+            if self._file is not None and not self.all_series():
+                self._file.discard_new()
+            raise
         return self.find_series(head.camera.name, head.series)
 
     def append(

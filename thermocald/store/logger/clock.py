@@ -269,6 +269,11 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     raise ValueError(f"{text[:40]!r} is not a time")
 
 
+def day_begin(moment: date) -> datetime:
+    """Return midnight of a date; a date with a time as it is."""
+    return moment if isinstance(moment, datetime) else datetime.combine(moment, time())
+
+
 def parse_serial(text: str) -> datetime:
     """Parse a spreadsheet's number of days since 1899-12-30. Raises ValueError for other text.
 

@@ -31,39 +31,8 @@ if TYPE_CHECKING:
 
 UNITS = ("degC", "K", "degF")
 
-_LETTERS = {"c": "degC", "℃": "degC", "k": "K"}  # others, also 华, stand for °F
-_STATED = re.compile(
-    r"(?:°|º|˚|(?<![^\W\d_])deg(?:rees?|\.)?|(?<![^\W\d_])grad)[\s_-]*(?P<degree>[CFK])(?![^\W\d_])"
-    r"|(?<![^\W\d_])(?P<before>[CFK])\s?[°º˚]"
-    r"|[(\[{<]\s*[o*]?(?P<bracket>[CFK])\.?\s*[)\]}>,]"
-    r"|(?P<word>celsius|f\w?[ah]r?h?r?[ae]n?h?ei[td]|fahr(?![^\W\d_])|kelvin)"
-    r"|(?P<sign>[℃℉])|(?P<chinese>[华華]氏)"
-    r"|te?mp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
-    r"|[_,/]\s*(?P<tail>[CFK])$",
-    re.IGNORECASE,
-)
 UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|'C|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
 """The unit behind a reading."""
-
-
-def stated_unit(text: str) -> str | None:
-    """Return the unit, one of `UNITS`, that a column's head or a reading states, or None.
-
-    `(F)`, `[F]`, `°F`, `ºF`, `℉`, `degF`, `deg. F`, `TempF`, `temp_f`, `Temperature, F` and
-    `Fahrenheit` are equivalent.
-    """
-    found = _STATED.search(text)
-    if found is None:
-        return None
-    return _LETTERS.get(next(filter(None, found.groups()))[0].lower(), "degF")
-
-
-def without_unit(text: str) -> str:
-    """Return a column's head without the unit that it states: `Temp` of `Temp (°F)`, `temp_f`."""
-    while found := _STATED.search(text):
-        begin = found.start("temp") if found["temp"] else found.start()
-        text = f"{text[:begin]} {text[found.end() :]}"
-    return " ".join(text.split()).replace("_ _", "_").strip(" _.,/-()[]{}")
 
 
 def to_celsius(values: Array, unit: str) -> Array:
@@ -76,7 +45,7 @@ def to_celsius(values: Array, unit: str) -> Array:
 OUR_TIMES = ("time", "temperature_time", "frame_time", "timestamp")
 """Names of columns of seconds in this program's files, which may count from any day."""
 TIME_NAME = re.compile(
-    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|changed|\btid|时间|日期|時間|日時|時刻|日付"
+    r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|changed|czas|godzin|\btid|时间|日期|時間|日時|時刻|日付"
     r"|시간|날짜|일시|дата|врем|čas|ώρα",
     re.IGNORECASE,
 )
@@ -97,6 +66,7 @@ _ENCODINGS = (
 """Encodings that are tried after those of Western Europe and China."""
 _LETTERS_ALONE = "\u03a9\u2126\u0394"  # ohm and delta, which are part of Greek words too
 _DECIMAL = re.compile(r"[+-]?\d+([.,])\d+\s*[^\d\s.,:]{0,4}")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 _CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
@@ -235,9 +205,9 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    # `temp=` of vcgencmd, a head of NumPy
-    plain = (line.replace("−", "-").replace("temp=", "") for line in lines)
-    if mark == " ":
+    # `temp=` of vcgencmd, NULs after a power cut, a mark of UTF-16 written with each line
+    plain = (re.sub("temp=|[\0\ufeff]", "", line.replace("−", "-")) for line in lines)
+    if mark == " ":  # a head of NumPy
         plain = (line.removeprefix("# ") for line in plain)
     reader = csv.reader(plain, delimiter=mark, skipinitialspace=True)
     try:
@@ -272,7 +242,7 @@ def _detect_encoding(path: Path) -> str:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; split it")
     try:
         with path.open("rb") as file:
-            head = file.read(4096)
+            head = re.sub(rb"\0{8,}", b"", file.read(4096))  # a power cut may leave a block of them
             if not head.strip():
                 raise DataError(f"{path}: is empty")
             if head.startswith(codecs.BOM_UTF8):
@@ -382,19 +352,21 @@ def _join_units(row: list[str], width: int) -> list[str]:
 
 
 def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
-    found = (_DECIMAL.fullmatch(value) for row in rows for value in row)
-    marks = Counter(number[1] for number in found if number)
+    found = [number for row in rows for value in row if (number := _DECIMAL.fullmatch(value))]
+    clear = [number for number in found if not _THOUSANDS.fullmatch(number[0])]
+    marks = Counter(number[1] for number in clear or found)
     return "," if marks[","] > (0 if separator == "," else marks["."]) else "."
 
 
 TEMPERATURE_NAME = re.compile(
     r"temp|°\s*[cf]|deg\s*[cf]|celsius|fahrenheit|kelvin|thermo|ds18|pt100|housing|geh[äa]use"
-    r"|\bt\d*\b|\btt_|\btmp|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot",
+    r"|\bt\d*\b|\btt_|\btmp|[\[(][cf][\])]|\bsensor|温度|溫度|気温|[℃℉]|온도|기온|темп|θερμ|hőm|sıcakl|teplot"
+    r"|czujnik|wewn[ęe]trzn|zewn[ęe]trzn|płytk",
     re.IGNORECASE,
 )
 OTHER_NAME = re.compile(
-    r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
-    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt|ros[ée]e|roc[ií]o|rugiada"
+    r"hum|feucht|wilgotno[śs]|ci[śs]nien|napi[ęe]ci|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
+    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|recn|lux|light|dew|taupunkt|ros[ée]e|roc[ií]o|rugiada"
     r"|^table$|entry_id|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|濕度|露点|序号|влажн|давлен|습도|気圧"
     # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import date, datetime
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
-from thermocald.numbers import column_label
+from thermocald.numbers import column_label, without_unit
 from thermocald.store.logger.clock import (
     ORDERS,
     ZONES_H,
     DeviceClock,
     are_serials,
     date_orders,
+    day_begin,
     device_clock,
     lacks_zone,
     parse_moment,
@@ -31,7 +32,6 @@ from thermocald.store.logger.dialect import (
     TEMPERATURE_NAME,
     TIME_NAME,
     UNITS,
-    without_unit,
 )
 
 if TYPE_CHECKING:
@@ -233,10 +233,10 @@ def _read_in_orders(
     first, dates = "", set[str]()
     found: dict[str, list[datetime]] = {order: [] for order in ORDERS}
     for line, row in file.rows():
-        date = row[places[0]][:10]
-        if date in dates:
+        day = row[places[0]][:10]
+        if day in dates:
             continue
-        dates.add(date)
+        dates.add(day)
         if (possible := date_orders(row[places[0]])) is None:
             continue
         found = {order: moments for order, moments in found.items() if order in possible}
@@ -252,7 +252,8 @@ def _read_in_orders(
                 moment = parse_moment(text, order)
             except ValueError as cause:
                 raise DataError(f"{file.path}, column {names[0]!r}: {cause}") from cause
-            moments.append(moment if isinstance(moment, datetime) else datetime.now(UTC))
+            assert isinstance(moment, date)  # `date_orders` knows no others
+            moments.append(day_begin(moment))
     every = list(found.values())
     return first, {
         order: [moments[0], moments[-1]]

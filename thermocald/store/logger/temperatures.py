@@ -11,17 +11,18 @@ import re
 from array import array
 from collections import Counter
 from dataclasses import replace
-from datetime import datetime
+from datetime import date, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.numbers import counted
+from thermocald.numbers import counted, stated_unit
 from thermocald.store.logger.clock import (
     DeviceClock,
     are_serials,
+    day_begin,
     parse_moment,
     parse_serial,
     stated_zones,
@@ -34,7 +35,6 @@ from thermocald.store.logger.dialect import (
     UNIT_BEHIND,
     LoggerFile,
     open_log,
-    stated_unit,
     to_celsius,
 )
 from thermocald.store.logger.options import (
@@ -268,6 +268,7 @@ class _Table:
         bare = set(self._time_names) <= set(OUR_TIMES) and not self.are_serials
         # 2026061412, the hours of a weather service
         tail = "00" if all(map(_HOURS.fullmatch, file.column(times[0]))) else ""
+        self._has_times = times[0] in file.of_kind("moment")
         head = 0
         for line, row in file.rows():
             text = " ".join(row[place] for place in self._places) + tail
@@ -347,6 +348,8 @@ class _Table:
                 f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
                 f"not a date with a time ({cause})"
             ) from cause
+        if self._has_times and isinstance(moment, date):
+            moment = day_begin(moment)  # some programs leave out the time of midnight
         if not isinstance(moment, datetime):
             raise DataError(
                 f"{self.file.path}, line {line}: {text[:40]!r} is only a date or a time; name "
@@ -457,7 +460,8 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
         raise DataError(
             f"{table.where(i)}, column {name!r}: {values[i]:g} {unit} is {celsius[i]:.4g} °C; "
             f"temperatures of cameras lie between {_PLAUSIBLE_C[0]:g} and {_PLAUSIBLE_C[1]:g} °C. "
-            "Another unit (--unit), or another column (--temperature-column)?"
+            "Another unit (--unit), or another column (--temperature-column)? Leave a field "
+            "empty that is no reading"
         )
     return celsius, [*notes, *doubts]
 

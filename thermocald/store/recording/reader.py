@@ -13,7 +13,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.names import FileFolder
-from thermocald.numbers import counted
+from thermocald.numbers import counted, stated_unit
 from thermocald.photogrammetry.series.normals import runs
 from thermocald.store.recording.head import CameraSpec, Head, read_head
 from thermocald.store.recording.observation_file import ObservationFile
@@ -195,6 +195,8 @@ class Recording:
         found += pairing_doubts(columns.frame_time, columns.temperature_time, self.head.interval)
         for name, values in columns.temperatures.items():
             found += reading_doubts(columns.temperature_time, values, name)
+            if (unit := stated_unit(name)) not in (None, "degC"):
+                found.append(f"{name}: its name states {unit}, recording.yaml degC: which is true?")
         if (every := columns.readings) is not None:
             for name, values in every.channels.items():
                 found += reading_doubts(every.times, values, f"{name} of {READINGS}")

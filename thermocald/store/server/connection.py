@@ -137,6 +137,14 @@ class ServerAddress:
         return f"postgresql://{user}{place[-1]}{parts.path}"
 
 
+def require_file(source: Path) -> Path:
+    """Return the path of a store. Raises UsageError for a server's address."""
+    if is_server(source):
+        address = ServerAddress.parse(source)
+        raise UsageError(f"{address}: is a server; this command needs a store's file")
+    return source
+
+
 @contextmanager
 def in_words(address: ServerAddress | str, doing: str) -> Iterator[None]:
     """Turn psycopg's errors into ServerGone (temporary) or ServerError."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tracemalloc
 from dataclasses import replace
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.store.small import assert_same_epochs, write_recording
-from tests.store.test_bad_recordings import set_field
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
@@ -209,7 +209,22 @@ def test_long_text_is_parsed_once_until_it_changes(recording_path, cache, monkey
     with monkeypatch.context() as without_parser:
         without_parser.setattr(observation_file, "_typed", None)
         assert_same_epochs(streamed(recording_path), whole)
-    set_field(recording_path / "observations.csv", 2, "x", "7.25")
+    (copy,) = cache.iterdir()
+    copy.write_bytes(b"")  # a power cut
+    assert_same_epochs(streamed(recording_path), whole)
+    whole_copy = copy.read_bytes()
+    copy.write_bytes(whole_copy[:40] + bytes(99) + whole_copy[139:])
+    with pytest.raises(RecordingError, match="is removed: run the command again"):
+        streamed(recording_path)
+    assert_same_epochs(streamed(recording_path), whole)
+    # changed in place, with the same size and time
+    text = recording_path / "observations.csv"
+    before, lines = text.stat(), text.read_text().split("\n")
+    x = lines[1].split(",")[2]
+    lines[1] = lines[1].replace(x, "7.25".ljust(len(x), "0"), 1)
+    with text.open("r+") as file:
+        file.write("\n".join(lines))
+    os.utime(text, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert streamed(recording_path)[0].observations.points[0, 0] == 7.25
 
 

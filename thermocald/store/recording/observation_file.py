@@ -8,7 +8,7 @@ same to the bit. It needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk
 interface of a CSV table's chunk, so both pass the same checks.
 
 A CSV file that is too long for memory is read several times by an analysis. Its text is parsed only
-once, into a Parquet copy in the user's cache, found by the text's path, inode, size and time.
+once, into a Parquet copy in the user's cache, found by the text's path, inode, size and times.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import logging
 import os
 import shutil
 import time
+import uuid
 from bisect import bisect_left, bisect_right
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -285,7 +286,9 @@ class ParquetTable(Table):
         first = 0
         try:
             # not memory-mapped: what was read of a long file would stay resident
-            with pyarrow.parquet.ParquetFile(self.path, pre_buffer=False) as file:
+            with pyarrow.parquet.ParquetFile(
+                self.path, pre_buffer=False, page_checksum_verification=True
+            ) as file:
                 groups = range(file.num_row_groups)
                 if epochs is not None:
                     groups, first = _select_groups(
@@ -297,7 +300,12 @@ class ParquetTable(Table):
                             yield ColumnChunk(self, first, batch)
                             first += len(batch)
         except (OSError, ValueError) as cause:  # pyarrow raises both
-            raise RecordingError(f"{self.path}: is damaged: {cause}") from cause
+            removed = ""
+            if self._original is not None:
+                removed = "; this copy of the text is removed: run the command again"
+                with suppress(OSError):
+                    self.path.unlink()
+            raise RecordingError(f"{self.path}: is damaged: {cause}{removed}") from cause
         finally:
             pyarrow.default_memory_pool().release_unused()
 
@@ -365,25 +373,28 @@ def _parse_once(table: Table) -> Table:
     """
     try:
         found = table.path.stat()
-        key = f"2 {table.path.resolve()} {found.st_ino} {found.st_size} {found.st_mtime_ns}"
+        # a program that keeps the time of a file that it changes cannot keep `ctime`
+        stamps = found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+        key = f"3 {table.path.resolve()} {stamps}"
         folder = _cache()
         copy = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.parquet"
         if copy.exists():
             with suppress(OSError):  # a cache that is read-only
                 os.utime(copy)
-        else:
-            for old in folder.glob("*.parquet"):
-                with suppress(OSError):
-                    if old.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
-                        old.unlink()
-            if shutil.disk_usage(folder).free < 2 * found.st_size:
-                return table
-            partial = copy.with_name(f"{copy.stem}-{os.getpid()}.parquet")
-            try:
-                _write(partial, _typed(table, _parsed(table), lambda _: None))
-                partial.replace(copy)
-            finally:
-                partial.unlink(missing_ok=True)
+            with suppress(RecordingError):  # a power cut may have left an empty one
+                return ParquetTable(copy, REQUIRED, table)
+        for old in folder.glob("*.parquet"):
+            with suppress(OSError):
+                if old.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
+                    old.unlink()
+        if shutil.disk_usage(folder).free < 2 * found.st_size:
+            return table
+        partial = folder / f"{uuid.uuid4().hex}.parquet"
+        try:
+            _write(partial, _typed(table, _parsed(table), lambda _: None))
+            partial.replace(copy)
+        finally:
+            partial.unlink(missing_ok=True)
         return ParquetTable(copy, REQUIRED, table)
     except UsageError:
         log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
@@ -458,7 +469,7 @@ def _write(path: Path, parts: Iterable[Mapping[str, Any]]) -> None:
     words = [f.name for f in first.schema if f.type == pyarrow.string()]
     tables = chain([first], tables)
     with pyarrow.parquet.ParquetWriter(
-        path, first.schema, compression="zstd", use_dictionary=words
+        path, first.schema, compression="zstd", use_dictionary=words, write_page_checksum=True
     ) as writer:
         # the parser's parts are long, those of our tables short
         while group := list(islice(tables, max(1, _ROWS // max(1, first.num_rows)))):

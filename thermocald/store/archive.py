@@ -121,7 +121,7 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
             {
                 "time": [f"{reading.utc:.6f}"],
                 "clock_trusted": [str(int(reading.clock_trusted))],
-                **{channel: [str(reading.values.get(channel, ""))] for channel in columns},
+                **{one: np.array([reading.values.get(one, np.nan)]) for one in columns},
             }
             for reading in store.readings(name)
         )

@@ -30,7 +30,7 @@ ORDERS = {"dmy": "day/month/year", "mdy": "month/day/year", "ymd": "year/month/d
 AMBIGUOUS = ("refuse", "order", "earlier", "later")
 """How to treat the repeated hour: refuse it, use the order of the rows, or take one."""
 
-_OFFSET = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?", re.IGNORECASE)
+_OFFSET = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?:[:.]?(\d{2}))?", re.IGNORECASE)
 _ERROR = re.compile(r"([+-]?)(?:(?:(\d+):)?(\d+):)?(\d+(?:\.\d+)?)s?")
 _LARGEST_OFFSET_H = 14
 
@@ -201,10 +201,11 @@ ZONES_H = {
 """Zones by their letters; without CST, which China and America have."""
 _ZONE = rf"(?:,?\s*(?P<zone>{'|'.join(ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}(?::?\d{{2}})?))?"
 _STATED_ZONE = re.compile(
-    rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?::?\d{{2}})?"
-    rf"|(?:(?i:UTC|GMT)|CST(?=/CDT)|{'|'.join(n for n in ZONES_H if len(n) > 2)})(?![^\W_]))"
+    rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?:[:.]?\d{{2}})?(?![.,]?\d|[½¼¾])"
+    r"|(?:(?i:UTC|GMT)(?!\s*(?:offset|plus|minus|[+-]\s*\d))|CST(?=/CDT)|"
+    rf"{'|'.join(ZONES_H.keys() - {'Z', 'UTC', 'GMT'})})(?![^\W_]))"
 )
-_CITY = re.compile(r"[A-Z][a-z]+/[A-Z][\w/]+")
+_CITY = re.compile(r"[A-Z][a-z]+/[A-Z][\w/+-]+")
 _FULL = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})[ T,;_-]+(?:{_TIME}|{_COMPACT_TIME}){_ZONE}")
 _ONLY_DATE = re.compile(rf"(?:{_DATE}|{_COMPACT_DATE})")
 _ONLY_TIME = re.compile(rf"{_TIME}{_ZONE}")

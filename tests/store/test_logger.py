@@ -176,17 +176,17 @@ def test_of_one_sensor_of_many_only_its_readings_are_examined(tmp_path):
 def test_a_log_of_changes_holds_its_value_in_a_pause_but_not_while_unavailable(tmp_path):
     """Home Assistant writes no row while a value stays the same; ten minutes were a gap."""
     rows: list = [(20.0 + k, 10 * k) for k in range(6)]
-    rows += [(25.1, 650), ("unavailable", 660), (25.2, 1300)]
+    rows += [(25.1, 650), ("unavailable", 660), (25.2, 1300), (25.3, 91_300)]
     data = "entity_id,state,last_changed\n" + "".join(
         f"sensor.{name},{value},{1.78e9 + t:.0f}\n"
         for value, t in rows for name in ("box_temperature", "air_temperature")
     )  # fmt: skip
     found = logged(tmp_path, data)
     assert found.step == 10.0
-    at = found.times[0] + np.array([30.0, 300.0, 645.0, 900.0])
+    at = found.times[0] + np.array([30.0, 300.0, 645.0, 900.0, 40_000.0])
     for readings in found.channels.values():
         known = interpolate_readings(at, found.times, readings)
-        np.testing.assert_allclose(known, [23.0, 25.0, 25.05, np.nan])
+        np.testing.assert_allclose(known, [23.0, 25.0, 25.05, np.nan, np.nan])
     assert sum("is held in 1 pause of up to 600 s" in note for note in found.notes) == 2
 
 
@@ -338,8 +338,10 @@ def test_another_head_below_is_refused(tmp_path, head):
     """A file of two logs: below the second head the columns are others."""
     one = ["time;T °C", *(f"2026-07-06 13:{i}:00;21.4" for i in range(30, 45))]
     rows = rows_of("{m:%Y-%m-%d %H:%M:%S};{t:.2f}")
-    with pytest.raises(DataError, match="line 23: another head begins here"):
-        read(tmp_path, "\n".join(one), [*rows[:6], head, *rows[6:]])
+    for above in (one, one[:3]):
+        line = len(above) + 7
+        with pytest.raises(DataError, match=f"line {line}: another head begins here"):
+            read(tmp_path, "\n".join(above), [*rows[:6], head, *rows[6:]])
     assert len(read(tmp_path, "\n".join(one), [*rows[:6], one[0], *rows[6:]]).times) == 27
 
 

@@ -202,7 +202,7 @@ ZONES_H = {
 _ZONE = rf"(?:,?\s*(?P<zone>{'|'.join(ZONES_H)}|(?:UTC|GMT)?[+-]\d{{2}}(?::?\d{{2}})?))?"
 _STATED_ZONE = re.compile(
     rf"(?<![^\W_])((?i:UTC|GMT)\s*[+-]\s*\d{{1,2}}(?:[:.]?\d{{2}})?(?![.,]?\d|[½¼¾])"
-    r"|(?:(?i:UTC|GMT)(?!\s*(?:offset|plus|minus|[+-]\s*\d))|CST(?=/CDT)|"
+    r"|(?:(?i:UTC|GMT)(?![\s_-]*(?:offset|plus|minus|[+-]\s*\d))|CST(?=/CDT)|"
     rf"{'|'.join(ZONES_H.keys() - {'Z', 'UTC', 'GMT'})})(?![^\W_]))"
 )
 _CITY = re.compile(r"[A-Z][a-z]+/[A-Z][\w/+-]+")

@@ -184,12 +184,17 @@ def _find_head(
     if first < 0:
         return [], first
     head = [row for _, row in start[:first]]
-    # if another head follows, the rows so far were statistics
+    titled = any(
+        len(row) == width and any(map(TIME_NAME.search, row)) and not any(map(_is_time, row))
+        for row in head
+    )
+    # if another head follows, the rows so far were statistics; several below a head are readings
     for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
         row, next_row = start[i][1], start[i + 1][1]
         named = row not in head and not _is_data(row) and any(map(TIME_NAME.search, row))
         # a remark (`# battery changed`) fills one field
-        if named and sum(map(bool, row)) > 1 and _is_data(next_row):
+        statistics = not titled or i - first < 2
+        if named and statistics and sum(map(bool, row)) > 1 and _is_data(next_row):
             head, first = [row], i + 1
     return head, first
 

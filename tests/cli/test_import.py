@@ -60,13 +60,18 @@ def run(place, *more):
 
 
 def test_photographs_and_a_german_log_become_a_recording(place):
-    """All eight readings are kept for six photographs: analyses use those in between too."""
+    """All eight readings are kept for six photographs: analyses use those in between too.
+
+    A photograph long after the log has no reading.
+    """
+    photograph(place / "photos" / "late.jpg", "2026:06:14 12:10:00")
     result = run(place, *BERLIN)
-    assert "6 epochs" in result.stdout
+    assert "7 epochs" in result.stdout
     assert "guessed" in result.stderr
     recording = read_recording(place / "M1")
     columns = recording.columns
-    assert columns.frame_time.tolist() == [START + 0.25 + 10 * i for i in range(6)]
+    assert columns.frame_time[:6].tolist() == [START + 0.25 + 10 * i for i in range(6)]
+    assert np.isnan(columns.temperature_time).tolist() == [False] * 6 + [True]
     assert columns.readings.times.tolist() == [START + 15 * i for i in range(8)]
     kept = columns.readings.channels["Temperatur"].tolist()
     assert kept == [21 + 0.25 * i for i in range(8)]

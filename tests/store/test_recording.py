@@ -244,6 +244,9 @@ INTERPOLATED = {
     "a long gap is not filled": (
         [15.0, 500.0, 1000.0, 1015.0], [0.0, 10.0, 20.0, 1000.0, 1010.0, 1020.0],
         [0.0, 0.1, 0.2, 10.0, 10.1, 10.2], [0.15, NONE, 10.0, 10.15]),
+    "ten intervals are bridged, eleven are not": (
+        [80.0, 205.0], [0.0, 10.0, 20.0, 30.0, 130.0, 140.0, 150.0, 260.0, 270.0],
+        [0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0, 26.0, 27.0], [8.0, NONE]),
     "no guess far outside": ([-50.0, 100.0], [0.0, 10.0, 20.0], [1.0, 2.0, 3.0], [NONE, NONE]),
     "nothing but missing ones": ([0.0, 1.0], [0.0, 1.0], [NONE, NONE], [NONE, NONE]),
     "one reading holds for its instant": ([5.0, 6.0], [5.0], [21.0], [21.0, NONE]),

@@ -139,29 +139,20 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
         raise StoreError(f"epoch {epoch.number}: {len(seen)} observations are too many to store")
     parts = [*covariance, *((1 + i, packed[c : c + _PART_BYTES]) for i, c in enumerate(cuts))]
     row: dict[str, Any] = {
-        "series_id": series,
-        "number": epoch.number,
-        "revision": stored.revision,
-        "frame_time": epoch.frame_time,
-        "temperature_time": epoch.temperature_time,
-        "clock_trusted": int(stored.clock_trusted),
-        "status": result.status,
-        "sigma0": result.sigma0,
-        "redundancy": result.redundancy,
-        "n_observations": result.n_observations,
-        "n_rejected": len(result.rejected),
+        "series_id": series, "number": epoch.number, "revision": stored.revision,
+        "frame_time": epoch.frame_time, "temperature_time": epoch.temperature_time,
+        "clock_trusted": int(stored.clock_trusted), "status": result.status,
+        "sigma0": result.sigma0, "redundancy": result.redundancy,
+        "n_observations": result.n_observations, "n_rejected": len(result.rejected),
         # None where a later calibration uses the observations of the revision before
         "measured": None if seen is None else len(seen),
-        "temperatures": _numbers_json(epoch.temperatures),
-        "extra": _numbers_json(stored.extra),
-        "rejected": json.dumps(result.rejected),
+        "temperatures": _numbers_json(epoch.temperatures), "extra": _numbers_json(stored.extra),
+        "rejected": json.dumps(result.rejected), "note": epoch.note, "reason": result.reason,
         "frame": "" if epoch.frame is None else str(epoch.frame),
-        "note": epoch.note,
-        "reason": result.reason,
         **dict(zip(_VALUES, result.values.tolist(), strict=True)),
         **dict(zip(_SDS, result.sd.tolist(), strict=True)),
         "detail_checksum": row_checksum((), data=b"".join(data for _, data in parts)),
-    }
+    }  # fmt: skip
     first = insert_row(connection, "epoch", **row) * _PARTS
     details = [(first + part, data) for part, data in parts]
     kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", details).rowcount
@@ -192,26 +183,17 @@ def latest_epochs(
                 _, seen = details(measured)
         row = every[-1]
         epoch = Epoch(
-            number=row["number"],
-            frame_time=row["frame_time"],
-            temperature_time=number_or_nan(row["temperature_time"]),
-            temperatures=parse_numbers(row["temperatures"]),
-            frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
-            if row["frame"]
-            else None,
-            observations=unpack_observations(seen) if seen else None,
-            note=row["note"],
-        )
+            row["number"], row["frame_time"], number_or_nan(row["temperature_time"]),
+            parse_numbers(row["temperatures"]),
+            relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
+            if row["frame"] else None,
+            unpack_observations(seen) if seen else None, row["note"],
+        )  # fmt: skip
         result = EpochResult(
-            status=row["status"],
-            reason=row["reason"],
-            values=np.array([row[name] for name in _VALUES], dtype=float),
-            covariance=unpack_covariance(covariance) if covariance else None,
-            sigma0=number_or_nan(row["sigma0"]),
-            redundancy=row["redundancy"],
-            n_observations=row["n_observations"],
-            rejected=tuple(json.loads(row["rejected"])),
-        )
+            row["status"], row["reason"], np.array([row[name] for name in _VALUES], dtype=float),
+            unpack_covariance(covariance) if covariance else None, number_or_nan(row["sigma0"]),
+            row["redundancy"], row["n_observations"], tuple(json.loads(row["rejected"])),
+        )  # fmt: skip
         yield StoredEpoch(
             epoch, result, parse_numbers(row["extra"]), bool(row["clock_trusted"]), row["revision"]
         )

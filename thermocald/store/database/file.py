@@ -441,20 +441,14 @@ def read_wal_tail(path: Path) -> tuple[int, bool]:
     file was cut off in copying, and more may have followed. The files may be written meanwhile.
     """
     for _ in range(_TRIES):
-        tail = _read_tail(path)
+        committed = _committed_frames(path)  # first: later commits may be read half-written
+        tail = 0, False
+        with suppress(OSError), path.open("rb") as file:  # long, if a reader kept it
+            tail = _read_frames(file, committed)
         if tail == (0, False):
             break
         time.sleep(_PAUSE_S)  # a frame that is only half written looks like damage
     return tail
-
-
-def _read_tail(path: Path) -> tuple[int, bool]:
-    committed = _committed_frames(path)  # first: later commits may be read half-written
-    try:
-        with path.open("rb") as file:  # of a writer that a reader kept from checkpoints it is long
-            return _read_frames(file, committed)
-    except OSError:
-        return 0, False
 
 
 def _read_frames(file: BinaryIO, committed: Mapping[bytes, int]) -> tuple[int, bool]:

@@ -412,14 +412,12 @@ class Store(SeriesReader):
             found = epochs.select_epochs(self._db, series.id, number, number, details=False)
             if (then := next(found, None)) is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
-            stored = StoredEpoch(
-                replace(then.epoch, observations=observations),
-                result,
-                {**then.extra, **(extra or {})},
-                then.clock_trusted,
-                then.revision + 1,
-            )
-            epochs.insert_epoch(self._db, series.id, stored)
+            epoch, more = replace(then.epoch, observations=observations), extra or {}
+            later = replace(
+                then, epoch=epoch, result=result, extra={**then.extra, **more},
+                revision=then.revision + 1,
+            )  # fmt: skip
+            epochs.insert_epoch(self._db, series.id, later)
 
     def add_event(self, event: Event) -> None:
         """Store an event."""

@@ -157,14 +157,12 @@ class Recording:
         for i, observations in zip(rows, seen, strict=False):
             frame = columns.frames[i]
             yield Epoch(
-                number=int(columns.numbers[i]),
-                frame_time=float(columns.frame_time[i]),
-                temperature_time=float(columns.temperature_time[i]),
-                temperatures={name: float(t[i]) for name, t in columns.temperatures.items()},
-                frame=self.path / frame if frame else None,
-                observations=observations,
-                note="" if frame or observations is not None else "neither frame nor observations",
-            )
+                int(columns.numbers[i]), float(columns.frame_time[i]),
+                float(columns.temperature_time[i]),
+                {name: float(t[i]) for name, t in columns.temperatures.items()},
+                self.path / frame if frame else None, observations,
+                "" if frame or observations is not None else "neither frame nor observations",
+            )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -303,14 +301,10 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     if len(frame_time) > 2 and np.ptp(frame_time) == 0:
         table.fail(1, "frame_time", "all epochs have the same time; give the time of each frame")
     return EpochColumns(
-        numbers,
-        frame_time,
-        temperature_time,
-        {name: found[name] for name in channels},
-        frames,
+        numbers, frame_time, temperature_time, {name: found[name] for name in channels}, frames,
         {name: found[name] for name in extra},
         _read_readings(log, channels) if channels and (log := folder / READINGS).exists() else None,
-    )
+    )  # fmt: skip
 
 
 def _check_celsius(table: Table, name: str, values: Array) -> None:

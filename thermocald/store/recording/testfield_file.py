@@ -120,13 +120,10 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
     if not names and not may_be_empty:
         raise TestFieldError(f"{table.title}: holds no targets")
     return TestField.build(
-        names,
-        np.array([found[name] for name in "XYZ"]).T,
-        np.array([found[name] for name in ("sX", "sY", "sZ")]).T,
-        found["diameter"].tolist(),
-        kinds,
-        codes,
-    )
+        names, np.array([found[name] for name in "XYZ"]).T,
+        np.array([found[name] for name in ("sX", "sY", "sZ")]).T, found["diameter"].tolist(),
+        kinds, codes,
+    )  # fmt: skip
 
 
 def require_millimetres(

@@ -38,14 +38,10 @@ _OURS = ("station", "camera", "series")
 _CONNECT_S = 10
 # A lost connection is noticed within a minute, during a query or between two.
 _SESSION = {
-    "connect_timeout": _CONNECT_S,
-    "keepalives": 1,
-    "keepalives_idle": 20,
-    "keepalives_interval": 10,
-    "keepalives_count": 3,
-    "tcp_user_timeout": 60_000,
+    "connect_timeout": _CONNECT_S, "keepalives": 1, "keepalives_idle": 20,
+    "keepalives_interval": 10, "keepalives_count": 3, "tcp_user_timeout": 60_000,
     "application_name": "thermocald",
-}
+}  # fmt: skip
 # SQLSTATE or its class → what to do. Source: PostgreSQL manual, appendix A.
 _ADVICE = {
     "28": "the server refused the user; check name, password or certificate, and its pg_hba.conf",

@@ -92,7 +92,11 @@ class ServerStore(Connected, SeriesReader):
         statement = sql.SQL("SELECT {} {}").format(sql.SQL(", ").join(wanted.values()), latest)
         with self._transaction("columns cannot be read") as connection:
             (found,) = connection.execute(statement, binary=True).fetchall()
-        columns = {name: _decode_column(value) for name, value in zip(wanted, found, strict=True)}
+        columns = {
+            name: np.array(value.split("\n")) if isinstance(value, str)
+            else np.frombuffer(value or b"", ">f8").astype(np.float64)  # NULL without epochs
+            for name, value in zip(wanted, found, strict=True)
+        }  # fmt: skip
         if np.any(np.diff(columns["epoch"]) <= 0):
             order = np.lexsort((columns["frame_time"], columns["epoch"]))
             columns = {name: column[order] for name, column in columns.items()}
@@ -161,13 +165,6 @@ def _expression(name: str, series: StoredSeries) -> Composable:
     return sql.SQL("string_agg(float8send(coalesce({}::float8, 'NaN')), '')").format(number)
 
 
-def _decode_column(value: bytes | str | None) -> NDArray[Any]:
-    """Return the column (E,) in a value of `_expression`; a series without epochs gives NULL."""
-    if isinstance(value, str):
-        return np.array(value.split("\n"))
-    return np.frombuffer(value or b"", ">f8").astype(np.float64)
-
-
 _DAY_S = 86400.0
 _PLAUSIBLE = (946_684_800.0, 4_102_444_800.0)  # s UTC: 2000 to 2100
 _NAMESPACE = UUID("c1b7b0de-6c1e-5f0e-9d0d-7468656d6f63")
@@ -224,13 +221,10 @@ class ServerWriter(Connected):
     def write_frame(self, series: StoredSeries, frame: KeptFrame, data: bytes) -> None:
         """Insert the file of one epoch's frame; the server checks its SHA-256."""
         row = {
-            "series": series_key(self.station, self.store, series),
-            "number": frame.number,
-            "frame_time": frame.frame_time,
-            "name": str(frame.path),
-            "digest": hashlib.sha256(data).hexdigest(),
-            "data": data,
-        }
+            "series": series_key(self.station, self.store, series), "number": frame.number,
+            "frame_time": frame.frame_time, "name": str(frame.path),
+            "digest": hashlib.sha256(data).hexdigest(), "data": data,
+        }  # fmt: skip
         with self._transaction(f"the frame of epoch {frame.number} was not sent") as connection:
             self._insert(connection, "frame", [row])
 

@@ -102,15 +102,10 @@ def test_clock_errors_and_zones_of_each_device(place):
     assert times.tolist() == [START + 4 * i for i in range(6)]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "IMG_20260614_12000{}",
-        "2026-06-14 12.00.0{}",
-        "PXL_20260614_10000{}000.MP",
-        f"f_{START // 10:.0f}{{}}.0",
-    ],
-)
+@pytest.mark.parametrize("name", [
+    "IMG_20260614_12000{}", "2026-06-14 12.00.0{}", "PXL_20260614_10000{}000.MP",
+    f"f_{START // 10:.0f}{{}}.0",
+])  # fmt: skip
 def test_times_from_names(place, name):
     for i in range(6):
         (place / "photos" / f"{i}.jpg").rename(place / "photos" / f"{name.format(i)}.jpg")
@@ -135,32 +130,29 @@ def stop_the_clock(folder):
         path.write_bytes(path.read_bytes() + path.name.encode())  # not a copy
 
 
-@pytest.mark.parametrize(
-    ("change", "more", "reason"),
-    [
-        (None, "", "has no time zone: give it with --timezone"),
-        (None, "--timezone Europe/Berlin --camera-clock +05:00:00", "5 h apart"),
-        (None, "--timezone Mars", "time zone 'Mars'"),
-        (None, "--timezone UTC --pixel-pitch 0.002 --unit R", "--unit R"),
-        (None, "--timezone UTC --temperature-column T", "there is no column 'T'"),
-        (None, "--timezone UTC --encoding greek8bit", "--encoding greek8bit: is unknown"),
-        (None, "--timezone UTC --encoding hex", "--encoding hex: is unknown"),
-        (third(size=(48, 64)), "--timezone UTC", r"3\.jpg: has 48 × 64 px"),
-        (lambda f: (f / "3.jpg").write_bytes(b"\xff\xd8no"), "--timezone UTC", "is not a picture"),
-        *(
-            (third(no), "--timezone UTC", r"3\.jpg: EXIF holds no time.*--times name")
-            for no in ("", "0000:00:00 00:00:00", "    :  :     :  :  ")
-        ),
-        (third("2000:01:01 00:00:05"), "--timezone UTC", r"0\.jpg: was taken at .*Z, years"),
-        (third(tags={MAKE: "Canon"}), "--timezone UTC", OF_ANOTHER),
-        (third(tags={MODEL: "imx477"}), "--timezone UTC", OF_ANOTHER),
-        (third(tags={SERIAL: "B2"}), "--timezone UTC", OF_ANOTHER),
-        (third(focal=6.0), "--timezone UTC", OF_ANOTHER),
-        (third(tags={MODEL: ""}), "--timezone UTC", OF_ANOTHER),
-        (third(tags=NOTHING), "--timezone UTC", OF_ANOTHER),
-        (stop_the_clock, "--timezone UTC", r"0\.jpg: all photographs have its time"),
-    ],
-)
+@pytest.mark.parametrize(("change", "more", "reason"), [
+    (None, "", "has no time zone: give it with --timezone"),
+    (None, "--timezone Europe/Berlin --camera-clock +05:00:00", "5 h apart"),
+    (None, "--timezone Mars", "time zone 'Mars'"),
+    (None, "--timezone UTC --pixel-pitch 0.002 --unit R", "--unit R"),
+    (None, "--timezone UTC --temperature-column T", "there is no column 'T'"),
+    (None, "--timezone UTC --encoding greek8bit", "--encoding greek8bit: is unknown"),
+    (None, "--timezone UTC --encoding hex", "--encoding hex: is unknown"),
+    (third(size=(48, 64)), "--timezone UTC", r"3\.jpg: has 48 × 64 px"),
+    (lambda f: (f / "3.jpg").write_bytes(b"\xff\xd8no"), "--timezone UTC", "is not a picture"),
+    *(
+        (third(no), "--timezone UTC", r"3\.jpg: EXIF holds no time.*--times name")
+        for no in ("", "0000:00:00 00:00:00", "    :  :     :  :  ")
+    ),
+    (third("2000:01:01 00:00:05"), "--timezone UTC", r"0\.jpg: was taken at .*Z, years"),
+    (third(tags={MAKE: "Canon"}), "--timezone UTC", OF_ANOTHER),
+    (third(tags={MODEL: "imx477"}), "--timezone UTC", OF_ANOTHER),
+    (third(tags={SERIAL: "B2"}), "--timezone UTC", OF_ANOTHER),
+    (third(focal=6.0), "--timezone UTC", OF_ANOTHER),
+    (third(tags={MODEL: ""}), "--timezone UTC", OF_ANOTHER),
+    (third(tags=NOTHING), "--timezone UTC", OF_ANOTHER),
+    (stop_the_clock, "--timezone UTC", r"0\.jpg: all photographs have its time"),
+])  # fmt: skip
 def test_what_is_not_certain_is_refused_and_nothing_is_written(place, change, more, reason):
     if change is not None:
         change(place / "photos")

@@ -127,13 +127,11 @@ def temperature(function):
     return change("epochs.csv", temperature=function)
 
 
-def name_fahrenheit(recording):
-    for path in (recording / "recording.yaml", recording / "epochs.csv"):
-        path.write_text(path.read_text().replace("board_temperature", "board [F]"))
-
-
 DOUBTS = {
-    "a unit in a name": (name_fahrenheit, "board [F]: its name states degF, recording.yaml degC"),
+    "a unit in a name": (
+        lambda folder: [path.write_text(path.read_text().replace("board_temperature", "board [F]"))
+                        for path in (folder / "recording.yaml", folder / "epochs.csv")],
+        "board [F]: its name states degF, recording.yaml degC"),
     "a principal distance of another lens": (
         head("principal_distance: 3.04", "principal_distance: 6.0"), "0.507 times"),
     "the pixels of a binned mode": (

@@ -122,8 +122,15 @@ class LoggerFile:
         with self.path.open(encoding=self.encoding, errors="replace", newline="") as file:
             lines = (text for text in file if text.endswith(_ENDS) or not self.is_cut)
             for line, row in _parse_rows(self.path, lines, self.separator):
-                if line >= self.first_line:
-                    yield line, _fit_width(row, width)
+                if line < self.first_line:
+                    continue
+                if (
+                    len(row) > width
+                    and self.separator == ","
+                    and all(map(str.isdigit, row[width:]))
+                ):
+                    raise _commas_twice(self.path, line)
+                yield line, _fit_width(row, width)
 
 
 def open_log(
@@ -161,16 +168,20 @@ def open_log(
     found = decimal or _detect_decimal(rows, mark)
     ends = [";".join(row[-2:]) for row in rows if row[-1]]
     if mark == "," and head and len(head[-1]) < width and ends and all(map(_CUT.fullmatch, ends)):
-        raise DataError(
-            f"{path}, line {start[first][0]}: the rows hold more fields than the head: are commas "
-            "used both in numbers and between columns? Change one of them"
-        )
+        raise _commas_twice(path, start[first][0])
     above = tuple(" ".join(row) for _, row in start[:first])
     is_cut = not (begin + end)[-1].endswith(_ENDS) and _is_shorter(rows, found)
     rows = rows[: len(rows) - is_cut]
     kinds = tuple(_kind(column) for column in zip(*rows, strict=True))
     return LoggerFile(
         path, names, start[first][0], encoding, mark, found, rows, kinds, above, is_cut, is_assumed
+    )
+
+
+def _commas_twice(path: Path, line: int) -> DataError:
+    return DataError(
+        f"{path}, line {line}: the row holds more fields than the head: are commas used both in "
+        "numbers and between columns? Change one of them"
     )
 
 

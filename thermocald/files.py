@@ -47,12 +47,8 @@ _DATABASE = b"SQLite format 3\0"
 _KERNEL = (("/", "proc"), ("/", "sys"))
 _WAL_MAGIC = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 _RECORDED = {
-    "recording.yaml",
-    "epochs.csv",
-    "observations.csv",
-    "observations.parquet",
-    "readings.csv",
-}
+    "recording.yaml", "epochs.csv", "observations.csv", "observations.parquet", "readings.csv",
+}  # fmt: skip
 
 _LONGEST_NAME, _LONGEST_SHOWN = 60, 400
 
@@ -409,13 +405,9 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 def dump_yaml(document: dict[str, Any]) -> str:
     """Return YAML text with the keys in their order and short mappings on one line."""
     text: str = yaml.dump(
-        document,
-        Dumper=_Dumper,
-        sort_keys=False,
-        allow_unicode=True,
-        default_flow_style=None,
+        document, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None,
         width=100,
-    )
+    )  # fmt: skip
     return text
 
 

@@ -153,6 +153,8 @@ def test_sensors_below_one_another_are_channels(tmp_path):
     found = logged(tmp_path, data)
     # a processor at 70 °C is no room in °F
     assert list(found.channels) == ["sensor.box_temperature", "sensor.air", "sensor.cpu"]
+    unread = read(tmp_path, "time;T1 °C;T2 °C", "{s};-127.00;{t:.2f}")
+    assert list(unread.channels) == ["T2", "T1"]
     for name, values in found.channels.items():
         known = sensors[name.removeprefix("sensor.")] + np.arange(9) / 10
         assert values[np.isfinite(values)] == pytest.approx(known)

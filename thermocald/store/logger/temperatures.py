@@ -161,6 +161,8 @@ def _read_channels(table: _Table, options: LogOptions) -> tuple[dict[str, Array]
             channel += "_"
         channels[channel] = values
         notes += found
+    if not options.temperatures:  # a sensor that was never read is no reference
+        channels = dict(sorted(channels.items(), key=lambda c: not np.isfinite(c[1]).any()))
     return channels, notes
 
 

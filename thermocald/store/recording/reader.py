@@ -267,11 +267,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     numbers, frame_time = found["epoch"], found["frame_time"]
     if not len(numbers):
         raise RecordingError(f"{table.path}: holds no epochs")
-    table.check(
-        "epoch",
-        np.diff(numbers, prepend=-1) <= 0,
-        "is duplicated or after a later one; numbers must increase",
-    )
+    wrong = np.diff(numbers, prepend=-1) <= 0
+    table.check("epoch", wrong, "is duplicated or after a later one; numbers must increase")
     for name in ("frame_time", *timed):
         times = found[name]
         fault = time_fault(times)
@@ -292,12 +289,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     files = FileFolder(folder)
     for row, frame in enumerate(frames):
         if frame and files.find(frame) is None:
-            table.fail(
-                row,
-                "frame",
-                f"{frame!r} is missing or outside the recording; leave the field empty if the "
-                "frame was not stored",
-            )
+            why = "is missing or outside the recording; leave the field empty if it was not stored"
+            table.fail(row, "frame", f"{frame!r} {why}")
     if len(frame_time) > 2 and np.ptp(frame_time) == 0:
         table.fail(1, "frame_time", "all epochs have the same time; give the time of each frame")
     return EpochColumns(

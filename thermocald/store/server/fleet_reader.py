@@ -254,8 +254,7 @@ class FleetReader(Connected):
             (
                 [one.key for one, _ in short],
                 [next(iter(heads[one.key].channels), "") for one, _ in short],
-                [one.first for one, _ in short],
-                [one.last for one, _ in short],
+                *([getattr(one, end) for one, _ in short] for end in ("first", "last")),
                 [count for _, count in short],
             ),
         )

@@ -122,6 +122,8 @@ DAMAGES = {
         (put(r"t0(.*\n)(.*\n)t2,[-\d.]+", r'"first\ntarget"\1\n\2t2,nan'), "line 6, column X"),
     ],
     "observations.csv": [
+        (lambda text: put("(?m)$", ",0.0101")(text.strip()).replace("0.0101", "sxy", 1),
+         "line 2, column sxy: a covariance must be below sx·sy"),
         (put(",x,", ",x [px],"), "Write x, without"), (put("t5", '"t5'), "line .*is not readable"),
         (lambda text: text.rpartition(",")[0], "61: has 5 fields instead of 6; is the file cut"),
         (put("(?m)^(1,t1,[^,]*),", r"\1,5,"), "line 3.*has 7 fields instead of 6"),

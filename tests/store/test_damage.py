@@ -99,7 +99,7 @@ def test_a_store_whose_series_are_gone_is_not_empty(whole, store_path, statement
         list(map(store.last_epoch, store.all_series()))
 
 
-def test_missing_epochs_are_named(whole, store_path):
+def test_missing_epochs_are_named(whole, store_path, caplog):
     change(
         store_path,
         "DELETE FROM epoch WHERE number IN (3, 10, 11, 12)",
@@ -107,6 +107,8 @@ def test_missing_epochs_are_named(whole, store_path):
     )
     with Store.open(store_path) as store:
         found = store.examine()
+        assert len(list(store.epochs(store.find_series()))) == 32
+    assert "lacks 4 epochs of series M1" in caplog.text
     assert [gap.text for gap in found.gaps] == [
         "rpi/M1: epoch 3 is missing", "rpi/M1: epochs 10 to 12 are missing (3)"
     ]  # fmt: skip

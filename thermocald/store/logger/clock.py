@@ -334,7 +334,12 @@ def _month_to_number(text: str) -> str:
     if month is None:
         return text
     day, year = int(found["d1"] or found["d2"]), found["y1"] or found["y2"]
-    return f"{year if len(year) == 4 else 2000 + int(year)}-{month}-{day}{found['rest']}"
+    return f"{_full_year(int(year))}-{month}-{day}{found['rest']}"
+
+
+def _full_year(year: int) -> int:
+    """Return a year of two digits with its century, as POSIX does: 1969 to 2068."""
+    return year + (0 if year > 99 else 1900 if year > 68 else 2000)
 
 
 def _date(found: re.Match[str], order: str | None) -> date:
@@ -344,7 +349,7 @@ def _date(found: re.Match[str], order: str | None) -> date:
     if len(found["a"]) == 4:
         return date(a, b, c)
     if len(found["c"]) != 4:
-        a, c = (2000 + a, c) if order == "ymd" else (a, 2000 + c)
+        a, c = (_full_year(a), c) if order == "ymd" else (a, _full_year(c))
     return date(a, b, c) if order == "ymd" else date(c, *((a, b) if order == "mdy" else (b, a)))
 
 

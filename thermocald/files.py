@@ -395,11 +395,10 @@ def _fault(document: dict[str, Any]) -> str:
 class _Dumper(yaml.SafeDumper):
     """The safe dumper, which escapes lone surrogates (from file names): no file can hold them."""
 
-    def represent_text(self, text: str) -> yaml.ScalarNode:
-        return self.represent_str(text.encode(errors="backslashreplace").decode())
 
-
-_Dumper.add_representer(str, _Dumper.represent_text)
+_Dumper.add_representer(
+    str, lambda dumper, text: dumper.represent_str(text.encode(errors="backslashreplace").decode())
+)
 
 
 def dump_yaml(document: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from tests.commands import succeed as run
 from thermocald.errors import UsageError
 from thermocald.physics.testfields import corner_field
 from thermocald.store.database.store import Store
+from thermocald.store.logger.options import LogOptions
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import read_recording
 
@@ -78,7 +79,7 @@ def test_extra_columns_of_a_store_are_exported_and_imported_the_same(recording, 
     out = tmp_path / "german.csv"
     style = ("--time", "iso", "--separator", ";", "--decimal", ",", "-o", out)
     run("export", *source, *style)
-    log = read_log(out)  # no time zone needed: the times say UTC
+    log = read_log(out, LogOptions())  # no time zone needed: the times say UTC
     assert log.times == pytest.approx(opened.columns.frame_time, abs=2e-6)
     for name in channels:
         read, stored = log.channels[f"temperature {name}"], opened.columns.at_frame(name)

@@ -90,13 +90,12 @@ _MOST_REPEATED = 0.1  # of the rows
 
 
 def read_log(
-    path: Path, options: LogOptions | None = None, near: tuple[float, float] | None = None
+    path: Path, options: LogOptions, near: tuple[float, float] | None = None
 ) -> TemperatureLog:
     """Read a logger's file; near: first and last time, s UTC, that the log should cover.
 
     Raises DataError or UsageError if something cannot be determined, naming the option to set.
     """
-    options = options or LogOptions()
     file = open_log(path, options.encoding, options.separator, options.decimal)
     time_names = find_time_columns(file, options)
     lines = [zone[1] for line in file.above if (zone := _ZONE_LINE.search(line))]

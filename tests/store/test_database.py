@@ -83,7 +83,9 @@ def test_what_cannot_be_stored_is_refused_and_leaves_nothing(filled, make_epoch,
     assert not store.examine().damaged
 
 
-def test_a_later_calibration_replaces_what_is_read_but_not_what_is_kept(filled, make_result):
+def test_a_later_calibration_replaces_what_is_read_not_what_is_kept(
+    filled, make_epoch, make_result
+):
     store, series = filled
     without = Epoch(21, 1.6e9 + 210, np.nan, {"temperature": 30.0})
     store.append(series, replace(without, frame=Path("21.jpg")), None)
@@ -98,6 +100,10 @@ def test_a_later_calibration_replaces_what_is_read_but_not_what_is_kept(filled, 
     assert stored.result.values.tolist() == make_result(401).values.tolist()
     assert (stored.revision, stored.extra, len(stored.epoch.observations)) == (2, {"blur": 2.0}, 12)
     assert [s.epoch.number for s in store.epochs(series)] == list(range(1, 23))
+    seen = make_epoch(9).observations
+    store.amend(series, 4, make_result(402), observations=seen)
+    (stored,) = store.epochs(series, 4, 4)
+    assert np.array_equal(stored.epoch.observations.points, seen.points)
     with pytest.raises(StoreError, match="has no epoch 99"):
         store.amend(series, 99, make_result(1))
 

@@ -381,11 +381,11 @@ class SeriesRun:
                 end = found[-1] if len(found) == _CATCH_UP_BATCH else end
                 self._searched_to = max(self._searched_to, end)
                 for number in found:
-                    (stored,) = self._guard.epochs(series, number, number, details=False)
-                    path = self.frames.root / (stored.epoch.frame or "")
-                    if path.is_file():
-                        self._backlog.append(replace(stored.epoch, frame=path))
-                        self.pipeline.dropped += number < self.first
+                    for stored in self._guard.epochs(series, number, number, details=False):
+                        path = self.frames.root / (stored.epoch.frame or "")
+                        if path.is_file():
+                            self._backlog.append(replace(stored.epoch, frame=path))
+                            self.pipeline.dropped += number < self.first
             except StoreError as error:
                 log.warning("epochs with a deferred calibration cannot be read: %s", error)
         return self._backlog.pop(0) if self._backlog else None

@@ -222,7 +222,10 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
     # `temp=` of vcgencmd, NULs after a power cut, a mark of UTF-16 written with each line
-    plain = (re.sub("temp=|[\0\ufeff]", "", line.replace("−", "-")) for line in lines)
+    plain = (
+        line.replace("−", "-").replace("temp=", "").replace("\0", "").replace("\ufeff", "")
+        for line in lines
+    )
     if mark == " ":  # a head of NumPy
         plain = (line.removeprefix("# ") for line in plain)
     reader = csv.reader(plain, delimiter=mark, skipinitialspace=True)

@@ -94,7 +94,7 @@ def archive_series(
     head = replace(series.head, extra={**series.head.extra, **known})
     folder = FileFolder(frames or Path())
     extra = {name for stored in store.epochs(series, details=False) for name in stored.extra}
-    reported = sorted(name for name in extra if name.startswith("camera_"))
+    reported = [name for name in sorted(extra) if name.startswith("camera_")]
     further = dict.fromkeys([*series.settings.get("columns", ()), *reported])
     with RecordingWriter(path, head, series.testfield, further) as writer:
         if (log := stored_log(store, series)) is not None:

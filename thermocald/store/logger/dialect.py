@@ -124,11 +124,8 @@ class LoggerFile:
             for line, row in _parse_rows(self.path, lines, self.separator):
                 if line < self.first_line:
                     continue
-                if (
-                    len(row) > width
-                    and self.separator == ","
-                    and all(map(str.isdigit, row[width:]))
-                ):
+                more = row[width:] if self.separator == "," else []
+                if more and all(map(str.isdigit, more)):
                     raise _commas_twice(self.path, line)
                 yield line, _fit_width(row, width)
 

@@ -45,6 +45,7 @@ from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
     correlated_error_cofactors,
     estimate_held_affinity,
+    level_errors,
     line_weights,
     perspective_cofactor_roots,
     scaled_covariances,
@@ -264,7 +265,7 @@ def result(
         movement = estimate_mount_movement(series, estimate)
     elif held:
         movement = replace(movement, white=shown_movement(system, estimate.residuals, unit))
-    slow: list[tuple[Array, Array]] = []
+    slow = [level_errors(series.sensor, series.testfield, system, estimate.values, level)]
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
         if held:

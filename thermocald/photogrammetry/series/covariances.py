@@ -10,13 +10,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
-from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, IOP, PARAMETER_NAMES
+from thermocald.photogrammetry.linalg import (
+    inverse_2x2,
+    inverse_of_determined,
+    root_of,
+    symmetric_power,
+    unit_diagonal,
+)
 from thermocald.photogrammetry.series.normals import (
     as_matrices,
     cofactors,
     linearise,
     normal_matrices,
+    right_hand_sides,
     sums_of_targets,
 )
 
@@ -149,6 +156,42 @@ def correlated_error_cofactors(
     own = (back * np.maximum(values, -_MOST_REMOVED)[:, None, :]) @ np.swapaxes(back, 1, 2)
     own[~system.good] = 0.0
     return own
+
+
+def level_errors(
+    sensor: Sensor, field: TestField, system: SeriesSystem, values: Array, level: Array
+) -> tuple[Array, Array]:
+    """Return the course (E,), centred and of range 1, of the series' main change, and the
+    covariance (16, 16) of what errors of the level add to a change by 1.
+
+    An image shows a change by the partials at the level: where a field hardly determines that, such
+    as one plane, a change of c looks like one of the principal point. values (E, 16); level (16,
+    16): covariance.
+    """
+    design, good, out = system.design, system.good, np.zeros((16, 16))
+    own, A, at = design.own, design.at.A[..., design.own], design.at
+    course = np.zeros(len(good))
+    w = system.used(good).mean(axis=0)[None] if good.any() else np.zeros((1, *A.shape[:1], 3))
+    N = normal_matrices(w, A) + design.own_prior
+    (Q,), (regular,) = cofactors(N)
+    if not regular or good.sum() < 2 or not len(own):
+        return course, out
+    root = np.linalg.cholesky(N[0])
+    away = values[good][:, own] @ root
+    away -= away.mean(axis=0)
+    direction = np.linalg.eigh(away.T @ away)[1][:, -1]
+    along = away @ direction
+    course[good] = along / max(float(np.ptp(along)), 1e-300)
+    change = np.linalg.solve(root.T, direction) * np.ptp(along)
+    scaled, scale = unit_diagonal(level)
+    for error in (symmetric_power(scaled, 0.5) / scale[:, None]).T:
+        more, less = (
+            linearise(sensor, field, at.iop + e[IOP], at.eop + e[EOP]).A for e in (error, -error)
+        )
+        looks = 0.5 * (more - less)[..., own] @ change
+        pull = Q @ right_hand_sides(w, looks[None], A)[0]
+        out[own[:, None], own] += np.outer(pull, pull)
+    return course, out
 
 
 def typical_sensitivity(system: SeriesSystem) -> Array:

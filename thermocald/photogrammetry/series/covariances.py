@@ -26,12 +26,13 @@ from thermocald.photogrammetry.series.normals import (
     right_hand_sides,
     sums_of_targets,
 )
+from thermocald.photogrammetry.series.system import SeriesSystem
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.system import SeriesSystem, State
+    from thermocald.photogrammetry.series.system import State
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
 AFFINITY = 1e-4  # of a good lens; fx and fy of phones differ by 1e-4 to 3e-3
@@ -168,28 +169,27 @@ def level_errors(
     as one plane, a change of c looks like one of the principal point. values (E, 16); level (16,
     16): covariance.
     """
-    design, good, out = system.design, system.good, np.zeros((16, 16))
-    own, A, at = design.own, design.at.A[..., design.own], design.at
-    course = np.zeros(len(good))
-    w = system.used(good).mean(axis=0)[None] if good.any() else np.zeros((1, *A.shape[:1], 3))
-    N = normal_matrices(w, A) + design.own_prior
-    (Q,), (regular,) = cofactors(N)
-    if not regular or good.sum() < 2 or not len(own):
+    design, rows, out = system.design, np.flatnonzero(system.good), np.zeros((16, 16))
+    own, at, course = design.own, design.at, np.zeros(len(system.good))
+    if len(rows) < 2 or not len(own):
         return course, out
-    root = np.linalg.cholesky(N[0])
-    away = values[good][:, own] @ root
-    away -= away.mean(axis=0)
-    direction = np.linalg.eigh(away.T @ away)[1][:, -1]
-    along = away @ direction
-    course[good] = along / max(float(np.ptp(along)), 1e-300)
-    change = np.linalg.solve(root.T, direction) * np.ptp(along)
+    w = system.used(rows).mean(axis=0, keepdims=True)
+    usual = SeriesSystem.formed(design, w, w[..., 0] > 0)
+    if not usual.good[0]:
+        return course, out
+    root = np.linalg.cholesky(usual.Q[0])
+    away = np.linalg.solve(root, (values[rows][:, own] - values[rows][:, own].mean(axis=0)).T)
+    direction = np.linalg.eigh(away @ away.T)[1][:, -1]
+    along = direction @ away
+    size = max(float(np.ptp(along)), 1e-300)
+    course[rows], change = along / size, root @ direction * size
     scaled, scale = unit_diagonal(level)
     for error in (symmetric_power(scaled, 0.5) / scale[:, None]).T:
         more, less = (
             linearise(sensor, field, at.iop + e[IOP], at.eop + e[EOP]).A for e in (error, -error)
         )
         looks = 0.5 * (more - less)[..., own] @ change
-        pull = Q @ right_hand_sides(w, looks[None], A)[0]
+        pull = usual.Q[0] @ right_hand_sides(w, looks[None], at.A[..., own])[0]
         out[own[:, None], own] += np.outer(pull, pull)
     return course, out
 

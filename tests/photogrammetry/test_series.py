@@ -176,7 +176,7 @@ def test_changes_are_as_uncertain_as_the_level_makes_them():
         noise = np.sqrt(12 / 30) * r.sd.mean(axis=0)  # of a line through 30 epochs
         line = 29 * np.polyfit(np.arange(30), r.values - truth, 1)[0]
         lines.append((line / np.hypot(r.trend_sd, noise))[:3])
-    assert rms(lines) < 1.6  # 24 values, correlated
+    assert 0.7 < rms(lines) < 1.4  # 24 values, correlated
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])

@@ -265,7 +265,9 @@ def result(
         movement = estimate_mount_movement(series, estimate)
     elif held:
         movement = replace(movement, white=shown_movement(system, estimate.residuals, unit))
-    slow = [level_errors(series.sensor, series.testfield, system, estimate.values, level)]
+    seen = series.sensor, series.testfield, system, estimate.values
+    combination, mean, turned = level_errors(*seen, level)
+    slow = [(np.where(sound, estimate.values @ combination - mean, 0.0), turned)]
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
         if held:

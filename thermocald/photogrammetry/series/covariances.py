@@ -161,28 +161,27 @@ def correlated_error_cofactors(
 
 def level_errors(
     sensor: Sensor, field: TestField, system: SeriesSystem, values: Array, level: Array
-) -> tuple[Array, Array]:
-    """Return the course (E,), centred and of range 1, of the series' main change, and the
-    covariance (16, 16) of what errors of the level add to a change by 1.
+) -> tuple[Array, float, Array]:
+    """Return the combination (16,) of parameters whose course is the series' main change, of range
+    1, its mean, and the covariance (16, 16) of what errors of the level add to a change by 1.
 
     An image shows a change by the partials at the level: where a field hardly determines that, such
     as one plane, a change of c looks like one of the principal point. values (E, 16); level (16,
     16): covariance.
     """
     design, rows, out = system.design, np.flatnonzero(system.good), np.zeros((16, 16))
-    own, at, course = design.own, design.at, np.zeros(len(system.good))
+    own, at, combination = design.own, design.at, np.zeros(16)
     if len(rows) < 2 or not len(own):
-        return course, out
+        return combination, 0.0, out
     w = system.used(rows).mean(axis=0, keepdims=True)
     usual = SeriesSystem.formed(design, w, w[..., 0] > 0)
     if not usual.good[0]:
-        return course, out
+        return combination, 0.0, out
     root = np.linalg.cholesky(usual.Q[0])
     away = np.linalg.solve(root, (values[rows][:, own] - values[rows][:, own].mean(axis=0)).T)
     direction = np.linalg.eigh(away @ away.T)[1][:, -1]
-    along = direction @ away
-    size = max(float(np.ptp(along)), 1e-300)
-    course[rows], change = along / size, root @ direction * size
+    size = max(float(np.ptp(direction @ away)), 1e-300)
+    combination[own], change = np.linalg.solve(root.T, direction) / size, root @ direction * size
     scaled, scale = unit_diagonal(level)
     for error in (symmetric_power(scaled, 0.5) / scale[:, None]).T:
         more, less = (
@@ -191,7 +190,7 @@ def level_errors(
         looks = 0.5 * (more - less)[..., own] @ change
         pull = usual.Q[0] @ right_hand_sides(w, looks[None], at.A[..., own])[0]
         out[own[:, None], own] += np.outer(pull, pull)
-    return course, out
+    return combination, float((values[rows] @ combination).mean()), out
 
 
 def typical_sensitivity(system: SeriesSystem) -> Array:

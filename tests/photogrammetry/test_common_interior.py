@@ -84,7 +84,13 @@ def errors(draws: int, seed: int, **drawn):
 
 def test_the_camera_is_as_accurate_as_stated():
     """In 16 draws of field and image noise; benchmarks.audit has more."""
-    found, _, z = zip(*errors(16, 7, step=4), strict=True)
+    found, stations, z = zip(*errors(16, 7, step=4), strict=True)
+    turned = [
+        (e.as_array() - s.as_array())[:3] / np.sqrt(np.diag(Q)[:3])
+        for r, true in zip(found, stations, strict=True)
+        for e, s, Q in zip(r.exteriors, true, r.exterior_covariances, strict=True)
+    ]
+    assert rms(turned, axis=0) == pytest.approx(np.ones(3), abs=0.3)
     assert rms(z, axis=0) == pytest.approx(np.ones(6), abs=3 / np.sqrt(2 * 16))
     assert np.mean([r.sigma0 for r in found]) == pytest.approx(1.0, abs=0.03)
 

@@ -165,6 +165,20 @@ def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
     assert 0.7 < rms(z) < 1.3  # 36 values, correlated
 
 
+def test_changes_are_as_uncertain_as_the_level_makes_them():
+    """In one plane c's drift looks like one of y0 if phi is wrong: by 10 sds without this."""
+    lines = []
+    for seed in range(8):
+        field, rng = scene.corner_field(0.02).subset(np.arange(49)), np.random.default_rng(seed)
+        truth = scene.warming_up(np.linspace(0, 20, 30))
+        truth[:, 0] += np.linspace(0, 0.01, 30)
+        r = scene.adjusted_series(field, scene.observe_series(field, truth, rng, 0.02))
+        noise = np.sqrt(12 / 30) * r.sd.mean(axis=0)  # of a line through 30 epochs
+        line = 29 * np.polyfit(np.arange(30), r.values - truth, 1)[0]
+        lines.append((line / np.hypot(r.trend_sd, noise))[:3])
+    assert 0.7 < rms(lines) < 1.4  # 24 values, correlated
+
+
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_noise_that_grows_towards_the_edge_is_estimated_with_its_sd(factor):
     """25 epochs of a stable camera, whose outermost target is `factor` times as noisy."""

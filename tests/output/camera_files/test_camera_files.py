@@ -359,6 +359,8 @@ def _own(**changes):
         ("Ck -8\nfoo 3\n", "foo"),
         ("1 1 -8 0 0 1e-3 0 0 0 0 0 0 0 8 6 2000 1500", "R0 is 0"),
         ("1 1 -8 0 0 0 0 2 0 0 0 0 0 8 6 0 1500", "columns"),
+        ("1 1 -8 0 0 0 0 2 0 0 0 0 0 6 8 2000 1500", "width and height exchanged"),
+        ("1 1 -8 0 0 0 0 2 0 0 0 0 0 8 6 2000 1500", "0.001 mm was given, but .* 0.004 mm"),
         ('{"format": "thermocald-camera/1"}', "sensor or interior"),
         (_own(covariance=[]), "covariance.matrix"),
         (_own(covariance={"parameters": ["x0", "c"]}), "covariance.parameters"),
@@ -379,6 +381,8 @@ def _own(**changes):
         ("1 PINHOLE 1280 720 944 -944 640 360\n", "fx is -1 times fy"),
         ("""cam0: {camera_model: pinhole, intrinsics: [944,2, 635.5, 359.5],
          resolution: [1280, 720]}""", "fx is 472 times fy"),
+        ("1 PINHOLE 1280 720 944 0 640 360\n", "principal distance of 0 px"),
+        ("1 PINHOLE 1280 720 944 944 360 640\n", "cx and cy, or width and height, exchanged"),
         ("1 PINHOLE 1280 720 944 944 6400 360\n", r"\(6400, 360\) px lies outside"),
         ("""<calibration><width>1280</width><height>720</height><f>944</f><cx>635</cx>
          </calibration>""", r"\(1274, 360\) px lies outside"),

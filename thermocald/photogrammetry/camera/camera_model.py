@@ -343,7 +343,40 @@ def partials(
         depth = np.where(depth > 0, depth, np.nan)
     inverse_depth = 1.0 / depth
     uv = q[..., :2, :] * inverse_depth[..., None, :]
-    ideal = i[..., 0, None, None] * uv
+    out = np.zeros((2, *uv.shape[:-2], 16, uv.shape[-1]))
+    measured, by_ideal = _partials_of_distortion(i, i[..., 0, None, None] * uv, out)
+    # The third component of `by_ideal` is ∂/∂c.
+    scale = (_UPWARDS / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
+    measured *= scale[..., 0]
+    measured += sensor.centre.reshape(scale[..., 0].shape)
+    by_ideal[..., :2, :] *= scale
+    by_c = by_ideal[..., 2, :]
+    pair = by_ideal[..., :2, :] * uv
+    np.add(pair[..., 0, :], pair[..., 1, :], out=by_c)
+    out[..., 1:10, :] *= scale
+    out[..., 0, :] = by_c
+
+    # With respect to the object point: D = R · (c / depth · by_ideal). A small rotation about the
+    # axis w changes q by q × w, and the image point by w · (D × q).
+    by_point = R @ (by_ideal * (i[..., 0, None] * inverse_depth)[..., None, :])
+    np.negative(by_point, out=out[..., 13:16, :])
+    crosswise = uv[..., ::-1, :]
+    moment = np.empty(by_ideal.shape)
+    np.multiply(by_c[..., None, :], crosswise, out=moment[..., :2, :])
+    moment[..., :2, :] += by_ideal[..., 1::-1, :]
+    np.multiply(by_ideal[..., :2, :], crosswise, out=pair)
+    np.subtract(pair[..., 0, :], pair[..., 1, :], out=moment[..., 2, :])
+    np.matmul(turning_axes(e, R) * (i[..., 0, None, None] * _TURNS), moment, out=out[..., 10:13, :])
+    image_points = measured.transpose(*range(1, measured.ndim), 0)
+    return image_points, _points_first(out), _points_first(by_point)
+
+
+def _partials_of_distortion(i: Array, ideal: Array, out: Array) -> tuple[Array, Array]:
+    """Write the partials of image points with respect to x0 to C2 to `out` (2, ..., 16, n).
+
+    i (..., 10), ideal (..., 2, n) mm. Returns image points (2, ..., n) mm about the image centre,
+    and in the first two of three components (2, ..., 3, n) their partials by the ideal points.
+    """
     batch, n = ideal.shape[:-2], ideal.shape[-1]
     by_axis = ideal.transpose(len(batch), *range(len(batch)), -1)  # (2, ..., n)
     x, y = by_axis[0], by_axis[1]
@@ -359,7 +392,6 @@ def partials(
     np.multiply(r2, r4, out=powers[..., 3, :])
 
     # The image point is linear in x0 to C2: their partials come first and give the point itself.
-    out = np.zeros((2, *batch, 16, n))
     out[0, ..., 1, :] = out[1, ..., 2, :] = 1.0
     twice = 2 * squares
     np.multiply(by_axis[..., None, :], powers[..., 1:4, :], out=out[..., 3:6, :])
@@ -379,34 +411,10 @@ def partials(
     jacobian = squares
     jacobian *= (i[..., None, 3:6] * _SLOPE) @ powers[..., :3, :]
     jacobian += linear @ powers
-
-    # With respect to the camera coordinates: the same, with ∂/∂c as its third component
     by_ideal = np.empty((2, *batch, 3, n))
     np.add(jacobian[..., :2, :], i[..., 8:10, None], out=by_ideal[0, ..., :2, :])
     by_ideal[1, ..., :2, :] = jacobian[..., 1:, :]
-    scale = (_UPWARDS / sensor.pixel_pitch).reshape(2, *(1,) * (out.ndim - 1))
-    measured *= scale[..., 0]
-    measured += sensor.centre.reshape(scale[..., 0].shape)
-    by_ideal[..., :2, :] *= scale
-    by_c = by_ideal[..., 2, :]
-    pair = by_ideal[..., :2, :] * uv
-    np.add(pair[..., 0, :], pair[..., 1, :], out=by_c)
-    out[..., 1:10, :] *= scale
-    out[..., 0, :] = by_c
-
-    # With respect to the object point: D = R · (c / depth · by_ideal). A small rotation about the
-    # axis w changes q by q × w, and the image point by w · (D × q).
-    by_point = R @ (by_ideal * (i[..., 0, None] * inverse_depth)[..., None, :])
-    np.negative(by_point, out=out[..., 13:16, :])
-    crosswise = uv[..., ::-1, :]
-    moment = np.empty((2, *batch, 3, n))
-    np.multiply(by_c[..., None, :], crosswise, out=moment[..., :2, :])
-    moment[..., :2, :] += by_ideal[..., 1::-1, :]
-    np.multiply(by_ideal[..., :2, :], crosswise, out=pair)
-    np.subtract(pair[..., 0, :], pair[..., 1, :], out=moment[..., 2, :])
-    np.matmul(turning_axes(e, R) * (i[..., 0, None, None] * _TURNS), moment, out=out[..., 10:13, :])
-    image_points = measured.transpose(*range(1, measured.ndim), 0)
-    return image_points, _points_first(out), _points_first(by_point)
+    return measured, by_ideal
 
 
 def _points_first(array: Array) -> Array:

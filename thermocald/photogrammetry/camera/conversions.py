@@ -142,7 +142,7 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
             except np.linalg.LinAlgError:
                 break
     raise GeometryError(
-        f"the {family.name} model has no rays for some of the image: its distortion folds back "
+        f"the {family.name} has no rays for some of the image: its distortion folds back "
         "inside the picture; it was calibrated over a smaller area, or its parameters are wrong"
     )
 

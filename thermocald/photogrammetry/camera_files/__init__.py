@@ -47,6 +47,7 @@ FORMATS: dict[str, Format] = {
 _LARGEST_FILE = 10_000_000
 _LARGEST_ASPECT = 2.0  # of fx and fy; that of anamorphic lenses
 _EDGE = 0.01  # of the image's shorter side
+_FAR = 0.1  # the same, for a principal point that is another image's centre
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +149,12 @@ def read(
             raise ConfigurationError(
                 f"the principal point ({u:.0f}, {v:.0f}) px lies outside the {W} × {H} px of the "
                 "image or at its edge: is a number wrong, or the size that of another image?"
+            )
+        away, exchanged = (np.hypot(u - x / 2, v - y / 2) for x, y in ((W, H), (H, W)))
+        if away > _FAR * min(W, H) > 4 * exchanged:
+            raise ConfigurationError(
+                f"the principal point ({u:.0f}, {v:.0f}) px is the centre of an image of {H} × {W} "
+                f"px, not of {W} × {H} px: are cx and cy, or width and height, exchanged?"
             )
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause

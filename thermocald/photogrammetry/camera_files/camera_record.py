@@ -80,6 +80,7 @@ def among(known: Mapping[str, _T], given: Any, what: str) -> _T:
 
 
 _LARGEST = 1e9
+_LONGEST = 300.0  # principal distance in image widths: a field of view of 0.2°
 _ROUNDED = 1e-4  # of a correlation, in files with few digits
 _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
 
@@ -134,7 +135,7 @@ class CameraRecord:
                     "symmetric: is a number wrong?"
                 )
         own = self.pixel_pitch
-        if self.family is BROWN and own and given and not np.isclose(given, own, rtol=1e-9):
+        if own and given and not np.isclose(given, own, rtol=1e-9):  # its terms are in mm
             raise ConfigurationError(
                 f"pixel pitch {given:g} mm was given, but the file states {own:g} mm"
             )
@@ -146,7 +147,7 @@ class CameraRecord:
                     "the file does not state the pixel pitch: give it, in mm (--pixel-pitch "
                     "0.00112 for a Raspberry Pi camera v2.1)"
                 )
-            pitch = float(stated.group(1))
+            pitch = number(stated.group(1), "pixel_pitch_mm")
         if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
             raise ConfigurationError(
                 f"pixel pitch {pitch:g} mm: it must be between 0.00001 and 1 mm"
@@ -154,7 +155,9 @@ class CameraRecord:
         sensor = Sensor(width, height, pitch)
         # a focal length of zero or less would fail later, with a message less clear
         focal = self.values[0] / (pitch if self.family.parameters[0] == "c" else 1.0)
-        if not 0.05 * max(self.size) < focal < 1000 * max(self.size):
+        if self.family.parameters[1] == "fy" and abs(self.values[1]) < 1.0:
+            focal = self.values[1]
+        if not 0.05 * max(self.size) < focal < _LONGEST * max(self.size):
             raise ConfigurationError(
                 f"a principal distance of {focal:g} px is impossible for an image of {width} × "
                 f"{height} px"

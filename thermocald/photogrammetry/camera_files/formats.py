@@ -298,6 +298,7 @@ _AICON_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 _AICON_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
 _AICON_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
 _AICON_FIELDS = ("camera", "type", *_AICON_LINES, *_AICON_SIZES)
+_SQUARE = 0.02  # relative difference of a pixel's sides, as the sensor's are often rounded
 _TAGS = METASHAPE_FRAME.parameters
 
 
@@ -340,14 +341,20 @@ def _decode_aicon(text: str) -> CameraRecord:
             "line instead"
         )
     values[0] = abs(values[0])
-    width, _, *pixels = [number(found[key], key) for key in _AICON_SIZES]
+    width, height, *pixels = [number(found[key], key) for key in _AICON_SIZES]
     if not 0 <= r0 < 1000:
         raise ConfigurationError(f"R0 is {r0:g} mm: it must be a radius in the image, 0 to 1000 mm")
-    if not 1 <= pixels[0] < 1e6:
-        raise ConfigurationError(f"pixels_x: {pixels[0]:g} columns of pixels are impossible")
+    if not all(1 <= side < 1e6 for side in pixels):
+        raise ConfigurationError(f"{pixels[0]:g} columns, {pixels[1]:g} rows are impossible")
+    pitch = width / pixels[0]
+    if not np.isclose(height / pixels[1], pitch, rtol=_SQUARE):
+        raise ConfigurationError(
+            f"a sensor of {width:g} × {height:g} mm with {pixels[0]:g} × {pixels[1]:g} pixels does "
+            "not have square ones: are width and height exchanged?"
+        )
     covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES]) if spread else None
     family = measured_point(r0) if record is None else aicon(r0)
-    return CameraRecord(pixels, family, values, name, covariance, width / pixels[0])
+    return CameraRecord(pixels, family, values, name, covariance, pitch)
 
 
 def _aicon_record(text: str) -> dict[str, str] | None:

@@ -43,6 +43,7 @@ from thermocald.photogrammetry.network.bundle import (
     inner_constraints,
     point_tests,
 )
+from thermocald.photogrammetry.network.shared_errors import estimate_shared_errors
 from thermocald.photogrammetry.network.start import approximate
 
 if TYPE_CHECKING:
@@ -359,8 +360,8 @@ def adjust_network(
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
-    shared = adjustment.shared_errors(bundle, found, variance, redundancy)
-    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, shared)
+    shared = estimate_shared_errors(adjustment, bundle, found, variance, redundancy)
+    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows, *shared[1:])
     placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,
         of_points,

@@ -11,10 +11,9 @@ Rotations are updated in object space (`R ← exp([w]×) R`), so that there is n
 
 Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
 adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56); Triggs, B. et al.
-(2000): Bundle adjustment — a modern synthesis, sections 6 and 9; Harville, D. A. (1977): Maximum
-likelihood approaches to variance component estimation and to related problems, Journal of the
-American Statistical Association 72, section 5.2; Armijo, L. (1966): Minimization of functions
-having Lipschitz continuous first partial derivatives, Pacific Journal of Mathematics 16.
+(2000): Bundle adjustment — a modern synthesis, sections 6 and 9; Armijo, L. (1966): Minimization
+of functions having Lipschitz continuous first partial derivatives, Pacific Journal of Mathematics
+16.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
     rotation_angles,
 )
-from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import (
     median_variance,
     rigid_motion,
@@ -62,15 +60,7 @@ BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _LEAST_DECREASE = 0.5  # of what the step predicts
 _DAMPING = 1e-6  # of the unit diagonal, so that a weak free network does not run away
-_OF_CAMERA = ("c", "x0", "y0", "C1", "C2")
-# of `_OF_CAMERA`, of the squares of a bent field, and of squares in the image
-_KINDS = (0, 1, 1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4)
-_FEWEST_TO_COMPARE = 3  # photographs
-_LEAST_SHARE = 1e-6  # of the largest eigenvalue, below which an error is absorbed altogether
-_DISAGREE = 3.0  # standard deviations of the ratio of two variances
-_ITERATIONS = 60
 _AS_STATED = 2.0  # residuals in their sigmas: larger ones have another cause than weak geometry
-_WIDEST = 3.0  # the factor for a variance from hardly any degree of freedom
 _CONTROLLED = 1e-3  # cofactor of a residual below which no other observation controls it
 
 
@@ -170,21 +160,6 @@ class Cofactors:
     weakest: tuple[str, ...] = ()
 
 
-class SharedErrors(NamedTuple):
-    """The errors that the image points of one photograph share: another focus, a shifted principal
-    point, a sheared image (rolling shutter), a bent field, and what else bends the image smoothly.
-
-    disagreement: how many times larger than by chance, 1 if that may be chance; noise: variance of
-    unit weight without them; cameras (e, u), targets (e, 3m): roots of what the e errors add to
-    the covariance.
-    """
-
-    disagreement: float
-    noise: float
-    cameras: Array
-    targets: Array
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleAdjustment:
     """The adjustment of one camera's image points with interior orientation, poses and targets.
@@ -269,7 +244,7 @@ class BundleAdjustment:
     def with_held_targets(self, bundle: Bundle) -> BundleAdjustment:
         """Return the adjustment that holds known targets and adds their covariance to the rays'."""
         assert self.known is not None
-        by_target = self._linearised(bundle, np.ones(len(self.rays)))[2]
+        by_target = self.linearised(bundle, np.ones(len(self.rays)))[2]
         J = by_target / np.sqrt(self.known.weights)[self.rays.target, None]
         root = np.linalg.cholesky(np.eye(2) + J @ np.swapaxes(J, 1, 2))
         rays = replace(self.rays, whitening=np.linalg.solve(root, self.rays.whitening))
@@ -308,8 +283,8 @@ class BundleAdjustment:
         """Return the cofactors (n, 2, 2) of the adjusted, whitened image points, which do not
         depend on the datum. The rays may be others than those of the adjustment.
         """
-        _, J, by_target = self._linearised(bundle, np.ones(len(self.rays)))
-        columns = self._columns[:, :, None]
+        _, J, by_target = self.linearised(bundle, np.ones(len(self.rays)))
+        columns = self.columns[:, :, None]
         rows = 3 * self.rays.target[:, None] + np.arange(3)
         half = J @ found.mixed[columns, rows[:, None, :]] @ np.swapaxes(by_target, 1, 2)
         follow, mixed = (a.reshape(len(a), -1, 3) for a in (found.follow, found.mixed))
@@ -322,70 +297,8 @@ class BundleAdjustment:
         )
         return total
 
-    def shared_errors(
-        self, bundle: Bundle, found: Cofactors, variance: float, redundancy: float
-    ) -> SharedErrors:
-        """Estimate the errors that the image points of one photograph share.
-
-        variance: of unit weight, from all residuals. What all photographs have in common shows
-        nothing and is left out.
-        """
-        rays, k, f, q = self.rays, len(bundle.centres), len(self.free), len(_KINDS)
-        E, ones = self._effects(bundle), np.ones(len(self.rays))
-        v, by_camera, by_point = self._linearised(bundle, ones)
-        C, P, F = (np.swapaxes(part, 1, 2) for part in (by_camera, by_point, E))
-        photo, target, m = rays.photo[:, None], rays.target[:, None], len(bundle.points)
-        R = _sum_at((f + 6 * k, k, q), (self._columns, photo), C @ E)
-        r = _sum_at((m, 3, k, q), (target, np.arange(3), photo), P @ E)
-        blocks = _sum_at((k, q, q), (rays.photo,), F @ E)
-        b = _sum_at((k, q), (rays.photo,), F @ v[..., None])
-        R_all, r_all = R.reshape(len(R), -1), r.reshape(-1, k * q)
-        # how cameras and targets follow the errors
-        cameras = found.cameras @ (R_all + found.follow @ r_all)
-        targets = (found.own @ r.reshape(-1, 3, k * q)).reshape(r_all.shape)
-        targets += found.follow.T @ cameras
-        M = (-R_all.T @ cameras - r_all.T @ targets).reshape(k, q, k, q)
-        np.einsum("iqip->iqp", M)[...] += blocks
-        # their mean is eliminated
-        of_mean = M.sum(axis=2).reshape(k * q, q)
-        inverse = np.linalg.pinv(M.sum(axis=(0, 2)), rcond=1e-6, hermitian=True)
-        b = b.ravel() - of_mean @ inverse @ b.sum(axis=0)
-        M = M.reshape(k * q, k * q) - of_mean @ inverse @ of_mean.T
-        values, vectors = np.linalg.eigh((M + M.T) / 2)
-        known = values > _LEAST_SHARE * values[-1]
-        rank = int(known.sum())
-        left = redundancy - rank
-        if k < _FEWEST_TO_COMPARE or left < rank:
-            return SharedErrors(1.0, variance, 0 * cameras.T, 0 * targets.T)
-        explained = float(np.sum((b @ vectors)[known] ** 2 / values[known]))
-        noise = (variance * redundancy - explained) / left
-        ratio = explained / rank / noise
-        disagree = ratio > 1 + _DISAGREE * np.sqrt(2 / rank + 2 / left)
-        sds = _variance_components(M / noise, b / noise, _WIDEST if disagree else 1.0)[:, None]
-        return SharedErrors(
-            float(np.sqrt(ratio)) if disagree else 1.0, noise, sds * cameras.T, sds * targets.T
-        )
-
-    def _effects(self, bundle: Bundle) -> Array:
-        """Return whitened partials (n, 2, q) of the image points by what photographs differ in
-        (`_KINDS`), with a mean square of 1.
-        """
-        columns = np.array([IOP_NAMES.index(name) for name in _OF_CAMERA])
-        every = replace(self, free=columns, known=None)
-        _, by_camera, by_point = every._linearised(bundle, np.ones(len(self.rays)))
-        middle, axes, _ = plane_fit(bundle.points)
-        x, y, _ = ((bundle.points - middle) @ axes.T)[self.rays.target].T
-        bent = (by_point @ axes[2])[:, :, None] * np.stack([x * x, x * y, y * y], axis=1)[:, None]
-        u, w = (self.rays.points - self.sensor.centre).T
-        squares = np.stack([u * u, u * w, w * w], axis=1)
-        smooth = self.rays.whitening[..., None] * squares[:, None, None]
-        smooth = smooth.reshape(len(squares), 2, 6)
-        E = np.concatenate([by_camera[:, :, : len(columns)], bent, smooth], axis=2)
-        size = np.sqrt(np.mean(np.sum(E * E, axis=1), axis=0))
-        return E / np.where(size > 0, size, 1.0)
-
     @property
-    def _columns(self) -> Index:
+    def columns(self) -> Index:
         """Columns (n, f + 6) of each ray's camera and pose in the normal equations."""
         pose = len(self.free) + 6 * self.rays.photo[:, None] + np.arange(6)
         interior = np.broadcast_to(np.arange(len(self.free)), (len(pose), len(self.free)))
@@ -398,7 +311,7 @@ class BundleAdjustment:
             total += float(np.sum(self.known.weights * (bundle.points - self.known.places) ** 2))
         return total
 
-    def _linearised(self, bundle: Bundle, weights: Array) -> tuple[Array, Array, Array]:
+    def linearised(self, bundle: Bundle, weights: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (n, 2), and the partials with respect to camera and pose
         (n, 2, f + 6) and to the target (n, 2, 3), 0 if that is held.
         """
@@ -424,8 +337,8 @@ class BundleAdjustment:
         """Return normal blocks of the cameras (u, u), interior first, then six per photograph; of
         cameras by targets (u, 3m); of targets (m, 3, 3); and right-hand sides (u,), (m, 3).
         """
-        v, by_camera, by_point = self._linearised(bundle, weights)
-        columns, target, m = self._columns, self.rays.target, len(bundle.points)
+        v, by_camera, by_point = self.linearised(bundle, weights)
+        columns, target, m = self.columns, self.rays.target, len(bundle.points)
         u = len(self.free) + 6 * len(bundle.centres)
         C, P = np.swapaxes(by_camera, 1, 2), np.swapaxes(by_point, 1, 2)
         A = np.zeros((u, u))
@@ -433,10 +346,10 @@ class BundleAdjustment:
             mine = self.rays.photo == photo
             rows, J = columns[mine][0], by_camera[mine].reshape(-1, columns.shape[1])
             A[rows[:, None], rows] += J.T @ J
-        B = _sum_at((u, m, 3), (columns, target[:, None]), C @ by_point)
-        D = _sum_at((m, 3, 3), (target,), P @ by_point)
-        a = _sum_at((u,), (columns,), C @ v[..., None])
-        d = _sum_at((m, 3), (target,), P @ v[..., None])
+        B = sum_at((u, m, 3), (columns, target[:, None]), C @ by_point)
+        D = sum_at((m, 3, 3), (target,), P @ by_point)
+        a = sum_at((u,), (columns,), C @ v[..., None])
+        d = sum_at((m, 3), (target,), P @ v[..., None])
         if self.known is not None:
             D += self.known.weights[:, :, None] * np.eye(3)
             d += self.known.weights * (self.known.places - bundle.points)
@@ -465,7 +378,7 @@ class BundleAdjustment:
         return dc, dp, float(dc @ a + dp.ravel() @ d.ravel())
 
 
-def _sum_at(shape: tuple[int, ...], index: tuple[Index, ...], values: Array) -> Array:
+def sum_at(shape: tuple[int, ...], index: tuple[Index, ...], values: Array) -> Array:
     """Sum values at indices of the leading axes of an array of this shape; the latter broadcast."""
     at = np.ravel_multi_index(np.broadcast_arrays(*index), shape[: len(index)])
     inner = prod(shape[len(index) :])
@@ -489,42 +402,17 @@ def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Arra
     return A - BD @ B.T, a - BD @ d.ravel(), inverses
 
 
-def _variance_components(M: Array, b: Array, widest: float) -> Array:
-    """Return the standard deviation (k q,) of each photograph's errors by restricted maximum
-    likelihood: one for all errors of a kind.
-
-    M, b: their normal equations, for a noise of 1. With few photographs the variance itself is
-    uncertain: it is that of Student's t with as many degrees of freedom as the data determine.
-    """
-    kinds = np.eye(max(_KINDS) + 1)[np.tile(_KINDS, len(b) // len(_KINDS))]
-    start = (b**2 @ kinds) / np.maximum(M.diagonal() ** 2 @ kinds, 1e-300)
-    variances = start
-    for _ in range(_ITERATIONS):
-        sds = np.sqrt(kinds @ variances)
-        Q = np.linalg.inv(sds[:, None] * M * sds + np.eye(len(b)))
-        errors = sds * (Q @ (sds * b))
-        freedom = (1 - Q.diagonal()) @ kinds
-        new = errors**2 @ kinds / np.maximum(freedom, 1e-12)
-        new = np.clip(new, np.maximum(variances / 10, 1e-12 * start), variances * 10)
-        # one that vanishes falls for long
-        settled = np.all(np.abs(new - variances) < 1e-2 * variances + 1e-4 * start)
-        variances = new
-        if settled:
-            break
-    wider = np.minimum(freedom / np.maximum(freedom - 2, 1e-3), widest)
-    result: Array = np.sqrt(kinds @ (variances * wider))
-    return result
-
-
 def inner_constraints(
-    bundle: Bundle, found: Cofactors, free: Index, shared: SharedErrors
+    bundle: Bundle, found: Cofactors, free: Index, noise: float, more_c: Array, more_p: Array
 ) -> tuple[Array, Array, Array]:
     """Return the covariances of a free network with inner constraints over the targets: of the
     interior orientation (10, 10), zero if held, the centres (k, 3, 3) mm² and the targets (3m, 3m)
     mm².
+
+    noise: variance of unit weight; more_c (e, u), more_p (e, 3m): roots of what is added to the
+    covariances of cameras and targets.
     """
     f, k, m = len(free), len(bundle.centres), len(bundle.points)
-    _, noise, more_c, more_p = shared
     Qp = noise * found.follow.T @ found.mixed + more_p.T @ more_p
     blocks = np.einsum("mimj->mij", Qp.reshape(m, 3, m, 3))  # a view
     blocks += noise * found.own

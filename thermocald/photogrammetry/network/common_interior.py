@@ -44,6 +44,7 @@ from thermocald.photogrammetry.network.bundle import (
     KnownTargets,
     point_tests,
 )
+from thermocald.photogrammetry.network.shared_errors import estimate_shared_errors
 from thermocald.photogrammetry.orientation import resection
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def adjust_common_interior(
     f, eops = len(free), bundle.exteriors()
     # how weak the geometry is, whatever the photographs disagree in
     weak = _weaknesses(bundle, part, found.cameras[:f, :f] * noise[0], s)
-    shared = part.shared_errors(bundle, found, *noise)
+    shared = estimate_shared_errors(part, bundle, found, *noise)
     Q = found.cameras * shared.noise + shared.cameras.T @ shared.cameras
     covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[:f, :f]

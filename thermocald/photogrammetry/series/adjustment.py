@@ -45,6 +45,7 @@ from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
     correlated_error_cofactors,
     estimate_held_affinity,
+    level_errors,
     line_weights,
     perspective_cofactor_roots,
     scaled_covariances,
@@ -264,7 +265,9 @@ def result(
         movement = estimate_mount_movement(series, estimate)
     elif held:
         movement = replace(movement, white=shown_movement(system, estimate.residuals, unit))
-    slow: list[tuple[Array, Array]] = []
+    seen = series.sensor, series.testfield, system, estimate.values
+    combination, mean, turned = level_errors(*seen, level)
+    slow = [(np.where(sound, estimate.values @ combination - mean, 0.0), turned)]
     line, step = line_weights(sound), 0
     if movement.covariance.any() and sound.any():
         if held:

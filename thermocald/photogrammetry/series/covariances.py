@@ -10,21 +10,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
-from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, IOP, PARAMETER_NAMES
+from thermocald.photogrammetry.linalg import (
+    inverse_2x2,
+    inverse_of_determined,
+    root_of,
+    symmetric_power,
+    unit_diagonal,
+)
 from thermocald.photogrammetry.series.normals import (
     as_matrices,
     cofactors,
     linearise,
     normal_matrices,
+    right_hand_sides,
     sums_of_targets,
 )
+from thermocald.photogrammetry.series.system import SeriesSystem
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.system import SeriesSystem, State
+    from thermocald.photogrammetry.series.system import State
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
 AFFINITY = 1e-4  # of a good lens; fx and fy of phones differ by 1e-4 to 3e-3
@@ -149,6 +157,40 @@ def correlated_error_cofactors(
     own = (back * np.maximum(values, -_MOST_REMOVED)[:, None, :]) @ np.swapaxes(back, 1, 2)
     own[~system.good] = 0.0
     return own
+
+
+def level_errors(
+    sensor: Sensor, field: TestField, system: SeriesSystem, values: Array, level: Array
+) -> tuple[Array, float, Array]:
+    """Return the combination (16,) of parameters whose course is the series' main change, of range
+    1, its mean, and the covariance (16, 16) of what errors of the level add to a change by 1.
+
+    An image shows a change by the partials at the level: where a field hardly determines that, such
+    as one plane, a change of c looks like one of the principal point. values (E, 16); level (16,
+    16): covariance.
+    """
+    design, rows, out = system.design, np.flatnonzero(system.good), np.zeros((16, 16))
+    own, at, combination = design.own, design.at, np.zeros(16)
+    if len(rows) < 2 or not len(own):
+        return combination, 0.0, out
+    w = system.used(rows).mean(axis=0, keepdims=True)
+    usual = SeriesSystem.formed(design, w, w[..., 0] > 0)
+    if not usual.good[0]:
+        return combination, 0.0, out
+    root = np.linalg.cholesky(usual.Q[0])
+    away = np.linalg.solve(root, (values[rows][:, own] - values[rows][:, own].mean(axis=0)).T)
+    direction = np.linalg.eigh(away @ away.T)[1][:, -1]
+    size = max(float(np.ptp(direction @ away)), 1e-300)
+    combination[own], change = np.linalg.solve(root.T, direction) / size, root @ direction * size
+    scaled, scale = unit_diagonal(level)
+    for error in (symmetric_power(scaled, 0.5) / scale[:, None]).T:
+        more, less = (
+            linearise(sensor, field, at.iop + e[IOP], at.eop + e[EOP]).A for e in (error, -error)
+        )
+        looks = 0.5 * (more - less)[..., own] @ change
+        pull = usual.Q[0] @ right_hand_sides(w, looks[None], at.A[..., own])[0]
+        out[own[:, None], own] += np.outer(pull, pull)
+    return combination, float((values[rows] @ combination).mean()), out
 
 
 def typical_sensitivity(system: SeriesSystem) -> Array:

@@ -36,6 +36,7 @@ from thermocald.photogrammetry.series.adjustment import (
 )
 from thermocald.photogrammetry.series.covariances import (
     correlated_error_cofactors,
+    level_errors,
     line_weights,
     scaled_covariances,
     with_excess,
@@ -205,7 +206,8 @@ class KnownSeries:
     (p, q + 2T): mean G by which own parameters depend on the common ones; used: number of
     observations that these use up; excess (16,): variance of the epochs' excess scatter; middle
     (16,): start values of epochs; pairs: correlated errors of targets; movement: of the mount; slow
-    (16, 16): covariance of a straight line over the series from slow errors.
+    (16, 16): covariance of a straight line over the series from slow errors; combination (16,),
+    at, turned (16, 16): from `level_errors`.
     """
 
     estimator: SeriesEstimator
@@ -220,6 +222,9 @@ class KnownSeries:
     pairs: CorrelatedPairs | None
     movement: Movement
     slow: Array
+    combination: Array
+    at: float
+    turned: Array
 
     @classmethod
     def of(
@@ -230,7 +235,7 @@ class KnownSeries:
         at = system.design.at
         design = series.design(at, unit)
         slow = sum(
-            ((2.0 * course[-1]) ** 2 * changes for course, changes in sample.slow),
+            ((2.0 * course[-1]) ** 2 * changes for course, changes in sample.slow[1:]),
             np.zeros((16, 16)),
         )
         good = sample.ok
@@ -242,6 +247,9 @@ class KnownSeries:
         return cls(
             held, design, estimate.offsets, estimate.pose, system.Q_common, mean,
             system.common_share, sample.excess_sd**2, middle, sample.pairs, sample.movement, slow,
+            *level_errors(
+                series.sensor, series.testfield, system, estimate.values, sample.level_covariance
+            ),
         )  # fmt: skip
 
     def adjusted(
@@ -268,6 +276,8 @@ class KnownSeries:
         if self.slow.any():
             # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
             covariance += (line * system.good)[:, None, None] ** 2 * self.slow
+        course = estimate.values @ self.combination - self.at
+        covariance += (np.where(system.good, course, 0.0) ** 2)[:, None, None] * self.turned
         judged = judge_epochs(held, estimate, covariance, unit, pooled, sigma0, redundancy)
         return estimate, judged
 
@@ -398,7 +408,8 @@ def _carry(
     for column in common:
         old = np.nan_to_num(rows.sd[:, column])
         rows.sd[:, column] = np.where(ok, np.sqrt(old**2 + level[column]), np.nan)
-    trend, block = known.slow.copy(), np.ix_(own, own)
+    course = line_weights(ok) @ np.nan_to_num(rows.values @ known.combination)
+    trend, block = known.slow + course**2 * known.turned, np.ix_(own, own)
     if len(later.cofactors):
         tilt = line @ root_of(later.cofactors)
         trend[block] += tilt @ tilt.T * unit

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
 
 _HIDDEN = 0.3  # of the noise's variance, below which a movement cannot be estimated per epoch
-_FILLED = 1.5  # variance of an epoch about its two neighbours' mean
 _AMISS = 0.5  # share of a brief movement that may be otherwise, which real cameras show
 _FLAT = 1e-6  # of the noise's variance, for directions without movement
 

@@ -129,17 +129,17 @@ class SeriesAdjustment:
     the series', NaN if the EOP are per epoch; excess_sd (16,): scatter of neighbouring epochs
     beyond their noise, as the set-up trembles or the light flickers: included in the covariance, 0
     if not significant; trend_sd (16,): of a straight line from the first epoch to the last, from
-    the targets' coordinates if the visible ones changed, slow errors of targets, and a mount with
-    memory; perspective_sd (16,): of an epoch with a completely free mount, NaN if the EOP are per
-    epoch; field_ratio: estimated over stated standard deviations of the field's coordinates, at
-    least 1; outer_noise: noise of the outermost target over that in the image's middle, and its
-    standard deviation, NaN if weights do not follow it; noise_shown: whether residuals show the
-    noise rather than the field's errors; noise_ratio: estimated over stated noise; affinity: of
-    held C1 and C2; movement: of the mount; choice: how the exterior orientation was estimated, and
-    why; slow: errors common to all epochs but for a factor, each as that course (E,) and the
-    covariance (16, 16) of a change by 1: slow errors of targets, jumps of the mount; step: the
-    first epoch (row) after targets moved against one another, 0 for none; pairs: of coordinates
-    with correlated errors.
+    the targets' coordinates if the visible ones changed, errors of the level if the camera changes,
+    slow errors of targets, and a mount with memory; perspective_sd (16,): of an epoch with a
+    completely free mount, NaN if the EOP are per epoch; field_ratio: estimated over stated standard
+    deviations of the field's coordinates, at least 1; outer_noise: noise of the outermost target
+    over that in the image's middle, and its standard deviation, NaN if weights do not follow it;
+    noise_shown: whether residuals show the noise rather than the field's errors; noise_ratio:
+    estimated over stated noise; affinity: of held C1 and C2; movement: of the mount; choice: how
+    the exterior orientation was estimated, and why; slow: errors common to all epochs but for a
+    factor, each as that course (E,) and the covariance (16, 16) of a change by 1: errors of the
+    level, slow errors of targets, jumps of the mount; step: the first epoch (row) after targets
+    moved against one another, 0 for none; pairs: of coordinates with correlated errors.
     """
 
     settings: SeriesSettings

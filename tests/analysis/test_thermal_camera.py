@@ -35,16 +35,35 @@ LISTED = (
     ModelEffect("hysteresis", {"half_width": 0.5}, {"half_width": 0.05}),
     ModelEffect("thermal_gradient", {"x0": 1e-3}, {"x0": 1e-5}),
 )
+FORMULA = ModelEffect("square(offset(lag(temperature, tau), k))", {"tau": 99.0, "k": 30.5,
+                      "y0": 2e-6}, {"tau": 1.0, "k": 0.3, "y0": 1e-8})  # fmt: skip
 
 
 @pytest.mark.parametrize("T", [22.0, 25.0, 37.9, 44.0])
 def test_the_steady_state_is_the_end_of_a_long_history(T):
-    camera = ThermalCamera(thermal_model(*LISTED))
+    camera = ThermalCamera(thermal_model(*LISTED, FORMULA))
     now = camera.at(T)
     along = camera.along([0.0, 5e4, 1e5], [T, T, T])
     assert along[-1].name == camera.model.camera
     np.testing.assert_allclose(along.values[-1], now.values, rtol=0, atol=1e-14)
     np.testing.assert_allclose(along.covariance[-1], now.covariance, rtol=1e-6, atol=1e-22)
+
+
+@pytest.mark.parametrize("since", [None, 500.0])
+def test_the_noise_of_readings_against_draws(since):
+    """A gradient magnifies it (the stated sd was 20 times too small), a lag averages it."""
+    camera, rng = ThermalCamera(thermal_model(*LISTED, FORMULA)), np.random.default_rng(3)
+    times, at, sd = np.arange(0.0, 1500.0, 10.0), np.arange(605.0, 1400.0, 90.0), 0.02
+    T = 25.0 + 15.0 * (1.0 - np.exp(-times / 600.0))
+    drawn = []
+    for _ in range(300):
+        found = camera.along(times, T + rng.normal(0.0, sd, len(T)), [*at, since or at[0]]).values
+        drawn.append(found[:-1] - (0.0 if since is None else found[-1]))
+    with_noise, without = (camera.along(times, T, at, temperature_sd=s, since=since).covariance
+                           for s in (sd, 0.0))  # fmt: skip
+    stated = np.sqrt(np.diagonal(with_noise - without, axis1=1, axis2=2))[:, :4]
+    scatter = np.std(drawn, axis=0)[:, :4] / stated
+    np.testing.assert_allclose(np.sqrt(np.mean(scatter**2, axis=0)), 1.0, atol=0.06)
 
 
 def test_covariance_against_draws():
@@ -157,6 +176,20 @@ def test_warm_up_time_of_an_exponential():
     assert steady_from == pytest.approx(300.0 * np.log(worst / 2.0), abs=6.0)
     still_moving, _ = warm_up(camera.along(t[:60], T[:60]), 10_000.0, 0.1)
     assert still_moving is None
+
+
+def test_a_model_that_does_not_settle_has_a_certificate_without_a_curve():
+    """It was refused, as was correcting with a formula, with a request for a log that was given."""
+    camera = ThermalCamera(thermal_model(ModelEffect("integral(temperature)", {"c": 1e-9})))
+    assert "Change of the camera with its temperature" not in camera.page()
+    assert "Change of the camera" in ThermalCamera(thermal_model(FORMULA)).page()
+    with pytest.raises(DataError, match="no steady camera to predict or to correct to"):
+        camera.plot()
+    board = ThermalCamera(thermal_model(ModelEffect("above(board, k)", {"k": 30.0, "y0": 1e-5})))
+    with pytest.raises(DataError, match="'board': give its temperature"):
+        board.at(30.0)
+    a, b = (board.at(30.0, channels={"board": T}).interior.y0 for T in (40.0, 25.0))
+    assert a - b == pytest.approx(10 * 1e-5)
 
 
 def test_a_formula_with_a_decimal_point_is_predicted_along_a_log(tmp_path):

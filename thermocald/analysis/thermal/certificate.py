@@ -161,8 +161,8 @@ _DISTANCE_MM = 10_000.0
 
 
 def render_certificate(
-    document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float], drift: Figure,
-    warning: str, title: str,
+    document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float],
+    drift: Figure | None, warning: str, title: str,
 ) -> str:  # fmt: skip
     """Return the page as HTML text.
 

@@ -18,18 +18,21 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
 from thermocald.numbers import counted
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES, Sensor
 from thermocald.physics import catalogue
-from thermocald.physics.effect import Steady
+from thermocald.physics.catalogue import drive_matrix
+from thermocald.physics.effect import Steady, depends_on, does_not_settle
+from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.store.logger.clock import iso
 from thermocald.store.logger.dialect import to_celsius
 from thermocald.store.recording.reader import TemperatureLog
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import ArrayLike
+    from scipy.sparse import csr_array
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.physics.model import ThermalModel
@@ -118,8 +121,10 @@ def steady_table(
     of 1 beyond it. channels: °C of other thermometers.
     """
     effects = [
-        (e, catalogue.get(e.name), catalogue.get(e.name).steady(e.values, model.T0, channels))
+        (e, kind, kind.steady(e.values, model.T0, channels))
         for e in model.effects
+        for kind in [catalogue.get(e.name)]
+        if not is_formula(e.name)
     ]
     knees = [steady.knee for _, _, steady in effects if steady.knee is not None]
     table = np.zeros((10, 2 + len(names), 3 + 2 * len(knees)))
@@ -149,14 +154,58 @@ def steady_table(
     return table, knees
 
 
+def formula_columns(
+    model: ThermalModel, names: tuple[str, ...], T: float, channels: Mapping[str, float]
+) -> Array:
+    """Return what formulas add to a steady camera: value, slope per K, derivatives (10, 2 + p).
+
+    T °C: of the reference; channels: °C of other thermometers. Raises DataError for a formula that
+    does not settle, or that depends on two thermometers.
+    """
+    columns = np.zeros((10, 2 + len(names)))
+    reference = next(iter(model.validity), "temperature")
+    for effect in model.effects:
+        if not is_formula(effect.name):
+            continue
+        kind = GivenFormula(effect.name)
+        (channel, *_) = (*kind.node.channels(), reference)
+        own = channels.get(channel)
+        if own is None and channel != reference:
+            raise DataError(depends_on(channel))
+
+        def signal(searched: Mapping[str, float], at: float, kind: GivenFormula = kind) -> float:
+            settled = kind.node.bound(searched).steady(np.array([at]))
+            if settled is None:
+                raise DataError(does_not_settle(kind.name))
+            return float(settled[0])
+
+        searched, coefficients = kind.split(effect.values)
+        at = T if own is None else own
+        found = np.zeros(2 + len(names))
+        found[0] = signal(searched, at)
+        if own is None:
+            found[1] = (signal(searched, T + _STEP) - signal(searched, T - _STEP)) / (2.0 * _STEP)
+        for key, value in searched.items():
+            if (name := f"{effect.name}.{key}") in names:
+                step = _step(model, name)
+                up, down = (signal({**searched, key: value + s}, at) for s in (step, -step))
+                found[2 + names.index(name)] = (up - down) / (2.0 * step)
+        for key, size in coefficients.items():
+            if key in IOP_NAMES:
+                columns[IOP_NAMES.index(key)] += size * found
+                if (name := f"{effect.name}.{key}") in names:
+                    columns[IOP_NAMES.index(key), 2 + names.index(name)] += found[0]
+    return columns
+
+
 def predict_orientations(
     model: ThermalModel,
     names: tuple[str, ...],
     history: History,
     drive: Array,
     driven: Mapping[tuple[str, float], Array] | None = None,
-) -> tuple[Array, Array, Array]:
-    """Return a model's cameras: values (E, 10), slopes (E, 10) per K, derivatives (E, 10, p).
+) -> tuple[Array, Array]:
+    """Return a model's cameras: values (E, 10), derivatives (E, 10, p).
 
     names: of the parameters whose derivatives are wanted; drive (E,) °C: what the rates follow;
     driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
@@ -165,9 +214,8 @@ def predict_orientations(
     for effect in model.effects:
         if not catalogue.get(effect.name).is_drive:
             linear = linear + model.influence(effect.name, history)
-    J = np.zeros((*linear.shape, 1 + len(names)))
-    J[..., 0] = model.rate_vector
-    for i, name in enumerate(names, 1):
+    J = np.zeros((*linear.shape, len(names)))
+    for i, name in enumerate(names):
         group, key = name.rsplit(".", 1)  # a formula may contain dots
         if group == "interior":
             J[:, IOP_NAMES.index(key), i] = 1.0
@@ -182,8 +230,64 @@ def predict_orientations(
         else:
             up, down = (moved_model(model, name, s).influence(group, history) for s in (1.0, -1.0))
             J[:, :, i] = (up - down) / (2.0 * _step(model, name))
-    carried = model.carried_derivatives(linear, J, ("slope", *names))
-    return model.carried(linear), carried[..., 0], carried[..., 1:]
+    return model.carried(linear), model.carried_derivatives(linear, J, names)
+
+
+COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
+"""What a model changes: the camera's 16, scales of the field's coordinates, a displacement, mm."""
+
+
+def effect_weights(
+    model: ThermalModel, name: str, coefficients: Mapping[str, float] | None = None
+) -> Array:
+    """Return the weights (22,) of an effect's signal in `COLUMNS`, without coefficients the rates.
+
+    The distortion follows c, linearised at T₀.
+    """
+    weights = np.zeros(len(COLUMNS))
+    if coefficients is None:
+        weights[:10] = model.rate_vector
+    else:
+        for key, value in coefficients.items():
+            weights[COLUMNS.index(catalogue.get(name).column(key))] = value
+    moved = model.carried_derivatives(model.interior.as_array(), weights[:10, None])[:, 0]
+    return np.concatenate([moved, weights[10:]])
+
+
+Operators = list[tuple["Array", str, "csr_array"]]
+"""How errors of readings move the camera: weights (22,), channel, ∂ signal / ∂ readings (E, R)."""
+
+
+def reading_operators(model: ThermalModel, history: History) -> Operators:
+    """Return the operators of the rates and effects of a model at a history's times."""
+    drive = drive_matrix(history, model.drives)
+    assert drive is not None
+    found: Operators = [(effect_weights(model, ""), history.reference, drive)]
+    for effect in model.effects:
+        kind = catalogue.get(effect.name)
+        nonlinear, coefficients = kind.split(effect.values)
+        if kind.seen_in == "noise" or kind.is_drive or not any(coefficients.values()):
+            continue
+        own = kind.channel(history, **nonlinear), kind.sensitivity(history, **nonlinear)
+        matrices = dict([own]) | kind.further_sensitivities(history, **nonlinear)
+        weights = effect_weights(model, effect.name, coefficients)
+        found += [(weights, channel, S) for channel, S in matrices.items()]
+    return found
+
+
+def shared_errors(
+    operators: Operators, bases: Sequence[Array]
+) -> Iterator[tuple[str, Array, Array, Array]]:
+    """Yield a channel, the share (E,) of its readings' variance, and two weights (22,).
+
+    The outer product of the weights times the share is a term of the covariance; bases (R,): the
+    rows of the state relative to which the operators are taken. Thermometers are independent.
+    """
+    for (c, a, S), s in zip(operators, bases, strict=True):
+        for (d, b, R), r in zip(operators, bases, strict=True):
+            if a == b and S.nnz and R.nnz:
+                shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
+                yield a, shared - S @ r - R @ s + s @ r, c, d
 
 
 def moved_model(model: ThermalModel, name: str, sign: float) -> ThermalModel:

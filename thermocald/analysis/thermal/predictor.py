@@ -60,7 +60,8 @@ class Predictor:
     def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
         # `at` checks the range of temperature itself, for each epoch and without a warning
-        self._free = replace(thermal, model=replace(thermal.model, validity={}))
+        anywhere = dict.fromkeys(thermal.model.validity, (-math.inf, math.inf))
+        self._free = replace(thermal, model=replace(thermal.model, validity=anywhere))
         self._channels = thermal.channels
         model = thermal.model  # rays of a grid, which temperature hardly changes
         self._across = directions(model.sensor, model.interior.as_array(), image_grid(model.sensor))
@@ -71,9 +72,9 @@ class Predictor:
         self._jump = 0.0
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
-        """Take readings {channel: °C}, the reference first; failed ones are NaN or missing.
+        """Take readings {channel: °C} at a time, s UTC; failed ones are NaN.
 
-        time: s UTC.
+        The first is the reference, unless one has the name of the model's own.
         """
         row = self._row(readings)
         if row is None or not math.isfinite(time):
@@ -133,15 +134,17 @@ class Predictor:
         return self._free.at(T, self._change(math.inf), dict.fromkeys(self._channels, T) or None)
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
-        """Return the reference and the model's channels; None if one has not been read yet."""
-        reference = next(iter(readings), None)
-        if reference is None:
-            return None
-        row = {n: float(readings.get(n, math.nan)) for n in (reference, *self._channels)}
+        """Return the reference and the model's channels; None if one has not been read yet.
+
+        The reference is the model's own thermometer if there is one of its name, else the first.
+        """
+        first = next(iter(readings), "")
+        own = next(iter(self.thermal.model.validity), first)
+        row = {n: float(readings.get(n, math.nan)) for n in (own, *self._channels)}
+        if own not in readings:
+            row[own] = float(readings.get(first, math.nan))
         missing = [n for n, v in row.items() if not math.isfinite(v)]
-        if reference in missing:
-            return None
-        if missing and not self._recent:
+        if own in missing or (missing and not self._recent):
             return None
         return row | {n: self._recent[-1][1][n] for n in missing}
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,21 +32,23 @@ from thermocald.analysis.thermal.certificate import drift_figure, model_lines, r
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
+    formula_columns,
     moved_model,
     one_time,
     predict_orientations,
     read_history,
+    reading_operators,
     require_sd,
+    shared_errors,
     steady_table,
 )
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
-from thermocald.physics import catalogue
+from thermocald.photogrammetry.camera.camera_model import IOP, IOP_NAMES, Sensor
+from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
-from thermocald.physics.operators import interpolation_matrix
 from thermocald.result import Result, jsonable
 
 if TYPE_CHECKING:
@@ -61,6 +64,7 @@ USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _NEEDED = 6  # readings that the present effects follow from, besides two of each channel
 _CHUNK = 20_000  # times predicted at once
+_ENTRIES = 4_000_000  # readings that the times of a chunk depend on, each counted for itself
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
@@ -119,7 +123,9 @@ class ThermalCamera(Result):
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
-        sensor, drift = self.model.sensor, self._drift(band=not self.model.misses_an_effect)
+        sensor, drift = self.model.sensor, None
+        with suppress(DataError):  # a model without a steady camera has no curve of it
+            drift = self._drift(band=not self.model.misses_an_effect)
         return render_certificate(self.as_dict(), sensor, self._limits, drift, self.warning, title)
 
     def plot(self) -> Figure:
@@ -263,15 +269,20 @@ class ThermalCamera(Result):
         basis = [1.0, dT, dT * dT]
         for knee in knees:
             basis += [max(T - knee, 0.0), float(knee < T)]
-        columns = table @ np.array(basis)
+        columns = table @ np.array(basis) + formula_columns(model, names, T, channels)
         carried = model.carried_derivatives(columns[:, 0], columns[:, 1:], ("slope", *names))
         return model.carried(columns[:, 0]), carried[:, 0], carried[:, 1:]
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """The other thermometers that the model's effects follow."""
-        named = (e.values.get("channel") for e in self.model.effects)
-        return tuple(dict.fromkeys(str(c) for c in named if c))
+        reference, named = next(iter(self.model.validity), "temperature"), list[str]()
+        for e in self.model.effects:
+            if is_formula(e.name):
+                named += [c for c in GivenFormula(e.name).node.channels() if c != reference]
+            elif channel := e.values.get("channel"):
+                named.append(str(channel))
+        return tuple(dict.fromkeys(named))
 
     def at(
         self,
@@ -298,23 +309,12 @@ class ThermalCamera(Result):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
         values, slope, J = self._steady(T, channels or {})
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        beyond, covariance = 0.0, self._propagated(J, slope, temperature_sd**2)
-        covariance += temperature_sd**2 * self._noise_of(others)
+        of_readings = np.outer(slope, slope) + self._noise_of(others)
+        beyond, covariance = 0.0, J @ self.covariance @ J.T + temperature_sd**2 * of_readings
         if others or not self.validity.low <= T <= self.validity.high:
             (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
             covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
-
-    def _propagated(self, J: Array, slope: Array, noise: Array | float = 0.0) -> Array:
-        """Return covariances (…, 10, 10) from derivatives (…, 10, p) and slopes (…, 10) per K.
-
-        noise (…): the variance of the temperature, K².
-        """
-        covariance: Array = J @ self.covariance @ np.swapaxes(J, -1, -2)
-        if np.any(noise):
-            of_reading = slope[..., :, None] * slope[..., None, :]
-            covariance += np.asarray(noise)[..., None, None] * of_reading
-        return covariance
 
     def along(
         self,
@@ -333,9 +333,9 @@ class ThermalCamera(Result):
         begins with the first time. relative_to °C: the covariance is that of the difference from
         the steady camera at this temperature; since: instead, of the difference from the camera
         at this time of the log; temperature_sd K: of a reading, is propagated into the
-        covariance (as if no effect had a memory, which would average it). Raises UsageError far
-        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
-        that run backwards, DataError for times `at` that the log does not cover.
+        covariance through the model's effects. Raises UsageError far outside the model's validity
+        (unless `extrapolate`), for lengths that differ and for times that run backwards, DataError
+        for times `at` that the log does not cover.
 
         >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
         >>> along.values.shape, along.sd.shape
@@ -343,40 +343,46 @@ class ThermalCamera(Result):
         """
         require_sd(temperature_sd)
         begin, instants, history = read_history(times, temperatures, at, self.model.T0)
-        t, readings = history.reading_times, history.readings
+        readings = history.readings
         others = {name: history.temperature(name) for name in self.channels if name in readings}
         outside, drift = self._beyond(
             history.temperature(), others, self.model.rate_vector, extrapolate
         )
-        values, covariance = [], []
-        base: Array | float = 0.0  # derivatives of the camera whose difference is wanted,
-        of_base = np.zeros(len(t))  # and the weights of the readings that give its temperature
-
-        def predicted(part: History) -> tuple[Array, Array, Array]:
-            return predict_orientations(self.model, self.parameters, part, self.model.drive(part))
-
+        base: Array | float = 0.0  # derivatives of the camera whose difference is wanted
+        then = np.zeros(0)
         if relative_to is not None:
             base = self._steady(relative_to)[2]
         elif since is not None:
             at = one_time(since, "since")
             then = read_history(times, temperatures, at, self.model.T0)[1] - begin
-            base = predicted(history.at(then))[2]
-            of_base = interpolation_matrix(t, then).toarray()[0]
-        for first in range(0, len(history.times), _CHUNK):
-            part = history.at(history.times[first : first + _CHUNK])
-            W = interpolation_matrix(t, part.times)
-            shares = W.power(2).sum(axis=1) - 2.0 * (W @ of_base) + of_base @ of_base
-            found, slope, J = predicted(part)
+            base = self._predicted(history.at(then))[1]
+        variances = {n: (temperature_sd * self._relative_noise(n)) ** 2 for n in readings}
+        bases, size = [], _CHUNK
+        if temperature_sd:
+            last = then if len(then) else history.times[-1:]
+            rows = [S.toarray()[0] for *_, S in reading_operators(self.model, history.at(last))]
+            bases = rows if len(then) else [0.0 * row for row in rows]
+            size = int(np.clip(_ENTRIES // max(map(np.count_nonzero, rows)), 1, _CHUNK))
+        values, covariance = [], []
+        for first in range(0, len(history.times), size):
+            part = history.at(history.times[first : first + size])
+            found, J = self._predicted(part)
+            Q = (J - base) @ self.covariance @ np.swapaxes(J - base, 1, 2)
+            if temperature_sd:
+                operators = reading_operators(self.model, part)
+                for channel, shared, c, d in shared_errors(operators, bases):
+                    Q += variances[channel] * shared[:, None, None] * np.outer(c[IOP], d[IOP])
             values.append(found)
-            noise = np.asarray(temperature_sd**2 * shares)
-            of_others = noise[:, None, None] * self._noise_of(others)
-            covariance.append(self._propagated(J - base, slope, noise) + of_others)
+            covariance.append(Q)
         Q = np.concatenate(covariance)
         Q[:, range(10), range(10)] += drift
         return Along(
             self.model.sensor, instants, history.temperature(), np.concatenate(values), Q, outside,
             self.model.camera,
         )  # fmt: skip
+
+    def _predicted(self, history: History) -> tuple[Array, Array]:
+        return predict_orientations(self.model, self.parameters, history, self.model.drive(history))
 
     def _beyond(
         self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
@@ -407,11 +413,15 @@ class ThermalCamera(Result):
         """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
         total = np.zeros((10, 10))
         for name in channels:
-            fits = [f for f in self.model.fitted_on if name in f.get("other_sds_K", ())]
-            ratios = [f["other_sds_K"][name] / f["thermometer_sd_K"] for f in fits]
-            own = (float(np.median(ratios)) if ratios else 1.0) * self._slope_of(name)
+            own = self._relative_noise(name) * self._slope_of(name)
             total += np.outer(own, own)
         return total
+
+    def _relative_noise(self, channel: str) -> float:
+        """Return a thermometer's noise over that of the reference; 1 if no fit has estimated it."""
+        fits = [f for f in self.model.fitted_on if channel in f.get("other_sds_K", ())]
+        ratios = [f["other_sds_K"][channel] / f["thermometer_sd_K"] for f in fits]
+        return float(np.median(ratios)) if ratios else 1.0
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
@@ -419,8 +429,11 @@ class ThermalCamera(Result):
         Polynomials (3, 10); of each knee (11,) the temperature °C and the ten parameters' change
         per kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
         """
-        if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
-            raise UsageError("the model needs more than one thermometer: it is not a function of T")
+        if self.channels or any(is_formula(e.name) for e in self.model.effects):
+            raise UsageError(
+                "the model has a formula, or needs more than one thermometer: it cannot be written "
+                "as code"
+            )
         table, knees = self._table
         bends = [np.array([T, *table[:, 0, 3 + 2 * k]]) for k, T in enumerate(knees)]
         return table[:, 0, :3].T, bends
@@ -519,10 +532,8 @@ class LiveCamera:
         else:
             drive = _push(self._drive, t, row[0])
             driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
-        (values,), slopes, J = predict_orientations(
-            model, thermal.parameters, history, drive, driven
-        )
-        Q = thermal._propagated(J, slopes)[0] + np.diag(drift[0])
+        (values,), (J,) = predict_orientations(model, thermal.parameters, history, drive, driven)
+        Q = J @ thermal.covariance @ J.T + np.diag(drift[0])
         self._now = Camera(model.sensor, row[0], values, Q, float(beyond), model.camera)
         return self._now
 

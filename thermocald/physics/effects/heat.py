@@ -13,6 +13,7 @@ from thermocald.physics.effect import (
     Parameter,
     Steady,
     coefficient_units,
+    depends_on,
     say_estimate,
 )
 from thermocald.physics.formula import OfFormula, Proportional
@@ -173,8 +174,5 @@ class SecondHeatSource(Proportional):
     def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:
         channel = str(values["channel"])
         if channels is None or channel not in channels:
-            raise DataError(
-                f"the model also depends on {channel!r}: give its temperature, channels="
-                f"{{{channel!r}: …}}"
-            )
+            raise DataError(depends_on(channel))
         return Steady((float(channels[channel]) - T0, 0.0, 0.0))

@@ -150,7 +150,7 @@ def test_the_covariance_grows_while_a_thermometer_is_lost():
 
 
 def test_a_reading_that_jumps_is_no_temperature():
-    """Of 30 °C between two of 20 °C: the camera was 5 sds off, without a word."""
+    """Of 30 °C between two of 20 °C, and one that stays: the camera was 5 sds off, unsaid."""
     results, words, events = followed(
         GaugeCalibrator(thermal_camera()), read([20.0, 20.1, 30.0, 20.1, 21.0, 22.0], 60.0)
     )
@@ -158,6 +158,11 @@ def test_a_reading_that_jumps_is_no_temperature():
     sd = [r.adjustment.sd[1] for r in results]
     assert sd[2] == pytest.approx(np.hypot(sd[1], 9.9 * RATES["x0"]), rel=0.02)
     assert "jumped by 9.9 K" in events[0][1]
+    stays = read([20.0, 20.1, *[30.0] * 8], 60.0)
+    _, words, events = followed(GaugeCalibrator(thermal_camera()), stays)
+    # until the temperature may have changed by as much: it was said once
+    assert words == ["predicted"] * 2 + ["no_temperature"] * 5 + ["predicted"] * 3
+    assert len(events) == 2
 
 
 def test_a_delayed_epoch_has_the_camera_of_its_time():

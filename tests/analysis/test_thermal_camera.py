@@ -56,14 +56,14 @@ def test_the_noise_of_readings_against_draws(since):
     times, at, sd = np.arange(0.0, 1500.0, 10.0), np.arange(605.0, 1400.0, 90.0), 0.02
     T = 25.0 + 15.0 * (1.0 - np.exp(-times / 600.0))
     drawn = []
-    for _ in range(300):
+    for _ in range(150):
         found = camera.along(times, T + rng.normal(0.0, sd, len(T)), [*at, since or at[0]]).values
         drawn.append(found[:-1] - (0.0 if since is None else found[-1]))
     with_noise, without = (camera.along(times, T, at, temperature_sd=s, since=since).covariance
                            for s in (sd, 0.0))  # fmt: skip
     stated = np.sqrt(np.diagonal(with_noise - without, axis1=1, axis2=2))[:, :4]
     scatter = np.std(drawn, axis=0)[:, :4] / stated
-    np.testing.assert_allclose(np.sqrt(np.mean(scatter**2, axis=0)), 1.0, atol=0.06)
+    np.testing.assert_allclose(np.sqrt(np.mean(scatter**2, axis=0)), 1.0, atol=0.08)
 
 
 def test_covariance_against_draws():

@@ -43,7 +43,7 @@ class PredictedCamera:
     age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age, a
     jump, and the excess over the limits of the fit; unknown (10,): one standard deviation due to
     the unknown past, and unknown_px, its largest effect in the image; jump: by how much, K, the
-    reading differs from those before in a way that no temperature does.
+    reading differs from one before in a way that no temperature does.
     """
 
     camera: Camera
@@ -70,6 +70,7 @@ class Predictor:
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
         self._since_begin = 0
         self._jump = 0.0
+        self._trusted: tuple[float, float] | None = None  # the last reading without a jump
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
         """Take readings {channel: °C} at a time, s UTC; failed ones are NaN.
@@ -82,7 +83,8 @@ class Predictor:
         if self._recent and time <= (last := self._recent[-1][0]):
             if time > last - _BACK_S:
                 return
-            self._pair = None  # the clock was set back: the age of earlier readings is unknown
+            # the clock was set back: the age of earlier readings is unknown
+            self._pair = self._trusted = None
             self._recent.clear()
         self._since_begin += 1
         if self._pair is not None and self._pair[0].keeps_all and self._since_begin > _REMEMBERED:
@@ -149,13 +151,18 @@ class Predictor:
         return row | {n: self._recent[-1][1][n] for n in missing}
 
     def _jump_to(self, time: float, row: Mapping[str, float]) -> float:
-        """Return by how much, K, a reading differs from both before it; 0 if it can be true."""
-        if not self._recent:
-            return 0.0
+        """Return by how much, K, a reading differs from the last that can be true; 0 if it can be.
+
+        A jump that stays can be true once the temperature may have changed as much since then.
+        """
         T = next(iter(row.values()))
-        off = min(abs(T - next(iter(r.values()))) for _, r in list(self._recent)[-2:])
-        usual = math.hypot(self._change(time - self._recent[-1][0]), self.thermal.reading_sd)
-        return off if off > _JUMP_SIGMAS * usual else 0.0
+        before, last = self._trusted or (time, T)
+        off, since = abs(T - last), time - before
+        usual = math.hypot(self._change(since), self.thermal.reading_sd)
+        if off > _JUMP_SIGMAS * usual and since < _CORRELATED_S:
+            return off
+        self._trusted = time, T
+        return 0.0
 
     def _begin(self, time: float, row: dict[str, float]) -> None:
         self._pair = (self._free.live(), self._free.live())

@@ -447,7 +447,14 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
-    return ThermalCamera(read_model(Path(path)))
+    try:
+        return ThermalCamera(read_model(Path(path)))
+    except ConfigurationError as error:
+        if Path(path).suffix.lower() in (".yaml", ".yml"):
+            raise
+        raise ConfigurationError(
+            f"{error}; a thermal model is the YAML file that `fit` writes"
+        ) from error
 
 
 def steady_camera(thermal: ThermalCamera, T: float) -> Camera:

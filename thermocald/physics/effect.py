@@ -164,21 +164,6 @@ def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -
     return {n: PARAMETER_UNITS[n] + (f"/{per}" if per != "1" else "") for n in parameters}
 
 
-def does_not_settle(name: str) -> str:
-    """Return why a model with an effect has no steady camera, and what to use instead."""
-    return (
-        f"effect {name} has no value at a steady temperature, so there is no steady camera to "
-        "predict or to correct to; predict along a temperature log (predict --log, camera.along)"
-    )
-
-
-def depends_on(channel: str) -> str:
-    """Return that a steady camera needs the temperature of another thermometer, too."""
-    return (
-        f"the model also depends on {channel!r}: give its temperature, channels={{{channel!r}: …}}"
-    )
-
-
 Kind = Literal["drive", "signal", "image"]
 SeenIn = Literal["trajectory", "noise", "targets"]
 
@@ -326,7 +311,11 @@ class Effect:
         temperature log.
         """
         if self.steady_signal is None and self.kind == "signal":
-            raise DataError(does_not_settle(self.name))
+            raise DataError(
+                f"effect {self.name} has no value at a steady temperature, so there is no steady "
+                "camera to predict or to correct to; predict along a temperature log (predict "
+                "--log, camera.along)"
+            )
         return self.steady_signal or Steady()
 
     def weights(self, values: Values, name: str) -> Array:

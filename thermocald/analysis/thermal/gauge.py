@@ -382,9 +382,8 @@ class GaugeCalibrator(EpochCalibrator):
         an unknown past remain.
         """
         _, covariance = self.thermal.steady_change(then.camera.temperature, now.camera.temperature)
-        unsure_k = math.hypot(then.temperature_sd, now.temperature_sd)
-        rates, unknown = self.thermal.model.rate_vector, now.unknown - then.unknown
-        return covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
+        unknown = now.unknown - then.unknown
+        return covariance + then.noise + now.noise + np.outer(unknown, unknown)
 
     def _watch(self, pose: Pose) -> None:
         """Compare a pose with the reference; two different poses in a row are a movement."""

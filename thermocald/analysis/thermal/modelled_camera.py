@@ -18,11 +18,16 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
 from thermocald.numbers import counted
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    Sensor,
+)
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive_matrix
-from thermocald.physics.effect import Steady, depends_on, does_not_settle
-from thermocald.physics.formula import GivenFormula, is_formula
+from thermocald.physics.effect import Steady
+from thermocald.physics.formula import is_formula
 from thermocald.physics.history import History
 from thermocald.store.logger.clock import iso
 from thermocald.store.logger.dialect import to_celsius
@@ -121,10 +126,8 @@ def steady_table(
     of 1 beyond it. channels: °C of other thermometers.
     """
     effects = [
-        (e, kind, kind.steady(e.values, model.T0, channels))
+        (e, catalogue.get(e.name), catalogue.get(e.name).steady(e.values, model.T0, channels))
         for e in model.effects
-        for kind in [catalogue.get(e.name)]
-        if not is_formula(e.name)
     ]
     knees = [steady.knee for _, _, steady in effects if steady.knee is not None]
     table = np.zeros((10, 2 + len(names), 3 + 2 * len(knees)))
@@ -159,42 +162,23 @@ def formula_columns(
 ) -> Array:
     """Return what formulas add to a steady camera: value, slope per K, derivatives (10, 2 + p).
 
-    T °C: of the reference; channels: °C of other thermometers. Raises DataError for a formula that
-    does not settle, or that depends on two thermometers.
+    T °C: of the reference; channels: °C of other thermometers.
     """
-    columns = np.zeros((10, 2 + len(names)))
+    formulas = [e.name for e in model.effects if is_formula(e.name)]
     reference = next(iter(model.validity), "temperature")
-    for effect in model.effects:
-        if not is_formula(effect.name):
-            continue
-        kind = GivenFormula(effect.name)
-        (channel, *_) = (*kind.node.channels(), reference)
-        own = channels.get(channel)
-        if own is None and channel != reference:
-            raise DataError(depends_on(channel))
 
-        def signal(searched: Mapping[str, float], at: float, kind: GivenFormula = kind) -> float:
-            settled = kind.node.bound(searched).steady(np.array([at]))
-            if settled is None:
-                raise DataError(does_not_settle(kind.name))
-            return float(settled[0])
+    def added(model: ThermalModel, T: float) -> Array:
+        readings = {n: np.array([t]) for n, t in {reference: T, **channels}.items()}
+        history = History(np.zeros(1), np.zeros(1), readings, reference, model.T0)
+        return sum((model.influence(name, history)[0] for name in formulas), np.zeros(10))
 
-        searched, coefficients = kind.split(effect.values)
-        at = T if own is None else own
-        found = np.zeros(2 + len(names))
-        found[0] = signal(searched, at)
-        if own is None:
-            found[1] = (signal(searched, T + _STEP) - signal(searched, T - _STEP)) / (2.0 * _STEP)
-        for key, value in searched.items():
-            if (name := f"{effect.name}.{key}") in names:
-                step = _step(model, name)
-                up, down = (signal({**searched, key: value + s}, at) for s in (step, -step))
-                found[2 + names.index(name)] = (up - down) / (2.0 * step)
-        for key, size in coefficients.items():
-            if key in IOP_NAMES:
-                columns[IOP_NAMES.index(key)] += size * found
-                if (name := f"{effect.name}.{key}") in names:
-                    columns[IOP_NAMES.index(key), 2 + names.index(name)] += found[0]
+    columns = np.zeros((10, 2 + len(names)))
+    columns[:, 0] = added(model, T)
+    columns[:, 1] = (added(model, T + _STEP) - added(model, T - _STEP)) / (2.0 * _STEP)
+    for i, name in enumerate(names, 2):
+        if name.rsplit(".", 1)[0] in formulas:
+            up, down = (added(moved_model(model, name, sign), T) for sign in (1.0, -1.0))
+            columns[:, i] = (up - down) / (2.0 * _step(model, name))
     return columns
 
 
@@ -288,6 +272,29 @@ def shared_errors(
             if a == b and S.nnz and R.nnz:
                 shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
                 yield a, shared - S @ r - R @ s + s @ r, c, d
+
+
+def reading_covariance(
+    model: ThermalModel, history: History, sd: float, bases: Sequence[Array] | None = None
+) -> Array:
+    """Return the covariance (E, 10, 10) of the camera by the errors of the readings.
+
+    sd K: of a reading of the reference; bases: as in `shared_errors`, by default none.
+    """
+    operators = reading_operators(model, history)
+    found = np.zeros((len(history.times), 10, 10))
+    none = [np.zeros(len(history.reading_times))] * len(operators)
+    for channel, shared, c, d in shared_errors(operators, bases or none):
+        variance = (sd * relative_noise(model, channel)) ** 2
+        found += variance * shared[:, None, None] * np.outer(c[IOP], d[IOP])
+    return found
+
+
+def relative_noise(model: ThermalModel, channel: str) -> float:
+    """Return a thermometer's noise over that of the reference; 1 if no fit has estimated it."""
+    fits = [f for f in model.fitted_on if channel in f.get("other_sds_K", ())]
+    ratios = [f["other_sds_K"][channel] / f["thermometer_sd_K"] for f in fits]
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def moved_model(model: ThermalModel, name: str, sign: float) -> ThermalModel:

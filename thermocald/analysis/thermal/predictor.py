@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, image_grid
+from thermocald.analysis.thermal.modelled_camera import reading_covariance
 from thermocald.photogrammetry.camera.camera_model import IOP, partials
+from thermocald.physics.history import History
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,21 +36,22 @@ LONGEST_GAP_S = 120.0  # longest gap that a straight line bridges
 _JUMP_SIGMAS = 4.0  # of a change between two readings, beyond which it is no temperature's
 _BACK_S = 10.0  # a reading that is early by less is ignored; by more, the clock was set back
 _REMEMBERED = 4000  # readings
+_NOISY = 200  # of the last readings, through which noise is propagated
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedCamera:
     """A predicted camera, whose covariance includes model, thermometer and unknown past.
 
-    age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age, a
-    jump, and the excess over the limits of the fit; unknown (10,): one standard deviation due to
-    the unknown past, and unknown_px, its largest effect in the image; jump: by how much, K, the
-    reading differs from one before in a way that no temperature does.
+    age_s: of the last reading; noise (10, 10): the part of the covariance from readings: their
+    noise, age, jump, and excess over the limits of the fit; unknown (10,): one standard deviation
+    due to the unknown past, and unknown_px, its largest effect in the image; jump: by how much, K,
+    the reading differs from one before in a way that no temperature does.
     """
 
     camera: Camera
     age_s: float
-    temperature_sd: float
+    noise: Array
     unknown: Array
     unknown_px: float
     jump: float
@@ -121,14 +124,27 @@ class Predictor:
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         aged = self._change(age) if age > LONGEST_GAP_S else 0.0
-        drifted = math.hypot(self.thermal.reading_sd, aged, jump)
         beyond = float(self.thermal.validity.beyond(T))
-        covariance = camera.covariance + np.outer(unknown, unknown)
-        covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
+        noise = self._noise(min(time, read)) + math.hypot(aged, jump) ** 2 * np.outer(rates, rates)
+        noise += np.diag((rates * beyond) ** 2)
+        covariance = camera.covariance + np.outer(unknown, unknown) + noise
         now = replace(camera, covariance=covariance, extrapolated=beyond)
         by = partials(camera.sensor, camera.values, np.zeros(6), self._across)[1][..., IOP]
         largest = float(np.linalg.norm(by @ unknown, axis=1).max())
-        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest, jump)
+        return PredictedCamera(now, age, noise, unknown, largest, jump)
+
+    def _noise(self, time: float) -> Array:
+        """Return the covariance (10, 10) of the camera at a time by the noise of the readings."""
+        last = sum(t <= time for t, _ in self._recent)
+        rows = list(self._recent)[max(last - _NOISY, 0) : last + 1]
+        times = np.array([t for t, _ in rows])
+        readings = {n: np.array([row[n] for _, row in rows]) for n in rows[0][1]}
+        reference, model = next(iter(readings)), self.thermal.model
+        history = History(
+            np.array([time - times[0]]), times - times[0], readings, reference, model.T0
+        )
+        noise: Array = reading_covariance(model, history, self.thermal.reading_sd)[0]
+        return noise
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""

@@ -37,15 +37,16 @@ from thermocald.analysis.thermal.modelled_camera import (
     one_time,
     predict_orientations,
     read_history,
+    reading_covariance,
     reading_operators,
+    relative_noise,
     require_sd,
-    shared_errors,
     steady_table,
 )
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
-from thermocald.photogrammetry.camera.camera_model import IOP, IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
@@ -263,6 +264,11 @@ class ThermalCamera(Result):
         channels = dict.fromkeys(self.channels, T) if channels is None else channels
         if not math.isfinite(T):
             raise UsageError(f"the temperature is {T}: give one in °C")
+        if missing := [name for name in self.channels if name not in channels]:
+            raise DataError(
+                f"the model also depends on {missing[0]!r}: give its temperature, channels="
+                f"{{{missing[0]!r}: …}}"
+            )
         model, names = self.model, self.parameters
         table, knees = steady_table(model, names, channels) if channels else self._table
         dT = T - model.T0
@@ -356,12 +362,11 @@ class ThermalCamera(Result):
             at = one_time(since, "since")
             then = read_history(times, temperatures, at, self.model.T0)[1] - begin
             base = self._predicted(history.at(then))[1]
-        variances = {n: (temperature_sd * self._relative_noise(n)) ** 2 for n in readings}
-        bases, size = [], _CHUNK
+        bases, size = None, _CHUNK
         if temperature_sd:
             last = then if len(then) else history.times[-1:]
             rows = [S.toarray()[0] for *_, S in reading_operators(self.model, history.at(last))]
-            bases = rows if len(then) else [0.0 * row for row in rows]
+            bases = rows if len(then) else None
             size = int(np.clip(_ENTRIES // max(map(np.count_nonzero, rows)), 1, _CHUNK))
         values, covariance = [], []
         for first in range(0, len(history.times), size):
@@ -369,9 +374,7 @@ class ThermalCamera(Result):
             found, J = self._predicted(part)
             Q = (J - base) @ self.covariance @ np.swapaxes(J - base, 1, 2)
             if temperature_sd:
-                operators = reading_operators(self.model, part)
-                for channel, shared, c, d in shared_errors(operators, bases):
-                    Q += variances[channel] * shared[:, None, None] * np.outer(c[IOP], d[IOP])
+                Q += reading_covariance(self.model, part, temperature_sd, bases)
             values.append(found)
             covariance.append(Q)
         Q = np.concatenate(covariance)
@@ -413,15 +416,9 @@ class ThermalCamera(Result):
         """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
         total = np.zeros((10, 10))
         for name in channels:
-            own = self._relative_noise(name) * self._slope_of(name)
+            own = relative_noise(self.model, name) * self._slope_of(name)
             total += np.outer(own, own)
         return total
-
-    def _relative_noise(self, channel: str) -> float:
-        """Return a thermometer's noise over that of the reference; 1 if no fit has estimated it."""
-        fits = [f for f in self.model.fitted_on if channel in f.get("other_sds_K", ())]
-        ratios = [f["other_sds_K"][channel] / f["thermometer_sd_K"] for f in fits]
-        return float(np.median(ratios)) if ratios else 1.0
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.

@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import DataError
 from thermocald.physics.effect import (
     Effect,
     OfTime,
     Parameter,
     Steady,
     coefficient_units,
-    depends_on,
     say_estimate,
 )
 from thermocald.physics.formula import OfFormula, Proportional
@@ -172,7 +170,5 @@ class SecondHeatSource(Proportional):
         return channel or next(c for c in history.readings if c != history.reference)
 
     def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:
-        channel = str(values["channel"])
-        if channels is None or channel not in channels:
-            raise DataError(depends_on(channel))
-        return Steady((float(channels[channel]) - T0, 0.0, 0.0))
+        assert channels is not None
+        return Steady((float(channels[str(values["channel"])]) - T0, 0.0, 0.0))

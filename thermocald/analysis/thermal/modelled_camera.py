@@ -157,6 +157,13 @@ def steady_table(
     return table, knees
 
 
+def constant_history(model: ThermalModel, T: float, channels: Mapping[str, float]) -> History:
+    """Return the history of one reading: T °C of the reference, channels °C of others."""
+    reference = next(iter(model.validity), "temperature")
+    readings = {n: np.array([float(t)]) for n, t in {**channels, reference: T}.items()}
+    return History(np.zeros(1), np.zeros(1), readings, reference, model.T0)
+
+
 def formula_columns(
     model: ThermalModel, names: tuple[str, ...], T: float, channels: Mapping[str, float]
 ) -> Array:
@@ -165,11 +172,9 @@ def formula_columns(
     T °C: of the reference; channels: °C of other thermometers.
     """
     formulas = [e.name for e in model.effects if is_formula(e.name)]
-    reference = next(iter(model.validity), "temperature")
 
     def added(model: ThermalModel, T: float) -> Array:
-        readings = {n: np.array([t]) for n, t in {reference: T, **channels}.items()}
-        history = History(np.zeros(1), np.zeros(1), readings, reference, model.T0)
+        history = constant_history(model, T, channels)
         return sum((model.influence(name, history)[0] for name in formulas), np.zeros(10))
 
     columns = np.zeros((10, 2 + len(names)))

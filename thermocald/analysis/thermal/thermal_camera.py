@@ -17,7 +17,7 @@ raises UsageError unless extrapolation is requested explicitly.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,6 +32,7 @@ from thermocald.analysis.thermal.certificate import drift_figure, model_lines, r
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
+    constant_history,
     formula_columns,
     moved_model,
     one_time,
@@ -39,7 +40,6 @@ from thermocald.analysis.thermal.modelled_camera import (
     read_history,
     reading_covariance,
     reading_operators,
-    relative_noise,
     require_sd,
     steady_table,
 )
@@ -315,8 +315,10 @@ class ThermalCamera(Result):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
         values, slope, J = self._steady(T, channels or {})
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        of_readings = np.outer(slope, slope) + self._noise_of(others)
-        beyond, covariance = 0.0, J @ self.covariance @ J.T + temperature_sd**2 * of_readings
+        beyond, covariance = 0.0, J @ self.covariance @ J.T
+        if temperature_sd:
+            steady = constant_history(self.model, T, channels or {})
+            covariance += reading_covariance(self.model, steady, temperature_sd)[0]
         if others or not self.validity.low <= T <= self.validity.high:
             (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
             covariance += np.diag(drift)
@@ -411,14 +413,6 @@ class ThermalCamera(Result):
         linear = np.array([[sum(float(v.get(n, 0.0)) for v in own)] for n in IOP_NAMES])
         at = self.model.interior.as_array()
         return self.model.carried_derivatives(at, linear, ("slope",))[:, 0]
-
-    def _noise_of(self, channels: Iterable[str]) -> Array:
-        """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
-        total = np.zeros((10, 10))
-        for name in channels:
-            own = relative_noise(self.model, name) * self._slope_of(name)
-            total += np.outer(own, own)
-        return total
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.

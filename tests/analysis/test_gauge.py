@@ -194,6 +194,13 @@ def test_the_effects_of_the_unknown_past_and_of_a_gap_fade():
     after, end = unknown(predictor, START + 7490.0 + 3 * 3600.0, 24.0, 0, 500)
     assert after > 0.2
     assert end < 1e-3 * after
+    # five minutes: a trapezium whose height is the change that half of them allow, through the lag
+    (short,) = unknown(predictor, START + 14980.0 + 3 * 3600.0 + 300.0, 24.0, 0)
+    t = np.arange(0.05, 300.0, 0.1)
+    lagged = 0.1 / TAU * np.interp(t, [0, 30, 270, 300], [0, 1, 1, 0]) @ np.exp((t - 300.0) / TAU)
+    before = TAU / 60.0 * -np.expm1(-60.0 / TAU)  # at first, within a minute
+    height = np.sqrt(-np.expm1(-2.0 * 150.0 / 21600.0))
+    assert short / first == pytest.approx(height * lagged / before, rel=0.01)
 
 
 @pytest.mark.slow

@@ -149,7 +149,9 @@ def test_a_camera_with_two_thermometers():
     T0, point = np.full(2, camera.model.T0), np.array([[1500.0, 1200.0]])
     for warmer in (0.0, 20.0):  # correcting raised DataError
         table = TemperatureLog(np.array([0.0, 9.0]), {"temperature": T0, "board": T0 + warmer})
-        moved = correct_points(camera, table, np.array([5.0]), point)[0] - point
+        found, sds, *_ = correct_points(camera, table, np.array([5.0]), point, None, 0.2)
+        assert sds[0, 0] == pytest.approx(0.2 * np.hypot(own[1], 4e-4) / 0.00112 / 2**0.5, rel=0.1)
+        moved = found - point
         assert moved[0, 0] == pytest.approx(-warmer * 1e-4 / 0.00112, abs=0.02)
     live = camera.live()
     live.update(0.0, {"temperature": T0[0], "board": T0[0]})

@@ -197,7 +197,7 @@ def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool
         )
     along = thermal.along(
         log.times, log.channels, log.times[known], extrapolate=extrapolate,
-        temperature_sd=thermal.thermometer_sd or 0.0,
+        temperature_sd=thermal.reading_sd,
     )  # fmt: skip
     header = ["time", "temperature", *IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES), "extrapolated_K"]
     rows = np.column_stack(

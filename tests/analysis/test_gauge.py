@@ -163,6 +163,11 @@ def test_a_reading_that_jumps_is_no_temperature():
     # until the temperature may have changed by as much: it was said once
     assert words == ["predicted"] * 2 + ["no_temperature"] * 5 + ["predicted"] * 3
     assert len(events) == 2
+    narrow = replace(thermal_camera().model, validity={"h": (10.0, 20.0)})
+    later = Predictor(ThermalCamera(narrow))
+    for hours, T in ((0.0, 9.8), (24.0, 22.0)):
+        later.take(START + 3600.0 * hours, {"h": T})
+    assert later.at(START + 86400.0).jump == 0.0
 
 
 def test_a_delayed_epoch_has_the_camera_of_its_time():
@@ -172,6 +177,10 @@ def test_a_delayed_epoch_has_the_camera_of_its_time():
     assert late.interior.c == pytest.approx(results[9].adjustment.interior.c, abs=1e-12)
     now = gauge.calibrate(replace(epochs[-1], number=51, frame_time=START + 510.0))
     assert now.adjustment.interior.c == pytest.approx(results[-1].adjustment.interior.c)
+    gauge.predictor.take(START + 2000.0, {"h": 25.0})
+    in_gap = gauge.calibrate(replace(epochs[-1], number=60, frame_time=START + 1000.0)).adjustment
+    assert "reading is 510 s old" in in_gap.reason  # raised DataError
+    assert in_gap.sd[1] > 2 * late.sd[1]
 
 
 def unknown(predictor: Predictor, begin: float, T: float, *rows: int) -> list[float]:

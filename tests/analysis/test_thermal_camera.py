@@ -146,6 +146,11 @@ def test_a_camera_with_two_thermometers():
     c, d = (camera.at(30.0, sd, {"board": 40.0}).covariance for sd in (0.0, 0.2))
     for change in (b - a, d - c):
         np.testing.assert_allclose(change[:3, :3], wanted, rtol=1e-6)
+    product = ModelEffect("product(offset(temperature, 25.0), offset(board, 25.0))", {"x0": 1e-5})
+    both = ThermalCamera(replace(thermal_model(product), fitted_on=(fitted,)))
+    a, b = (both.along(*log, temperature_sd=sd).covariance[1, 1, 1] for sd in (0.0, 0.2))
+    by_both = (0.2 * (own[1] + 15e-5)) ** 2 + (0.8 * 5e-5) ** 2
+    assert b - a == pytest.approx(by_both, rel=1e-6)
     T0, point = np.full(2, camera.model.T0), np.array([[1500.0, 1200.0]])
     for warmer in (0.0, 20.0):  # correcting raised DataError
         table = TemperatureLog(np.array([0.0, 9.0]), {"temperature": T0, "board": T0 + warmer})

@@ -117,7 +117,7 @@ class Validity:
 
 
 def steady_table(
-    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float] | None = None
+    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float]
 ) -> tuple[Array, list[float]]:
     """Return a model's steady camera as a table (10, 2 + p, 3 + 2k), and its k knees, °C.
 

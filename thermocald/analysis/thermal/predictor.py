@@ -19,6 +19,7 @@ from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.thermal.modelled_camera import reading_covariance
 from thermocald.photogrammetry.camera.camera_model import IOP, partials
 from thermocald.physics.history import History
+from thermocald.store.recording.reader import TemperatureLog
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -118,9 +119,12 @@ class Predictor:
         read = self._recent[-1][0]
         age, jump = max(time - read, 0.0), self._jump
         if self._recent[0][0] < time < read - _BACK_S:  # an epoch that was processed late
-            times = [t for t, _ in self._recent]
-            rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
-            camera, age, jump = self._free.along(times, rows, [time])[0], 0.0, 0.0
+            times, readings = self._log(0, None)
+            age, jump, known = 0.0, 0.0, TemperatureLog(times, {"": next(iter(readings.values()))})
+            if not known.known_at(np.array([time]))[0]:
+                nearest = float(times[np.abs(times - time).argmin()])
+                age, time = abs(time - nearest), nearest
+            camera = self._free.along(times, readings, [time])[0]
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         aged = self._change(age) if age > LONGEST_GAP_S else 0.0
@@ -136,15 +140,19 @@ class Predictor:
     def _noise(self, time: float) -> Array:
         """Return the covariance (10, 10) of the camera at a time by the noise of the readings."""
         last = sum(t <= time for t, _ in self._recent)
-        rows = list(self._recent)[max(last - _NOISY, 0) : last + 1]
-        times = np.array([t for t, _ in rows])
-        readings = {n: np.array([row[n] for _, row in rows]) for n in rows[0][1]}
+        times, readings = self._log(max(last - _NOISY, 0), last + 1)
         reference, model = next(iter(readings)), self.thermal.model
         history = History(
             np.array([time - times[0]]), times - times[0], readings, reference, model.T0
         )
         noise: Array = reading_covariance(model, history, self.thermal.reading_sd)[0]
         return noise
+
+    def _log(self, first: int, end: int | None) -> tuple[Array, dict[str, Array]]:
+        """Return the times (n,) s and the readings {channel: (n,) °C} of some of the last."""
+        rows = list(self._recent)[first:end]
+        readings = {n: np.array([row[n] for _, row in rows]) for n in rows[0][1]}
+        return np.array([t for t, _ in rows]), readings
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""

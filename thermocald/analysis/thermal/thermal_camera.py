@@ -249,11 +249,6 @@ class ThermalCamera(Result):
         """The temperatures that the model was fitted on, without limits if it states none."""
         return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
-    @cached_property
-    def _table(self) -> tuple[Array, list[float]]:
-        """The steady camera's table, for one thermometer."""
-        return steady_table(self.model, self.parameters)
-
     def _steady(
         self, T: float, channels: Mapping[str, float] | None = None
     ) -> tuple[Array, Array, Array]:
@@ -270,7 +265,7 @@ class ThermalCamera(Result):
                 f"{{{missing[0]!r}: …}}"
             )
         model, names = self.model, self.parameters
-        table, knees = steady_table(model, names, channels) if channels else self._table
+        table, knees = steady_table(model, names, channels)
         dT = T - model.T0
         basis = [1.0, dT, dT * dT]
         for knee in knees:
@@ -425,7 +420,7 @@ class ThermalCamera(Result):
                 "the model has a formula, or needs more than one thermometer: it cannot be written "
                 "as code"
             )
-        table, knees = self._table
+        table, knees = steady_table(self.model, (), {})
         bends = [np.array([T, *table[:, 0, 3 + 2 * k]]) for k, T in enumerate(knees)]
         return table[:, 0, :3].T, bends
 

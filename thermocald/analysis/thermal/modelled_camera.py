@@ -119,9 +119,9 @@ class Validity:
 def steady_table(
     model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float]
 ) -> tuple[Array, list[float]]:
-    """Return a model's steady camera as a table (10, 2 + p, 3 + 2k), and its k knees, °C.
+    """Return a model's steady camera as a table (10, 1 + p, 3 + 2k), and its k knees, °C.
 
-    The rows are the value, its slope per K, and its derivatives by the parameters `names`. The
+    The rows are the value and its derivatives by the parameters `names`. The
     columns are factors of 1, T - T0 and (T - T0)², and for each knee of the kelvins beyond it and
     of 1 beyond it. channels: °C of other thermometers.
     """
@@ -130,21 +130,20 @@ def steady_table(
         for e in model.effects
     ]
     knees = [steady.knee for _, _, steady in effects if steady.knee is not None]
-    table = np.zeros((10, 2 + len(names), 3 + 2 * len(knees)))
+    table = np.zeros((10, 1 + len(names), 3 + 2 * len(knees)))
 
     def add(group: str, key: str, value: float, steady: Steady) -> None:
         rows = table[IOP_NAMES.index(key)]
-        signal, slope = np.zeros((2, table.shape[2]))
+        signal = np.zeros(table.shape[2])
         signal[:3] = steady.powers
-        slope[:2] = steady.powers[1], 2.0 * steady.powers[2]
         if steady.knee is not None:
             k = 3 + 2 * knees.index(steady.knee)
-            signal[k] = slope[k + 1] = 1.0
+            signal[k] = 1.0
             if (knee := f"{group}.{steady.knee_name}") in names:
-                rows[2 + names.index(knee), k + 1] -= value
-        rows[:2] += value * signal, value * slope
+                rows[1 + names.index(knee), k + 1] -= value
+        rows[0] += value * signal
         if (name := f"{group}.{key}") in names:
-            rows[2 + names.index(name)] += signal
+            rows[1 + names.index(name)] += signal
 
     for n in IOP_NAMES:
         add("interior", n, float(getattr(model.interior, n)), Steady((1.0, 0.0, 0.0)))
@@ -167,22 +166,22 @@ def constant_history(model: ThermalModel, T: float, channels: Mapping[str, float
 def formula_columns(
     model: ThermalModel, names: tuple[str, ...], T: float, channels: Mapping[str, float]
 ) -> Array:
-    """Return what formulas add to a steady camera: value, slope per K, derivatives (10, 2 + p).
+    """Return what formulas add to a steady camera: value and derivatives (10, 1 + p).
 
     T °C: of the reference; channels: °C of other thermometers.
     """
     formulas = [e.name for e in model.effects if is_formula(e.name)]
 
-    def added(model: ThermalModel, T: float) -> Array:
-        history = constant_history(model, T, channels)
+    history = constant_history(model, T, channels)
+
+    def added(model: ThermalModel) -> Array:
         return sum((model.influence(name, history)[0] for name in formulas), np.zeros(10))
 
-    columns = np.zeros((10, 2 + len(names)))
-    columns[:, 0] = added(model, T)
-    columns[:, 1] = (added(model, T + _STEP) - added(model, T - _STEP)) / (2.0 * _STEP)
-    for i, name in enumerate(names, 2):
+    columns = np.zeros((10, 1 + len(names)))
+    columns[:, 0] = added(model)
+    for i, name in enumerate(names, 1):
         if name.rsplit(".", 1)[0] in formulas:
-            up, down = (added(moved_model(model, name, sign), T) for sign in (1.0, -1.0))
+            up, down = (added(moved_model(model, name, sign)) for sign in (1.0, -1.0))
             columns[:, i] = (up - down) / (2.0 * _step(model, name))
     return columns
 

@@ -46,7 +46,7 @@ from thermocald.analysis.thermal.modelled_camera import (
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import IOP, Sensor
 from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
@@ -148,7 +148,7 @@ class ThermalCamera(Result):
 
         Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
         """
-        (then, _, J0), (now, _, J) = (self._steady(t) for t in (since, T))
+        (then, J0), (now, J) = (self._steady(t) for t in (since, T))
         return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
@@ -249,10 +249,8 @@ class ThermalCamera(Result):
         """The temperatures that the model was fitted on, without limits if it states none."""
         return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
-    def _steady(
-        self, T: float, channels: Mapping[str, float] | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p).
+    def _steady(self, T: float, channels: Mapping[str, float] | None = None) -> tuple[Array, Array]:
+        """Return the steady camera's values (10,) and derivatives (10, p).
 
         channels: °C of the other thermometers, by default as warm.
         """
@@ -271,8 +269,8 @@ class ThermalCamera(Result):
         for knee in knees:
             basis += [max(T - knee, 0.0), float(knee < T)]
         columns = table @ np.array(basis) + formula_columns(model, names, T, channels)
-        carried = model.carried_derivatives(columns[:, 0], columns[:, 1:], ("slope", *names))
-        return model.carried(columns[:, 0]), carried[:, 0], carried[:, 1:]
+        value, J = columns[:, 0], columns[:, 1:]
+        return model.carried(value), model.carried_derivatives(value, J, names)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
@@ -308,14 +306,14 @@ class ThermalCamera(Result):
                 raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
-        values, slope, J = self._steady(T, channels or {})
+        values, J = self._steady(T, channels or {})
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
         beyond, covariance = 0.0, J @ self.covariance @ J.T
         if temperature_sd:
             steady = constant_history(self.model, T, channels or {})
             covariance += reading_covariance(self.model, steady, temperature_sd)[0]
         if others or not self.validity.low <= T <= self.validity.high:
-            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+            (beyond,), (drift,) = self._beyond(np.array([T]), others, extrapolate)
             covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
 
@@ -348,13 +346,11 @@ class ThermalCamera(Result):
         begin, instants, history = read_history(times, temperatures, at, self.model.T0)
         readings = history.readings
         others = {name: history.temperature(name) for name in self.channels if name in readings}
-        outside, drift = self._beyond(
-            history.temperature(), others, self.model.rate_vector, extrapolate
-        )
+        outside, drift = self._beyond(history.temperature(), others, extrapolate)
         base: Array | float = 0.0  # derivatives of the camera whose difference is wanted
         then = np.zeros(0)
         if relative_to is not None:
-            base = self._steady(relative_to)[2]
+            base = self._steady(relative_to)[1]
         elif since is not None:
             at = one_time(since, "since")
             then = read_history(times, temperatures, at, self.model.T0)[1] - begin
@@ -385,29 +381,30 @@ class ThermalCamera(Result):
         return predict_orientations(self.model, self.parameters, history, self.model.drive(history))
 
     def _beyond(
-        self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
+        self, T: Array, others: Mapping[str, Array], extrapolate: bool
     ) -> tuple[Array, Array]:
         """Return how far outside (E,) K thermometers are, and the drift's variance (E, 10) there.
 
-        T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
+        T (E,) °C: of the reference; others {name: (E,) °C}. The drift is that of the steady camera
+        where a thermometer is furthest outside.
         """
-        outside = self.validity.check(T, extrapolate)
-        variance = (rates * outside[:, None]) ** 2
-        drift: Array | float = 0.0
+        beyond = {"": self.validity.check(T, extrapolate)}
         for name in self.channels:
             if name in others and name in self.model.validity:
                 of_fit = Validity(*self.model.validity[name], name)
-                beyond = of_fit.check(others[name], extrapolate)
-                outside = np.maximum(outside, beyond)
-                drift = drift + np.abs(beyond[:, None] * self._slope_of(name))
-        return outside, variance + drift**2
-
-    def _slope_of(self, channel: str) -> Array:
-        """Return the change (10,) of the parameters per kelvin of another thermometer."""
-        own = [e.values for e in self.model.effects if e.values.get("channel") == channel]
-        linear = np.array([[sum(float(v.get(n, 0.0)) for v in own)] for n in IOP_NAMES])
-        at = self.model.interior.as_array()
-        return self.model.carried_derivatives(at, linear, ("slope",))[:, 0]
+                beyond[name] = of_fit.check(others[name], extrapolate)
+        outside = np.max([*beyond.values()], axis=0)
+        variance = np.zeros((len(T), 10))
+        if outside.any():
+            k = int(outside.argmax())
+            there = constant_history(self.model, T[k], {n: float(o[k]) for n, o in others.items()})
+            slopes = {name: np.zeros(10) for name in beyond}
+            for weights, channel, S in reading_operators(self.model, there):
+                if (name := "" if channel == there.reference else channel) in slopes:
+                    slopes[name] += weights[IOP] * S.sum()
+            variance += (slopes.pop("") * beyond.pop("")[:, None]) ** 2
+            variance += sum(np.abs(beyond[n][:, None] * slopes[n]) for n in beyond) ** 2
+        return outside, variance
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
@@ -513,9 +510,8 @@ class LiveCamera:
         thermal, (t, *row) = self.thermal, self._checked(time, temperature)
         model, others = thermal.model, zip(self._channels[1:], row[1:], strict=True)
         (beyond,), drift = thermal._beyond(  # an error leaves the state unchanged
-            np.array(row[:1]), {name: np.array([T]) for name, T in others}, model.rate_vector,
-            extrapolate=False,
-        )  # fmt: skip
+            np.array(row[:1]), {name: np.array([T]) for name, T in others}, extrapolate=False
+        )
         self._remember((t, *row))
         times, *columns = np.array(self._readings).T
         readings, since = dict(zip(self._channels, columns, strict=True)), times - times[0]

@@ -114,8 +114,11 @@ def test_outside_the_validity_it_warns_or_refuses():
         camera.at(-20.0)
     with pytest.warns(ExtrapolationWarning):
         assert camera.at(-20.0, extrapolate=True).sd["c"] > 40 * 2e-4 * 0.99
-        bent = ThermalCamera(thermal_model(*LISTED))  # the drift of all effects, not the rates'
-        along, at = bent.along([0.0, 1e5], [53.0, 53.0]).sd[1, :4], bent.at(53.0).covariance
+    bent = ThermalCamera(thermal_model(*LISTED))
+    with pytest.warns(ExtrapolationWarning):  # by the drift of all effects, not of the rates alone
+        along = bent.along([0.0, 1e5], [53.0, 53.0]).sd[1, :4]
+    with pytest.warns(ExtrapolationWarning):
+        at = bent.at(53.0).covariance
     np.testing.assert_allclose(along**2, at.diagonal()[:4], rtol=1e-6)
 
 

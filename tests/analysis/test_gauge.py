@@ -150,7 +150,7 @@ def test_the_covariance_grows_while_a_thermometer_is_lost():
 
 
 def test_a_reading_that_jumps_is_no_temperature():
-    """Of 30 °C between two of 20 °C: the camera was 5 sds off, without a word."""
+    """Of 30 °C between two of 20 °C, and one that stays: the camera was 5 sds off, unsaid."""
     results, words, events = followed(
         GaugeCalibrator(thermal_camera()), read([20.0, 20.1, 30.0, 20.1, 21.0, 22.0], 60.0)
     )
@@ -158,6 +158,16 @@ def test_a_reading_that_jumps_is_no_temperature():
     sd = [r.adjustment.sd[1] for r in results]
     assert sd[2] == pytest.approx(np.hypot(sd[1], 9.9 * RATES["x0"]), rel=0.02)
     assert "jumped by 9.9 K" in events[0][1]
+    stays = read([20.0, 20.1, *[30.0] * 8], 60.0)
+    _, words, events = followed(GaugeCalibrator(thermal_camera()), stays)
+    # until the temperature may have changed by as much: it was said once
+    assert words == ["predicted"] * 2 + ["no_temperature"] * 5 + ["predicted"] * 3
+    assert len(events) == 2
+    narrow = replace(thermal_camera().model, validity={"h": (10.0, 20.0)})
+    later = Predictor(ThermalCamera(narrow))
+    for hours, T in ((0.0, 9.8), (24.0, 22.0)):
+        later.take(START + 3600.0 * hours, {"h": T})
+    assert later.at(START + 86400.0).jump == 0.0
 
 
 def test_a_delayed_epoch_has_the_camera_of_its_time():
@@ -167,6 +177,10 @@ def test_a_delayed_epoch_has_the_camera_of_its_time():
     assert late.interior.c == pytest.approx(results[9].adjustment.interior.c, abs=1e-12)
     now = gauge.calibrate(replace(epochs[-1], number=51, frame_time=START + 510.0))
     assert now.adjustment.interior.c == pytest.approx(results[-1].adjustment.interior.c)
+    gauge.predictor.take(START + 2000.0, {"h": 25.0})
+    in_gap = gauge.calibrate(replace(epochs[-1], number=60, frame_time=START + 1000.0)).adjustment
+    assert "reading is 510 s old" in in_gap.reason  # raised DataError
+    assert in_gap.sd[1] > 2 * late.sd[1]
 
 
 def unknown(predictor: Predictor, begin: float, T: float, *rows: int) -> list[float]:
@@ -189,6 +203,13 @@ def test_the_effects_of_the_unknown_past_and_of_a_gap_fade():
     after, end = unknown(predictor, START + 7490.0 + 3 * 3600.0, 24.0, 0, 500)
     assert after > 0.2
     assert end < 1e-3 * after
+    # five minutes: a trapezium whose height is the change that half of them allow, through the lag
+    (short,) = unknown(predictor, START + 14980.0 + 3 * 3600.0 + 300.0, 24.0, 0)
+    t = np.arange(0.05, 300.0, 0.1)
+    lagged = 0.1 / TAU * np.interp(t, [0, 30, 270, 300], [0, 1, 1, 0]) @ np.exp((t - 300.0) / TAU)
+    before = TAU / 60.0 * -np.expm1(-60.0 / TAU)  # at first, within a minute
+    height = np.sqrt(-np.expm1(-2.0 * 150.0 / 21600.0))
+    assert short / first == pytest.approx(height * lagged / before, rel=0.01)
 
 
 @pytest.mark.slow

@@ -177,6 +177,9 @@ def test_a_knock_is_no_slope_of_the_turns():
         slopes, sds = day.per_kelvin
         off.append(slopes[:2] / sds[:2])
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.9, abs=0.15)
+    locked = replace(day, locked=np.array([3e-4, 3e-4, 3e-4, 0.0])).per_kelvin[1]
+    ends = np.full(2, 6e-4 / np.ptp(WARMTH[12::12]))  # errors that more frames do not reduce
+    np.testing.assert_allclose(locked[:2] ** 2 - sds[:2] ** 2, ends**2, rtol=1e-6)
     at_once = replace(day, temperatures=np.where(day.values[:, 0] > 2.5e-4, 30.0, 20.0))
     assert "cannot be told from its movements" in str(at_once)
 

@@ -35,16 +35,35 @@ LISTED = (
     ModelEffect("hysteresis", {"half_width": 0.5}, {"half_width": 0.05}),
     ModelEffect("thermal_gradient", {"x0": 1e-3}, {"x0": 1e-5}),
 )
+FORMULA = ModelEffect("square(offset(lag(temperature, tau), k))", {"tau": 99.0, "k": 30.5,
+                      "y0": 2e-6}, {"tau": 1.0, "k": 0.3, "y0": 1e-8})  # fmt: skip
 
 
 @pytest.mark.parametrize("T", [22.0, 25.0, 37.9, 44.0])
 def test_the_steady_state_is_the_end_of_a_long_history(T):
-    camera = ThermalCamera(thermal_model(*LISTED))
+    camera = ThermalCamera(thermal_model(*LISTED, FORMULA))
     now = camera.at(T)
     along = camera.along([0.0, 5e4, 1e5], [T, T, T])
     assert along[-1].name == camera.model.camera
     np.testing.assert_allclose(along.values[-1], now.values, rtol=0, atol=1e-14)
     np.testing.assert_allclose(along.covariance[-1], now.covariance, rtol=1e-6, atol=1e-22)
+
+
+@pytest.mark.parametrize("since", [None, 500.0])
+def test_the_noise_of_readings_against_draws(since):
+    """A gradient magnifies it (the stated sd was 20 times too small), a lag averages it."""
+    camera, rng = ThermalCamera(thermal_model(*LISTED, FORMULA)), np.random.default_rng(3)
+    times, at, sd = np.arange(0.0, 1500.0, 10.0), np.arange(605.0, 1400.0, 90.0), 0.02
+    T = 25.0 + 15.0 * (1.0 - np.exp(-times / 600.0))
+    drawn = []
+    for _ in range(150):
+        found = camera.along(times, T + rng.normal(0.0, sd, len(T)), [*at, since or at[0]]).values
+        drawn.append(found[:-1] - (0.0 if since is None else found[-1]))
+    with_noise, without = (camera.along(times, T, at, temperature_sd=s, since=since).covariance
+                           for s in (sd, 0.0))  # fmt: skip
+    stated = np.sqrt(np.diagonal(with_noise - without, axis1=1, axis2=2))[:, :4]
+    scatter = np.std(drawn, axis=0)[:, :4] / stated
+    np.testing.assert_allclose(np.sqrt(np.mean(scatter**2, axis=0)), 1.0, atol=0.08)
 
 
 def test_covariance_against_draws():
@@ -95,6 +114,12 @@ def test_outside_the_validity_it_warns_or_refuses():
         camera.at(-20.0)
     with pytest.warns(ExtrapolationWarning):
         assert camera.at(-20.0, extrapolate=True).sd["c"] > 40 * 2e-4 * 0.99
+    bent = ThermalCamera(thermal_model(*LISTED))
+    with pytest.warns(ExtrapolationWarning):  # by the drift of all effects, not of the rates alone
+        along = bent.along([0.0, 1e5], [53.0, 53.0]).sd[1, :4]
+    with pytest.warns(ExtrapolationWarning):
+        at = bent.at(53.0).covariance
+    np.testing.assert_allclose(along**2, at.diagonal()[:4], rtol=1e-6)
 
 
 def test_missing_readings_are_refused():
@@ -127,10 +152,17 @@ def test_a_camera_with_two_thermometers():
     c, d = (camera.at(30.0, sd, {"board": 40.0}).covariance for sd in (0.0, 0.2))
     for change in (b - a, d - c):
         np.testing.assert_allclose(change[:3, :3], wanted, rtol=1e-6)
+    product = ModelEffect("product(offset(temperature, 25.0), offset(board, 25.0))", {"x0": 1e-5})
+    both = ThermalCamera(replace(thermal_model(product), fitted_on=(fitted,)))
+    a, b = (both.along(*log, temperature_sd=sd).covariance[1, 1, 1] for sd in (0.0, 0.2))
+    by_both = (0.2 * (own[1] + 15e-5)) ** 2 + (0.8 * 5e-5) ** 2
+    assert b - a == pytest.approx(by_both, rel=1e-6)
     T0, point = np.full(2, camera.model.T0), np.array([[1500.0, 1200.0]])
     for warmer in (0.0, 20.0):  # correcting raised DataError
         table = TemperatureLog(np.array([0.0, 9.0]), {"temperature": T0, "board": T0 + warmer})
-        moved = correct_points(camera, table, np.array([5.0]), point)[0] - point
+        found, sds, *_ = correct_points(camera, table, np.array([5.0]), point, None, 0.2)
+        assert sds[0, 0] == pytest.approx(0.2 * np.hypot(own[1], 4e-4) / 0.00112 / 2**0.5, rel=0.1)
+        moved = found - point
         assert moved[0, 0] == pytest.approx(-warmer * 1e-4 / 0.00112, abs=0.02)
     live = camera.live()
     live.update(0.0, {"temperature": T0[0], "board": T0[0]})
@@ -157,6 +189,20 @@ def test_warm_up_time_of_an_exponential():
     assert steady_from == pytest.approx(300.0 * np.log(worst / 2.0), abs=6.0)
     still_moving, _ = warm_up(camera.along(t[:60], T[:60]), 10_000.0, 0.1)
     assert still_moving is None
+
+
+def test_a_model_that_does_not_settle_has_a_certificate_without_a_curve():
+    """It was refused, as was correcting with a formula, with a request for a log that was given."""
+    camera = ThermalCamera(thermal_model(ModelEffect("integral(temperature)", {"c": 1e-9})))
+    assert "Change of the camera with its temperature" not in camera.page()
+    assert "Change of the camera" in ThermalCamera(thermal_model(FORMULA)).page()
+    with pytest.raises(DataError, match="no steady camera to predict or to correct to"):
+        camera.plot()
+    board = ThermalCamera(thermal_model(ModelEffect("above(board, k)", {"k": 30.0, "y0": 1e-5})))
+    with pytest.raises(DataError, match="'board': give its temperature"):
+        board.at(30.0)
+    a, b = (board.at(30.0, channels={"board": T}).interior.y0 for T in (40.0, 25.0))
+    assert a - b == pytest.approx(10 * 1e-5)
 
 
 def test_a_formula_with_a_decimal_point_is_predicted_along_a_log(tmp_path):

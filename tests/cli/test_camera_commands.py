@@ -207,4 +207,7 @@ def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen(coarse):
     spread = np.sqrt(np.mean(np.square(errors), axis=0))
     assert ((spread > 0.85) & (spread < 1.15)).all(), spread  # ± 2 sd of 100 draws
     assert alarms <= 1
-    assert fit(2e-5 * (np.array(IOP_NAMES) == "A1")).misses_an_effect
+    bent = fit(2e-5 * (np.array(IOP_NAMES) == "A1"))
+    assert bent.misses_an_effect
+    wider = bent.sds["rates.x0"] / model.sds["rates.x0"]
+    assert wider == pytest.approx(bent.evidence["fit"]["significance_sigmas"], rel=0.05)

@@ -20,7 +20,7 @@ from tests.recordings import read_rows, write_rows, write_table
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.correction import RowBlock
-from thermocald.analysis.thermal.places import measure_places
+from thermocald.analysis.thermal.places import Level, measure_places
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import DataError
 from thermocald.photogrammetry.epoch.measuring import Plane, Profile, place_on
@@ -177,6 +177,8 @@ def test_the_level_is_printed_and_heights_that_contradict_each_other_are_said(tm
     assert "contradict" not in text
     changed(tmp_path / "points.csv", shift("y", 30))
     assert "the places contradict each other" in measured(tmp_path).stdout
+    # 24 of χ² with six degrees of freedom, 4 with one
+    assert [Level(0.0, 0.0, 1.0, n, 2.0).contradicted for n in (7, 2)] == [True, False]
     changed(tmp_path / "points.csv", shift("y", -30))
     changed(tmp_path / "points.csv", shift("x", 1100))  # 5 m at 13 m
     line = {"point": (SECTION[0] / 1000 + ORIGIN_M).tolist(), "direction": [0, 0, 1]}

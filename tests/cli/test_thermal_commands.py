@@ -164,7 +164,8 @@ def test_rows_of_standard_input_are_corrected_as_they_come(misfits):
         process.stdin.write(f"time,x,y,who\n{first:.2f},500,400,a\n")
         answers = [process.stdout.readline(), process.stdout.readline()]
         for row in ("soon,500,400,b", f"{second:.2f},9999,400,c", f"{second:.2f},5",
-                    f"{last + 9e4:.2f},500,400,d", f"{second:.2f},600,400,e"):  # fmt: skip
+                    f"{last + 9e4:.2f},500,400,d", "2026-06-14T12:00:30,500,400,z",
+                    f"{second:.2f},600,400,e"):  # fmt: skip
             process.stdin.write(row + "\n")
         answers.append(process.stdout.readline())
         process.stdin.close()
@@ -174,7 +175,7 @@ def test_rows_of_standard_input_are_corrected_as_they_come(misfits):
     assert answers[0].startswith("time,x,y,who,dx,dy,sd_x")
     assert [answer.split(",")[3] for answer in answers[1:]] == ["a", "e"]
     for line, reason in ((3, "'soon' is not a time"), (4, "lies outside"), (5, "has 2 fields"),
-                         (6, "outside the temperature log")):  # fmt: skip
+                         (6, "outside the temperature log"), (7, "no time zone: add")):  # fmt: skip
         assert f"line {line}: not corrected: " in told
         assert reason in told
-    assert "4 of 6 rows were not corrected: lines 3, 4, 5, 6" in told
+    assert "5 of 7 rows were not corrected: lines 3, 4, 5, 6, 7" in told

@@ -312,8 +312,9 @@ class Effect:
         """
         if self.steady_signal is None and self.kind == "signal":
             raise DataError(
-                f"effect {self.name} states no value at a steady temperature; "
-                "give a temperature log instead"
+                f"effect {self.name} has no value at a steady temperature, so there is no steady "
+                "camera to predict or to correct to; predict along a temperature log (predict "
+                "--log, camera.along)"
             )
         return self.steady_signal or Steady()
 

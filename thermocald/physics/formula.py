@@ -448,6 +448,11 @@ class GivenFormula(OfFormula):
     def bound(self, history: History, **nonlinear: Any) -> Node:  # noqa: ARG002
         return self.node.bound(nonlinear)  # a channel may be named T
 
+    def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:
+        settles = self.node.bound(values).steady(np.zeros(1)) is not None
+        # the signal itself, which may be any function, is added by the thermal camera
+        return Steady() if settles else super().steady(values, T0, channels)
+
     def channel(self, history: History, **_: Any) -> str:
         channels = self.node.channels()
         return history.reference if history.reference in channels or not channels else channels[0]

@@ -94,7 +94,7 @@ def _verdict_lines(document: Mapping[str, Any]) -> list[str]:
     """Return the temperatures of the fit, and whether an effect is missing."""
     lines = []
     low, high = next(iter((document["validity"] or _UNKNOWN).values()))
-    T0 = f"T0 = {document['reference_temperature']:g} °C"
+    T0 = f"T0 = {short(document['reference_temperature'])} °C"
     if why := document.get("not_examined"):
         left = document["left_over_in_noise"]
         lines.append(f"  not examined whether an effect is missing: {why}")
@@ -161,8 +161,8 @@ _DISTANCE_MM = 10_000.0
 
 
 def render_certificate(
-    document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float], drift: Figure,
-    warning: str, title: str,
+    document: Mapping[str, Any], sensor: Sensor, limits: tuple[float, float],
+    drift: Figure | None, warning: str, title: str,
 ) -> str:  # fmt: skip
     """Return the page as HTML text.
 
@@ -233,10 +233,15 @@ def drift_figure(T: Array, T0: float, changes: Array, half: Array | None) -> Fig
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
     return Figure(
         "drift", "Change of the camera with its temperature",
-        f"Each parameter minus its value at {T0:g} °C, at steady temperatures; "
+        f"Each parameter minus its value at {short(T0)} °C, at steady temperatures; "
         f"{'no band is given' if half is None else 'bands: 95 %'}.",
         tuple(panels),
     )  # fmt: skip
+
+
+def short(T: float) -> str:
+    """Return a temperature, °C, to a hundredth at most: a T₀ is a mean with many decimals."""
+    return f"{round(T, 2):g}"
 
 
 def _shown(entry: Mapping[str, Any], unit: str, scale: float = 1.0) -> str:
@@ -257,7 +262,7 @@ def _model_tables(document: Mapping[str, Any]) -> list[Table]:
             document["interior"].items(),
             {
                 "parameter": lambda r: parameter_label(r[0]),
-                f"at {document['reference_temperature']:g} °C": lambda r: _shown(
+                f"at {short(document['reference_temperature'])} °C": lambda r: _shown(
                     r[1], UNITS.get(r[0], "")
                 ),
                 "rate": lambda r: _shown(rates[r[0]], "µm/K", 1e3) if r[0] in rates else "",
@@ -268,7 +273,7 @@ def _model_tables(document: Mapping[str, Any]) -> list[Table]:
             effects,
             {
                 "effect": lambda r: str(r[0]),
-                "parameter": lambda r: str(r[1]),
+                "parameter": lambda r: parameter_label(r[1]) if r[1] in IOP_NAMES else str(r[1]),
                 "value ± sd": lambda r: _shown(r[2], "" if r[2]["unit"] == "1" else r[2]["unit"]),
             },
         ),

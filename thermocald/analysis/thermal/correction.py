@@ -226,10 +226,12 @@ def row_blocks(
 
     A block of standard input is what has arrived. clock: for times without a zone; order, log: of
     the dates, None to find it as `find_order` does. Raises DataError for a missing column and for
-    times whose zone or order is not known; a row that cannot be read is refused on its own.
+    times whose zone or order is not known; a row that cannot be read is refused on its own, as is
+    one without a zone if others have one.
     """
     header: list[str] = []
     line = empty = 0
+    zoned = False
     for lines in _lines(path):
         if not header:
             header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
@@ -242,8 +244,9 @@ def row_blocks(
                         + (hint if len(header) == 1 else "")
                     )
         if lines:
-            block = _block(path, header, columns, lines, line, clock, order, log)
+            block = _block(path, header, columns, lines, line, clock, order, log, zoned=zoned)
             order = block.order if block.order in ORDERS else None
+            zoned = zoned or len(block.times) > 0
             yield block
         line, empty = line + len(lines), empty + len(lines)
     if not empty:
@@ -343,8 +346,9 @@ def _lines(path: Path) -> Iterator[list[str]]:
 
 def _block(
     path: Path, header: list[str], columns: tuple[str, ...], lines: list[str], line: int,
-    clock: DeviceClock, order: str | None, log: TemperatureLog | None,
+    clock: DeviceClock, order: str | None, log: TemperatureLog | None, *, zoned: bool,
 ) -> RowBlock:  # fmt: skip
+    """Return a block; zoned: whether times before it had a zone."""
     kept: list[tuple[int, dict[str, str], float | datetime, list[float]]] = []
     refused: list[tuple[int, str]] = []
     reader = csv.reader(lines)
@@ -363,6 +367,15 @@ def _block(
             kept.append((number, fields, _moment(fields["time"], order), values))
         except ValueError as cause:
             refused.append((number, str(cause)))
+    bare = [isinstance(m, datetime) and m.tzinfo is None for _, _, m, _ in kept]
+    if clock.zone is None and (zoned or not all(bare)):
+        why = f"has no time zone: add one, or set {clock.option}"
+        refused += [
+            (number, f"column time: {fields['time']!r} {why}")
+            for (number, fields, _, _), without in zip(kept, bare, strict=True)
+            if without
+        ]
+        kept = [row for row, without in zip(kept, bare, strict=True) if not without]
     dated = [(i, m) for i, (_, _, m, _) in enumerate(kept) if isinstance(m, datetime)]
     times = np.array([np.nan if isinstance(m, datetime) else m for _, _, m, _ in kept])
     times[[i for i, _ in dated]] = clock.utc(
@@ -371,7 +384,7 @@ def _block(
     found = np.array([values for *_, values in kept], dtype=float)
     return RowBlock(
         header, [n for n, *_ in kept], [fields for _, fields, _, _ in kept], times,
-        found.reshape(len(kept), len(columns)), refused, order,
+        found.reshape(len(kept), len(columns)), sorted(refused), order,
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.predictor import LONGEST_GAP_S, PredictedCamera, Predictor
+from thermocald.analysis.thermal.thermal_camera import steady_camera
 from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -216,7 +217,8 @@ class GaugeCalibrator(EpochCalibrator):
             return repeated
         epoch = replace(epoch, observations=measured)
         if now is None:
-            names = next(iter(epoch.temperatures), "the reference thermometer")
+            first = next(iter(epoch.temperatures), "the reference thermometer")
+            names = " and ".join(dict.fromkeys([first, *self.thermal.channels]))
             bad = failed("no_temperature", f"no reading of {names} so far", measured)
             return CalibratedEpoch(epoch, bad, {})
         beyond, T = now.camera.extrapolated, now.camera.temperature
@@ -380,9 +382,8 @@ class GaugeCalibrator(EpochCalibrator):
         an unknown past remain.
         """
         _, covariance = self.thermal.steady_change(then.camera.temperature, now.camera.temperature)
-        unsure_k = math.hypot(then.temperature_sd, now.temperature_sd)
-        rates, unknown = self.thermal.model.rate_vector, now.unknown - then.unknown
-        return covariance + unsure_k**2 * np.outer(rates, rates) + np.outer(unknown, unknown)
+        unknown = now.unknown - then.unknown
+        return covariance + then.noise + now.noise + np.outer(unknown, unknown)
 
     def _watch(self, pose: Pose) -> None:
         """Compare a pose with the reference; two different poses in a row are a movement."""
@@ -441,6 +442,10 @@ def plan_gauge(
     """Return the calibrator of a gauge and the origin (3,) of its coordinates, mm."""
     if control is None:
         return GaugeCalibrator(thermal, mount_sd_deg=mount_sd_deg), [0.0, 0.0, 0.0]
+    try:  # a pose is compared with others through the steady camera
+        steady_camera(thermal, thermal.model.T0)
+    except DataError as error:
+        raise ConfigurationError(f"a gauge with control points: {error}") from error
     given = ControlPoints.read(control, unit)
     finder: Tracker | Templates
     if reference is None:

@@ -18,18 +18,26 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
 from thermocald.numbers import counted
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    Sensor,
+)
 from thermocald.physics import catalogue
+from thermocald.physics.catalogue import drive_matrix
 from thermocald.physics.effect import Steady
+from thermocald.physics.formula import is_formula
 from thermocald.physics.history import History
 from thermocald.store.logger.clock import iso
 from thermocald.store.logger.dialect import to_celsius
 from thermocald.store.recording.reader import TemperatureLog
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import ArrayLike
+    from scipy.sparse import csr_array
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.physics.model import ThermalModel
@@ -109,11 +117,11 @@ class Validity:
 
 
 def steady_table(
-    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float] | None = None
+    model: ThermalModel, names: tuple[str, ...], channels: Mapping[str, float]
 ) -> tuple[Array, list[float]]:
-    """Return a model's steady camera as a table (10, 2 + p, 3 + 2k), and its k knees, °C.
+    """Return a model's steady camera as a table (10, 1 + p, 3 + 2k), and its k knees, °C.
 
-    The rows are the value, its slope per K, and its derivatives by the parameters `names`. The
+    The rows are the value and its derivatives by the parameters `names`. The
     columns are factors of 1, T - T0 and (T - T0)², and for each knee of the kelvins beyond it and
     of 1 beyond it. channels: °C of other thermometers.
     """
@@ -122,21 +130,20 @@ def steady_table(
         for e in model.effects
     ]
     knees = [steady.knee for _, _, steady in effects if steady.knee is not None]
-    table = np.zeros((10, 2 + len(names), 3 + 2 * len(knees)))
+    table = np.zeros((10, 1 + len(names), 3 + 2 * len(knees)))
 
     def add(group: str, key: str, value: float, steady: Steady) -> None:
         rows = table[IOP_NAMES.index(key)]
-        signal, slope = np.zeros((2, table.shape[2]))
+        signal = np.zeros(table.shape[2])
         signal[:3] = steady.powers
-        slope[:2] = steady.powers[1], 2.0 * steady.powers[2]
         if steady.knee is not None:
             k = 3 + 2 * knees.index(steady.knee)
-            signal[k] = slope[k + 1] = 1.0
+            signal[k] = 1.0
             if (knee := f"{group}.{steady.knee_name}") in names:
-                rows[2 + names.index(knee), k + 1] -= value
-        rows[:2] += value * signal, value * slope
+                rows[1 + names.index(knee), k + 1] -= value
+        rows[0] += value * signal
         if (name := f"{group}.{key}") in names:
-            rows[2 + names.index(name)] += signal
+            rows[1 + names.index(name)] += signal
 
     for n in IOP_NAMES:
         add("interior", n, float(getattr(model.interior, n)), Steady((1.0, 0.0, 0.0)))
@@ -149,14 +156,44 @@ def steady_table(
     return table, knees
 
 
+def constant_history(model: ThermalModel, T: float, channels: Mapping[str, float]) -> History:
+    """Return the history of one reading: T °C of the reference, channels °C of others."""
+    reference = next(iter(model.validity), "temperature")
+    readings = {n: np.array([float(t)]) for n, t in {**channels, reference: T}.items()}
+    return History(np.zeros(1), np.zeros(1), readings, reference, model.T0)
+
+
+def formula_columns(
+    model: ThermalModel, names: tuple[str, ...], T: float, channels: Mapping[str, float]
+) -> Array:
+    """Return what formulas add to a steady camera: value and derivatives (10, 1 + p).
+
+    T °C: of the reference; channels: °C of other thermometers.
+    """
+    formulas = [e.name for e in model.effects if is_formula(e.name)]
+
+    history = constant_history(model, T, channels)
+
+    def added(model: ThermalModel) -> Array:
+        return sum((model.influence(name, history)[0] for name in formulas), np.zeros(10))
+
+    columns = np.zeros((10, 1 + len(names)))
+    columns[:, 0] = added(model)
+    for i, name in enumerate(names, 1):
+        if name.rsplit(".", 1)[0] in formulas:
+            up, down = (added(moved_model(model, name, sign)) for sign in (1.0, -1.0))
+            columns[:, i] = (up - down) / (2.0 * _step(model, name))
+    return columns
+
+
 def predict_orientations(
     model: ThermalModel,
     names: tuple[str, ...],
     history: History,
     drive: Array,
     driven: Mapping[tuple[str, float], Array] | None = None,
-) -> tuple[Array, Array, Array]:
-    """Return a model's cameras: values (E, 10), slopes (E, 10) per K, derivatives (E, 10, p).
+) -> tuple[Array, Array]:
+    """Return a model's cameras: values (E, 10), derivatives (E, 10, p).
 
     names: of the parameters whose derivatives are wanted; drive (E,) °C: what the rates follow;
     driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
@@ -165,9 +202,8 @@ def predict_orientations(
     for effect in model.effects:
         if not catalogue.get(effect.name).is_drive:
             linear = linear + model.influence(effect.name, history)
-    J = np.zeros((*linear.shape, 1 + len(names)))
-    J[..., 0] = model.rate_vector
-    for i, name in enumerate(names, 1):
+    J = np.zeros((*linear.shape, len(names)))
+    for i, name in enumerate(names):
         group, key = name.rsplit(".", 1)  # a formula may contain dots
         if group == "interior":
             J[:, IOP_NAMES.index(key), i] = 1.0
@@ -182,8 +218,87 @@ def predict_orientations(
         else:
             up, down = (moved_model(model, name, s).influence(group, history) for s in (1.0, -1.0))
             J[:, :, i] = (up - down) / (2.0 * _step(model, name))
-    carried = model.carried_derivatives(linear, J, ("slope", *names))
-    return model.carried(linear), carried[..., 0], carried[..., 1:]
+    return model.carried(linear), model.carried_derivatives(linear, J, names)
+
+
+COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
+"""What a model changes: the camera's 16, scales of the field's coordinates, a displacement, mm."""
+
+
+def effect_weights(
+    model: ThermalModel, name: str, coefficients: Mapping[str, float] | None = None
+) -> Array:
+    """Return the weights (22,) of an effect's signal in `COLUMNS`, without coefficients the rates.
+
+    The distortion follows c, linearised at T₀.
+    """
+    weights = np.zeros(len(COLUMNS))
+    if coefficients is None:
+        weights[:10] = model.rate_vector
+    else:
+        for key, value in coefficients.items():
+            weights[COLUMNS.index(catalogue.get(name).column(key))] = value
+    moved = model.carried_derivatives(model.interior.as_array(), weights[:10, None])[:, 0]
+    return np.concatenate([moved, weights[10:]])
+
+
+Operators = list[tuple["Array", str, "csr_array"]]
+"""How errors of readings move the camera: weights (22,), channel, ∂ signal / ∂ readings (E, R)."""
+
+
+def reading_operators(model: ThermalModel, history: History) -> Operators:
+    """Return the operators of the rates and effects of a model at a history's times."""
+    drive = drive_matrix(history, model.drives)
+    assert drive is not None
+    found: Operators = [(effect_weights(model, ""), history.reference, drive)]
+    for effect in model.effects:
+        kind = catalogue.get(effect.name)
+        nonlinear, coefficients = kind.split(effect.values)
+        if kind.seen_in == "noise" or kind.is_drive or not any(coefficients.values()):
+            continue
+        own = kind.channel(history, **nonlinear), kind.sensitivity(history, **nonlinear)
+        matrices = dict([own]) | kind.further_sensitivities(history, **nonlinear)
+        weights = effect_weights(model, effect.name, coefficients)
+        found += [(weights, channel, S) for channel, S in matrices.items()]
+    return found
+
+
+def shared_errors(
+    operators: Operators, bases: Sequence[Array]
+) -> Iterator[tuple[str, Array, Array, Array]]:
+    """Yield a channel, the share (E,) of its readings' variance, and two weights (22,).
+
+    The outer product of the weights times the share is a term of the covariance; bases (R,): the
+    rows of the state relative to which the operators are taken. Thermometers are independent.
+    """
+    for (c, a, S), s in zip(operators, bases, strict=True):
+        for (d, b, R), r in zip(operators, bases, strict=True):
+            if a == b and S.nnz and R.nnz:
+                shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
+                yield a, shared - S @ r - R @ s + s @ r, c, d
+
+
+def reading_covariance(
+    model: ThermalModel, history: History, sd: float, bases: Sequence[Array] | None = None
+) -> Array:
+    """Return the covariance (E, 10, 10) of the camera by the errors of the readings.
+
+    sd K: of a reading of the reference; bases: as in `shared_errors`, by default none.
+    """
+    operators = reading_operators(model, history)
+    found = np.zeros((len(history.times), 10, 10))
+    none = [np.zeros(len(history.reading_times))] * len(operators)
+    for channel, shared, c, d in shared_errors(operators, bases or none):
+        variance = (sd * relative_noise(model, channel)) ** 2
+        found += variance * shared[:, None, None] * np.outer(c[IOP], d[IOP])
+    return found
+
+
+def relative_noise(model: ThermalModel, channel: str) -> float:
+    """Return a thermometer's noise over that of the reference; 1 if no fit has estimated it."""
+    fits = [f for f in model.fitted_on if channel in f.get("other_sds_K", ())]
+    ratios = [f["other_sds_K"][channel] / f["thermometer_sd_K"] for f in fits]
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def moved_model(model: ThermalModel, name: str, sign: float) -> ThermalModel:

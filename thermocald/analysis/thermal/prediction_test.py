@@ -14,9 +14,8 @@ The affinity is the stated one, or none, unless the targets contradict it; its u
 covariance. If the user names targets that have moved, the time and the vector of their movement are
 estimated, relative to the camera that the other targets determine.
 
-The 22 parameters of an epoch, with derivatives by the model's parameters and by the readings, are
-the camera's 16, three scales of the field's coordinates, and a displacement in mm. An amplitude
-keeps its size, an event its own height and time.
+The 22 parameters of an epoch are those of `modelled_camera.COLUMNS`. An amplitude keeps its size,
+an event its own height and time.
 """
 
 from __future__ import annotations
@@ -27,11 +26,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.thermal.modelled_camera import (
+    effect_weights,
+    reading_operators,
+    shared_errors,
+)
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
-    PARAMETER_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
     project,
@@ -39,7 +42,6 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.normals import linearise
 from thermocald.physics import catalogue
-from thermocald.physics.catalogue import drive_matrix
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term, coefficients_of, targets_of
@@ -48,10 +50,9 @@ from thermocald.thermal.scan import event_threshold, make_term, without_chance_e
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
-    from scipy.sparse import csr_array
 
     from thermocald.arrays import Array, Index
     from thermocald.physics.effect import Prediction
@@ -203,26 +204,6 @@ def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     return Moved(time, vectors[best], inverse_of_determined(N[best]))
 
 
-_COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
-
-
-def _weights(
-    model: ThermalModel, name: str = "", coefficients: Mapping[str, float] | None = None
-) -> Array:
-    """Return the weights (22,) of an effect's signal, or of the temperature (the rates).
-
-    The distortion follows c, linearised at T₀.
-    """
-    weights = np.zeros(len(_COLUMNS))
-    if coefficients is None:
-        weights[:10] = model.rate_vector
-    else:
-        for key, value in coefficients.items():
-            weights[_COLUMNS.index(catalogue.get(name).column(key))] = value
-    moved = model.carried_derivatives(model.interior.as_array(), weights[:10, None])[:, 0]
-    return np.concatenate([moved, weights[10:]])
-
-
 def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     """Return the model with the phases and events of a series with the model's T₀ and reference."""
     listed = [e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"]
@@ -363,39 +344,25 @@ def thermometer_noise(
     K: of a reading of the reference.
     """
     history = series.readings_history
+    operators = reading_operators(model, history)
+    means = [np.asarray(S.mean(axis=0)).ravel() for _, _, S in operators]
+    terms = []
+    for channel, shared, c, d in shared_errors(operators, means):
+        known = series.thermometers[channel].noise
+        sd = thermometer_sd if channel == history.reference else known
+        terms.append((sd**2 * shared, (A @ c) * (A @ d)))
     jump = series.thermometers[history.reference].slope_jump(history.times)
-    rates = _weights(model)
-    operators: list[tuple[Array, str, csr_array]] = []
     unresolved = []
-    if np.any(rates):
-        operator = drive_matrix(history, model.drives)
-        assert operator is not None
-        operators.append((rates, history.reference, operator))
     for effect in model.effects:
         kind = catalogue.get(effect.name)
-        if kind.seen_in == "noise":
+        if kind.seen_in == "noise" or kind.kind == "image":
             continue
         nonlinear, coefficients = kind.split(effect.values)
-        weights = rates if kind.is_drive else _weights(model, effect.name, coefficients)
-        if not kind.is_drive and any(coefficients.values()):
-            S = kind.sensitivity(history, **nonlinear)
-            if S.nnz:
-                operators.append((weights, kind.channel(history, **nonlinear), S))
-        if kind.kind != "image":
-            left = kind.unresolved(history, jump, **nonlinear)
-            if np.any(left) and np.any(weights):
-                unresolved.append((weights, left))
-    terms = []
-    means = [np.asarray(S.mean(axis=0)).ravel() for _, _, S in operators]
-    for (c, a, S), mean_s in zip(operators, means, strict=True):
-        for (d, b, R), mean_r in zip(operators, means, strict=True):
-            if a != b:
-                continue  # independent thermometers
-            shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
-            shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
-            sd = thermometer_sd if a == history.reference else series.thermometers[a].noise
-            terms.append((sd**2 * shared, (A @ c) * (A @ d)))
-    return terms, [(left**2, (A @ c) ** 2) for c, left in unresolved]
+        weights = effect_weights(model, effect.name, None if kind.is_drive else coefficients)
+        left = kind.unresolved(history, jump, **nonlinear)
+        if np.any(left) and np.any(weights):
+            unresolved.append((left**2, (A @ weights) ** 2))
+    return terms, unresolved
 
 
 def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.thermal.certificate import short
 from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import steady_camera
@@ -179,7 +180,7 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
     }
     in_space = (
         f"  on a plane at {distance:g} m: ± {plain(document['object_error_mm'], 'mm', 2)} "
-        f"from this orientation's uncertainty; the drift since {T0:g} °C is up to "
+        f"from this orientation's uncertainty; the drift since {short(T0)} °C is up to "
         f"{plain(document['drift_from_reference_mm'], 'mm', 3)}"
     )
     return Prediction(thermal, document, [*camera.lines(), in_space], camera)
@@ -196,7 +197,7 @@ def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool
         )
     along = thermal.along(
         log.times, log.channels, log.times[known], extrapolate=extrapolate,
-        temperature_sd=thermal.thermometer_sd or 0.0,
+        temperature_sd=thermal.reading_sd,
     )  # fmt: skip
     header = ["time", "temperature", *IOP_NAMES, *(f"sd_{n}" for n in IOP_NAMES), "extrapolated_K"]
     rows = np.column_stack(

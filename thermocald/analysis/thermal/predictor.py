@@ -16,7 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, image_grid
+from thermocald.analysis.thermal.modelled_camera import reading_covariance
 from thermocald.photogrammetry.camera.camera_model import IOP, partials
+from thermocald.physics.history import History
+from thermocald.store.recording.reader import TemperatureLog
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,21 +37,22 @@ LONGEST_GAP_S = 120.0  # longest gap that a straight line bridges
 _JUMP_SIGMAS = 4.0  # of a change between two readings, beyond which it is no temperature's
 _BACK_S = 10.0  # a reading that is early by less is ignored; by more, the clock was set back
 _REMEMBERED = 4000  # readings
+_NOISY = 200  # of the last readings, through which noise is propagated
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedCamera:
     """A predicted camera, whose covariance includes model, thermometer and unknown past.
 
-    age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age, a
-    jump, and the excess over the limits of the fit; unknown (10,): one standard deviation due to
-    the unknown past, and unknown_px, its largest effect in the image; jump: by how much, K, the
-    reading differs from those before in a way that no temperature does.
+    age_s: of the last reading; noise (10, 10): the part of the covariance from readings: their
+    noise, age, jump, and excess over the limits of the fit; unknown (10,): one standard deviation
+    due to the unknown past, and unknown_px, its largest effect in the image; jump: by how much, K,
+    the reading differs from one before in a way that no temperature does.
     """
 
     camera: Camera
     age_s: float
-    temperature_sd: float
+    noise: Array
     unknown: Array
     unknown_px: float
     jump: float
@@ -60,7 +64,8 @@ class Predictor:
     def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
         # `at` checks the range of temperature itself, for each epoch and without a warning
-        self._free = replace(thermal, model=replace(thermal.model, validity={}))
+        anywhere = dict.fromkeys(thermal.model.validity, (-math.inf, math.inf))
+        self._free = replace(thermal, model=replace(thermal.model, validity=anywhere))
         self._channels = thermal.channels
         model = thermal.model  # rays of a grid, which temperature hardly changes
         self._across = directions(model.sensor, model.interior.as_array(), image_grid(model.sensor))
@@ -69,11 +74,12 @@ class Predictor:
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
         self._since_begin = 0
         self._jump = 0.0
+        self._trusted: tuple[float, float] | None = None  # the last reading without a jump
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
-        """Take readings {channel: °C}, the reference first; failed ones are NaN or missing.
+        """Take readings {channel: °C} at a time, s UTC; failed ones are NaN.
 
-        time: s UTC.
+        The first is the reference, unless one has the name of the model's own.
         """
         row = self._row(readings)
         if row is None or not math.isfinite(time):
@@ -81,7 +87,8 @@ class Predictor:
         if self._recent and time <= (last := self._recent[-1][0]):
             if time > last - _BACK_S:
                 return
-            self._pair = None  # the clock was set back: the age of earlier readings is unknown
+            # the clock was set back: the age of earlier readings is unknown
+            self._pair = self._trusted = None
             self._recent.clear()
         self._since_begin += 1
         if self._pair is not None and self._pair[0].keeps_all and self._since_begin > _REMEMBERED:
@@ -112,20 +119,40 @@ class Predictor:
         read = self._recent[-1][0]
         age, jump = max(time - read, 0.0), self._jump
         if self._recent[0][0] < time < read - _BACK_S:  # an epoch that was processed late
-            times = [t for t, _ in self._recent]
-            rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
-            camera, age, jump = self._free.along(times, rows, [time])[0], 0.0, 0.0
+            times, readings = self._log(0, None)
+            age, jump, known = 0.0, 0.0, TemperatureLog(times, {"": next(iter(readings.values()))})
+            if not known.known_at(np.array([time]))[0]:
+                nearest = float(times[np.abs(times - time).argmin()])
+                age, time = abs(time - nearest), nearest
+            camera = self._free.along(times, readings, [time])[0]
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         aged = self._change(age) if age > LONGEST_GAP_S else 0.0
-        drifted = math.hypot(self.thermal.reading_sd, aged, jump)
         beyond = float(self.thermal.validity.beyond(T))
-        covariance = camera.covariance + np.outer(unknown, unknown)
-        covariance += drifted**2 * np.outer(rates, rates) + np.diag((rates * beyond) ** 2)
+        noise = self._noise(min(time, read)) + math.hypot(aged, jump) ** 2 * np.outer(rates, rates)
+        noise += np.diag((rates * beyond) ** 2)
+        covariance = camera.covariance + np.outer(unknown, unknown) + noise
         now = replace(camera, covariance=covariance, extrapolated=beyond)
         by = partials(camera.sensor, camera.values, np.zeros(6), self._across)[1][..., IOP]
         largest = float(np.linalg.norm(by @ unknown, axis=1).max())
-        return PredictedCamera(now, age, math.hypot(drifted, beyond), unknown, largest, jump)
+        return PredictedCamera(now, age, noise, unknown, largest, jump)
+
+    def _noise(self, time: float) -> Array:
+        """Return the covariance (10, 10) of the camera at a time by the noise of the readings."""
+        last = sum(t <= time for t, _ in self._recent)
+        times, readings = self._log(max(last - _NOISY, 0), last + 1)
+        reference, model = next(iter(readings)), self.thermal.model
+        history = History(
+            np.array([time - times[0]]), times - times[0], readings, reference, model.T0
+        )
+        noise: Array = reading_covariance(model, history, self.thermal.reading_sd)[0]
+        return noise
+
+    def _log(self, first: int, end: int | None) -> tuple[Array, dict[str, Array]]:
+        """Return the times (n,) s and the readings {channel: (n,) °C} of some of the last."""
+        rows = list(self._recent)[first:end]
+        readings = {n: np.array([row[n] for _, row in rows]) for n in rows[0][1]}
+        return np.array([t for t, _ in rows]), readings
 
     def settled(self) -> Camera:
         """Return the steady camera at T₀, with the covariance of an unknown temperature."""
@@ -133,26 +160,33 @@ class Predictor:
         return self._free.at(T, self._change(math.inf), dict.fromkeys(self._channels, T) or None)
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
-        """Return the reference and the model's channels; None if one has not been read yet."""
-        reference = next(iter(readings), None)
-        if reference is None:
-            return None
-        row = {n: float(readings.get(n, math.nan)) for n in (reference, *self._channels)}
+        """Return the reference and the model's channels; None if one has not been read yet.
+
+        The reference is the model's own thermometer if there is one of its name, else the first.
+        """
+        first = next(iter(readings), "")
+        own = next(iter(self.thermal.model.validity), first)
+        row = {n: float(readings.get(n, math.nan)) for n in (own, *self._channels)}
+        if own not in readings:
+            row[own] = float(readings.get(first, math.nan))
         missing = [n for n, v in row.items() if not math.isfinite(v)]
-        if reference in missing:
-            return None
-        if missing and not self._recent:
+        if own in missing or (missing and not self._recent):
             return None
         return row | {n: self._recent[-1][1][n] for n in missing}
 
     def _jump_to(self, time: float, row: Mapping[str, float]) -> float:
-        """Return by how much, K, a reading differs from both before it; 0 if it can be true."""
-        if not self._recent:
-            return 0.0
+        """Return by how much, K, a reading differs from the last that can be true; 0 if it can be.
+
+        A jump that stays can be true once the temperature may have changed as much since then.
+        """
         T = next(iter(row.values()))
-        off = min(abs(T - next(iter(r.values()))) for _, r in list(self._recent)[-2:])
-        usual = math.hypot(self._change(time - self._recent[-1][0]), self.thermal.reading_sd)
-        return off if off > _JUMP_SIGMAS * usual else 0.0
+        before, last = self._trusted or (time, T)
+        off, since = abs(T - last), time - before
+        usual = math.hypot(self._change(since), self.thermal.reading_sd)
+        if off > _JUMP_SIGMAS * usual and since < _CORRELATED_S:
+            return off
+        self._trusted = time, T
+        return 0.0
 
     def _begin(self, time: float, row: dict[str, float]) -> None:
         self._pair = (self._free.live(), self._free.live())

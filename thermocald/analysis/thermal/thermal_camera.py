@@ -17,7 +17,8 @@ raises UsageError unless extrapolation is requested explicitly.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,21 +32,24 @@ from thermocald.analysis.thermal.certificate import drift_figure, model_lines, r
 from thermocald.analysis.thermal.modelled_camera import (
     Along,
     Validity,
+    constant_history,
+    formula_columns,
     moved_model,
     one_time,
     predict_orientations,
     read_history,
+    reading_covariance,
+    reading_operators,
     require_sd,
     steady_table,
 )
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
-from thermocald.physics import catalogue
+from thermocald.photogrammetry.camera.camera_model import IOP, Sensor
+from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
-from thermocald.physics.operators import interpolation_matrix
 from thermocald.result import Result, jsonable
 
 if TYPE_CHECKING:
@@ -61,6 +65,7 @@ USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _NEEDED = 6  # readings that the present effects follow from, besides two of each channel
 _CHUNK = 20_000  # times predicted at once
+_ENTRIES = 4_000_000  # readings that the times of a chunk depend on, each counted for itself
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
@@ -119,7 +124,9 @@ class ThermalCamera(Result):
 
     def page(self, title: str = "") -> str:
         """Return the model's certificate as HTML text; title: by default the camera's name."""
-        sensor, drift = self.model.sensor, self._drift(band=not self.model.misses_an_effect)
+        sensor, drift = self.model.sensor, None
+        with suppress(DataError):  # a model without a steady camera has no curve of it
+            drift = self._drift(band=not self.model.misses_an_effect)
         return render_certificate(self.as_dict(), sensor, self._limits, drift, self.warning, title)
 
     def plot(self) -> Figure:
@@ -141,7 +148,7 @@ class ThermalCamera(Result):
 
         Also its covariance (10, 10), in which the level cancels. Other thermometers are as warm.
         """
-        (then, _, J0), (now, _, J) = (self._steady(t) for t in (since, T))
+        (then, J0), (now, J) = (self._steady(t) for t in (since, T))
         return now - then, (J - J0) @ self.covariance @ (J - J0).T
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
@@ -242,36 +249,39 @@ class ThermalCamera(Result):
         """The temperatures that the model was fitted on, without limits if it states none."""
         return Validity(*next(iter(self.model.validity.values()), (-math.inf, math.inf)))
 
-    @cached_property
-    def _table(self) -> tuple[Array, list[float]]:
-        """The steady camera's table, for one thermometer."""
-        return steady_table(self.model, self.parameters)
-
-    def _steady(
-        self, T: float, channels: Mapping[str, float] | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Return the steady camera's values (10,), slope (10,) per K and derivatives (10, p).
+    def _steady(self, T: float, channels: Mapping[str, float] | None = None) -> tuple[Array, Array]:
+        """Return the steady camera's values (10,) and derivatives (10, p).
 
         channels: °C of the other thermometers, by default as warm.
         """
         channels = dict.fromkeys(self.channels, T) if channels is None else channels
         if not math.isfinite(T):
             raise UsageError(f"the temperature is {T}: give one in °C")
+        if missing := [name for name in self.channels if name not in channels]:
+            raise DataError(
+                f"the model also depends on {missing[0]!r}: give its temperature, channels="
+                f"{{{missing[0]!r}: …}}"
+            )
         model, names = self.model, self.parameters
-        table, knees = steady_table(model, names, channels) if channels else self._table
+        table, knees = steady_table(model, names, channels)
         dT = T - model.T0
         basis = [1.0, dT, dT * dT]
         for knee in knees:
             basis += [max(T - knee, 0.0), float(knee < T)]
-        columns = table @ np.array(basis)
-        carried = model.carried_derivatives(columns[:, 0], columns[:, 1:], ("slope", *names))
-        return model.carried(columns[:, 0]), carried[:, 0], carried[:, 1:]
+        columns = table @ np.array(basis) + formula_columns(model, names, T, channels)
+        value, J = columns[:, 0], columns[:, 1:]
+        return model.carried(value), model.carried_derivatives(value, J, names)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """The other thermometers that the model's effects follow."""
-        named = (e.values.get("channel") for e in self.model.effects)
-        return tuple(dict.fromkeys(str(c) for c in named if c))
+        reference, named = next(iter(self.model.validity), "temperature"), list[str]()
+        for e in self.model.effects:
+            if is_formula(e.name):
+                named += [c for c in GivenFormula(e.name).node.channels() if c != reference]
+            elif channel := e.values.get("channel"):
+                named.append(str(channel))
+        return tuple(dict.fromkeys(named))
 
     def at(
         self,
@@ -296,25 +306,16 @@ class ThermalCamera(Result):
                 raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
             if not math.isfinite(value):
                 raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
-        values, slope, J = self._steady(T, channels or {})
+        values, J = self._steady(T, channels or {})
         others = {name: np.array([float(value)]) for name, value in (channels or {}).items()}
-        beyond, covariance = 0.0, self._propagated(J, slope, temperature_sd**2)
-        covariance += temperature_sd**2 * self._noise_of(others)
+        beyond, covariance = 0.0, J @ self.covariance @ J.T
+        if temperature_sd:
+            steady = constant_history(self.model, T, channels or {})
+            covariance += reading_covariance(self.model, steady, temperature_sd)[0]
         if others or not self.validity.low <= T <= self.validity.high:
-            (beyond,), (drift,) = self._beyond(np.array([T]), others, slope, extrapolate)
+            (beyond,), (drift,) = self._beyond(np.array([T]), others, extrapolate)
             covariance += np.diag(drift)
         return Camera(self.model.sensor, T, values, covariance, float(beyond), self.model.camera)
-
-    def _propagated(self, J: Array, slope: Array, noise: Array | float = 0.0) -> Array:
-        """Return covariances (…, 10, 10) from derivatives (…, 10, p) and slopes (…, 10) per K.
-
-        noise (…): the variance of the temperature, K².
-        """
-        covariance: Array = J @ self.covariance @ np.swapaxes(J, -1, -2)
-        if np.any(noise):
-            of_reading = slope[..., :, None] * slope[..., None, :]
-            covariance += np.asarray(noise)[..., None, None] * of_reading
-        return covariance
 
     def along(
         self,
@@ -333,9 +334,9 @@ class ThermalCamera(Result):
         begins with the first time. relative_to °C: the covariance is that of the difference from
         the steady camera at this temperature; since: instead, of the difference from the camera
         at this time of the log; temperature_sd K: of a reading, is propagated into the
-        covariance (as if no effect had a memory, which would average it). Raises UsageError far
-        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
-        that run backwards, DataError for times `at` that the log does not cover.
+        covariance through the model's effects. Raises UsageError far outside the model's validity
+        (unless `extrapolate`), for lengths that differ and for times that run backwards, DataError
+        for times `at` that the log does not cover.
 
         >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
         >>> along.values.shape, along.sd.shape
@@ -343,34 +344,32 @@ class ThermalCamera(Result):
         """
         require_sd(temperature_sd)
         begin, instants, history = read_history(times, temperatures, at, self.model.T0)
-        t, readings = history.reading_times, history.readings
+        readings = history.readings
         others = {name: history.temperature(name) for name in self.channels if name in readings}
-        outside, drift = self._beyond(
-            history.temperature(), others, self.model.rate_vector, extrapolate
-        )
-        values, covariance = [], []
-        base: Array | float = 0.0  # derivatives of the camera whose difference is wanted,
-        of_base = np.zeros(len(t))  # and the weights of the readings that give its temperature
-
-        def predicted(part: History) -> tuple[Array, Array, Array]:
-            return predict_orientations(self.model, self.parameters, part, self.model.drive(part))
-
+        outside, drift = self._beyond(history.temperature(), others, extrapolate)
+        base: Array | float = 0.0  # derivatives of the camera whose difference is wanted
+        then = np.zeros(0)
         if relative_to is not None:
-            base = self._steady(relative_to)[2]
+            base = self._steady(relative_to)[1]
         elif since is not None:
             at = one_time(since, "since")
             then = read_history(times, temperatures, at, self.model.T0)[1] - begin
-            base = predicted(history.at(then))[2]
-            of_base = interpolation_matrix(t, then).toarray()[0]
-        for first in range(0, len(history.times), _CHUNK):
-            part = history.at(history.times[first : first + _CHUNK])
-            W = interpolation_matrix(t, part.times)
-            shares = W.power(2).sum(axis=1) - 2.0 * (W @ of_base) + of_base @ of_base
-            found, slope, J = predicted(part)
+            base = self._predicted(history.at(then))[1]
+        bases, size = None, _CHUNK
+        if temperature_sd:
+            last = then if len(then) else history.times[-1:]
+            rows = [S.toarray()[0] for *_, S in reading_operators(self.model, history.at(last))]
+            bases = rows if len(then) else None
+            size = int(np.clip(_ENTRIES // max(map(np.count_nonzero, rows)), 1, _CHUNK))
+        values, covariance = [], []
+        for first in range(0, len(history.times), size):
+            part = history.at(history.times[first : first + size])
+            found, J = self._predicted(part)
+            Q = (J - base) @ self.covariance @ np.swapaxes(J - base, 1, 2)
+            if temperature_sd:
+                Q += reading_covariance(self.model, part, temperature_sd, bases)
             values.append(found)
-            noise = np.asarray(temperature_sd**2 * shares)
-            of_others = noise[:, None, None] * self._noise_of(others)
-            covariance.append(self._propagated(J - base, slope, noise) + of_others)
+            covariance.append(Q)
         Q = np.concatenate(covariance)
         Q[:, range(10), range(10)] += drift
         return Along(
@@ -378,40 +377,34 @@ class ThermalCamera(Result):
             self.model.camera,
         )  # fmt: skip
 
+    def _predicted(self, history: History) -> tuple[Array, Array]:
+        return predict_orientations(self.model, self.parameters, history, self.model.drive(history))
+
     def _beyond(
-        self, T: Array, others: Mapping[str, Array], rates: Array, extrapolate: bool
+        self, T: Array, others: Mapping[str, Array], extrapolate: bool
     ) -> tuple[Array, Array]:
         """Return how far outside (E,) K thermometers are, and the drift's variance (E, 10) there.
 
-        T (E,) °C: of the reference, which rates (10,) follow; others {name: (E,) °C}.
+        T (E,) °C: of the reference; others {name: (E,) °C}. The drift is that of the steady camera
+        where a thermometer is furthest outside.
         """
-        outside = self.validity.check(T, extrapolate)
-        variance = (rates * outside[:, None]) ** 2
-        drift: Array | float = 0.0
+        beyond = {"": self.validity.check(T, extrapolate)}
         for name in self.channels:
             if name in others and name in self.model.validity:
                 of_fit = Validity(*self.model.validity[name], name)
-                beyond = of_fit.check(others[name], extrapolate)
-                outside = np.maximum(outside, beyond)
-                drift = drift + np.abs(beyond[:, None] * self._slope_of(name))
-        return outside, variance + drift**2
-
-    def _slope_of(self, channel: str) -> Array:
-        """Return the change (10,) of the parameters per kelvin of another thermometer."""
-        own = [e.values for e in self.model.effects if e.values.get("channel") == channel]
-        linear = np.array([[sum(float(v.get(n, 0.0)) for v in own)] for n in IOP_NAMES])
-        at = self.model.interior.as_array()
-        return self.model.carried_derivatives(at, linear, ("slope",))[:, 0]
-
-    def _noise_of(self, channels: Iterable[str]) -> Array:
-        """Return the covariance (10, 10) by other thermometers, per K² of the reference's noise."""
-        total = np.zeros((10, 10))
-        for name in channels:
-            fits = [f for f in self.model.fitted_on if name in f.get("other_sds_K", ())]
-            ratios = [f["other_sds_K"][name] / f["thermometer_sd_K"] for f in fits]
-            own = (float(np.median(ratios)) if ratios else 1.0) * self._slope_of(name)
-            total += np.outer(own, own)
-        return total
+                beyond[name] = of_fit.check(others[name], extrapolate)
+        outside = np.max([*beyond.values()], axis=0)
+        variance = np.zeros((len(T), 10))
+        if outside.any():
+            k = int(outside.argmax())
+            there = constant_history(self.model, T[k], {n: float(o[k]) for n, o in others.items()})
+            slopes = {name: np.zeros(10) for name in beyond}
+            for weights, channel, S in reading_operators(self.model, there):
+                if (name := "" if channel == there.reference else channel) in slopes:
+                    slopes[name] += weights[IOP] * S.sum()
+            variance += (slopes.pop("") * beyond.pop("")[:, None]) ** 2
+            variance += sum(np.abs(beyond[n][:, None] * slopes[n]) for n in beyond) ** 2
+        return outside, variance
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
         """Return the steady camera's linear parameters as polynomials in T - T0, and its knees.
@@ -419,9 +412,12 @@ class ThermalCamera(Result):
         Polynomials (3, 10); of each knee (11,) the temperature °C and the ten parameters' change
         per kelvin beyond it. Raises UsageError for a model that needs more than one thermometer.
         """
-        if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
-            raise UsageError("the model needs more than one thermometer: it is not a function of T")
-        table, knees = self._table
+        if self.channels or any(is_formula(e.name) for e in self.model.effects):
+            raise UsageError(
+                "the model has a formula, or needs more than one thermometer: it cannot be written "
+                "as code"
+            )
+        table, knees = steady_table(self.model, (), {})
         bends = [np.array([T, *table[:, 0, 3 + 2 * k]]) for k, T in enumerate(knees)]
         return table[:, 0, :3].T, bends
 
@@ -434,7 +430,14 @@ def load_camera(path: Path | str) -> ThermalCamera:
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
     """
-    return ThermalCamera(read_model(Path(path)))
+    try:
+        return ThermalCamera(read_model(Path(path)))
+    except ConfigurationError as error:
+        if Path(path).suffix.lower() in (".yaml", ".yml"):
+            raise
+        raise ConfigurationError(
+            f"{error}; a thermal model is the YAML file that `fit` writes"
+        ) from error
 
 
 def steady_camera(thermal: ThermalCamera, T: float) -> Camera:
@@ -507,9 +510,8 @@ class LiveCamera:
         thermal, (t, *row) = self.thermal, self._checked(time, temperature)
         model, others = thermal.model, zip(self._channels[1:], row[1:], strict=True)
         (beyond,), drift = thermal._beyond(  # an error leaves the state unchanged
-            np.array(row[:1]), {name: np.array([T]) for name, T in others}, model.rate_vector,
-            extrapolate=False,
-        )  # fmt: skip
+            np.array(row[:1]), {name: np.array([T]) for name, T in others}, extrapolate=False
+        )
         self._remember((t, *row))
         times, *columns = np.array(self._readings).T
         readings, since = dict(zip(self._channels, columns, strict=True)), times - times[0]
@@ -519,10 +521,8 @@ class LiveCamera:
         else:
             drive = _push(self._drive, t, row[0])
             driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
-        (values,), slopes, J = predict_orientations(
-            model, thermal.parameters, history, drive, driven
-        )
-        Q = thermal._propagated(J, slopes)[0] + np.diag(drift[0])
+        (values,), (J,) = predict_orientations(model, thermal.parameters, history, drive, driven)
+        Q = J @ thermal.covariance @ J.T + np.diag(drift[0])
         self._now = Camera(model.sensor, row[0], values, Q, float(beyond), model.camera)
         return self._now
 

@@ -181,6 +181,17 @@ def test_corners_of_a_jpeg_have_true_sds(quality):
     assert 0.85 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < (1.2 if quality > 50 else 1.5)
 
 
+@pytest.mark.parametrize("blur", [1.6, 2.0])
+def test_the_bits_of_small_blurred_markers_are_in_the_sds(blur):
+    """They reach the edges and move corners by up to 0.3 px: error/sd was 1.7 and 2.3."""
+    far = look_at([300, 200, 2300], [225, 160, 0], 0.3)
+    frame = noisy(SCENE.render(SMALL_CAMERA, far, blur=blur), np.random.default_rng(1))
+    observed, _ = measure_markers(frame, FIELD)
+    errors = observed.points - SMALL_CAMERA.project(far, FIELD.points)[observed.targets]
+    assert len(observed) >= 20
+    assert 0.8 < np.sqrt(np.mean(np.square(errors / observed.sigmas))) < 1.4
+
+
 def test_a_sharpened_image_does_not_widen_sds():
     """Its halos along all edges are no noise: with them error/sd would be 0.5."""
     clean = _rendered("frontal")

@@ -118,7 +118,7 @@ class GradientWeights:
         delta[:, :6] *= gain[:, None]
         return CircleFit(
             self.parameters + delta,
-            self.inverse[:, :2, :2] * (gain**2)[:, None, None],
+            self.inverse[:, :2, :2] * (self.noise.spread * gain**2)[:, None, None],
             np.sqrt(np.maximum(square, 0.0) / self.freedom),
             np.zeros(n),
             np.full(n, "", dtype=object),

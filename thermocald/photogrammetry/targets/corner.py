@@ -29,7 +29,11 @@ import numpy as np
 from thermocald.arrays import full_scale
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import scaled_solve
-from thermocald.photogrammetry.targets.circle import first_reasons, normal_cdf
+from thermocald.photogrammetry.targets.circle import (
+    first_reasons,
+    neighbour_correlations,
+    normal_cdf,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,6 +54,7 @@ _FAR = 40.0  # standard deviations of the blur; the series would overflow where 
 _LARGEST_SATURATION = 0.3  # where paper is cut at full scale; sharpened edges alone reach a tenth
 _CUT = 0.05, 0.998  # the same where few pixels of paper are used: share, and paper over full scale
 _LEAST_SD = 0.3  # DN, of quantisation
+_BITS_PX = 3.3  # rendered markers: how far blurred bits move a corner, per blur and their share
 _CLEAR = 6.0  # times its variance, from which the light's squared gradient is corrected
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
@@ -207,6 +212,12 @@ def _side(found: Corners) -> Array:
     return side
 
 
+def _margin(found: Corners) -> Array:
+    """Return how far (n,) px from the edges pixels are used."""
+    # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
+    return np.maximum(found.quiet - 2.0, 2.0)
+
+
 def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
     """Return the pixels to fit, initial parameters (n, 7), and which corners the edge cuts off."""
     corners, n, side = found.places, len(found), _side(found)
@@ -226,8 +237,7 @@ def _pixels(image: Image, found: Corners) -> tuple[_Pixels, Array, Mask]:
         angles.append(np.arctan2(towards * side_x, -towards * side_y))
     placed = np.column_stack([corners, *angles])
     d1, d2 = _from_edges(placed, px, py)
-    # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
-    margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
+    margin = _margin(found)[:, None]
     saddle = _is_saddle(grey, d1, d2, inside & (away <= along[:, None]))
     # the square opposite to a marker of an AprilGrid is a third as large as the marker
     along = np.where(saddle, np.minimum(along, _SADDLE_REACH * side), along)
@@ -307,24 +317,11 @@ def _minimise(pixels: _Pixels, p: Array) -> tuple[Array, Array, Single, Array]:
 def _correlation(pixels: _Pixels, p: Array, r: Array) -> Array:
     """Return the correlation (n,) of neighbouring residuals r (n, m), 0 if negative: that of all
     corners, or a corner's own if that is significantly larger, as where it is covered in part.
-
-    Their mean profile across the edges, as of a sharpened image, is removed first: it is common to
-    all corners, and symmetric.
     """
     depth = _depth(*_from_edges(p[:, :4], pixels.x, pixels.y), pixels.saddle)
-    contrast = p[:, 6, None]
-    bins = np.rint(np.clip(2.0 * (depth + _REACH_PX), 0.0, 4.0 * _REACH_PX)).astype(np.int64)
-    used = bins[pixels.use]
-    sums = np.bincount(used, (r / contrast)[pixels.use], int(4 * _REACH_PX) + 1)
-    profile = sums / np.maximum(np.bincount(used, minlength=len(sums)), 1)
-    r = np.where(pixels.use, r - profile[bins] * contrast, 0.0)
-    # the pixels are in the order of rows, those that are not used at the end
-    beside = (np.diff(pixels.x, axis=1) == 1) & pixels.use[:, 1:]
-    products = np.sum(r[:, 1:] * r[:, :-1], axis=1, where=beside) / beside.sum(axis=1)
-    squares = np.sum(r * r, axis=1) / pixels.use.sum(axis=1)
-    own = products / np.maximum(squares, 1e-9)
+    own, pairs = neighbour_correlations(pixels.x, pixels.use, r, depth, p[:, 6])
     usual = np.median(own) if len(own) else 0.0
-    rho = np.where(own > usual + 3.0 / np.sqrt(beside.sum(axis=1)), own, usual)
+    rho = np.where(own > usual + 3.0 / np.sqrt(pairs), own, usual)
     return np.clip(rho, 0.0, 0.9)
 
 
@@ -393,8 +390,13 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
         "noise": residual_sd,
         "saturation": saturation,
     }
+    # the blur brings a marker's bits to its edges, which moves the corner by their pattern
+    margin, blur = _margin(found), p[:, 4]
+    bits = normal_cdf(((margin / 2 - found.quiet) / blur).astype(np.float32)) * ~pixels.saddle
+    covariances = cofactors * variance[:, None, None]
+    covariances += np.square(_BITS_PX * blur * bits / margin)[:, None, None] * np.eye(2)
     observations = Observations.build(
-        found.rows[good], p[good, :2], (cofactors * variance[:, None, None])[good],
+        found.rows[good], p[good, :2], covariances[good],
         {name: values[good] for name, values in quality.items()},
     )  # fmt: skip
     return observations, dict(zip(found.rows[~good].tolist(), reasons[~good], strict=True))

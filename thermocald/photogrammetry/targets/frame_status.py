@@ -33,10 +33,14 @@ _BINS = 6
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """The noise model var(g) = floor + gain·g, with floor DN² and gain DN."""
+    """The noise model var(g) = floor + gain·g, with floor DN² and gain DN.
+
+    spread: by what factor the correlation of neighbouring pixels enlarges the variance of a centre.
+    """
 
     floor: float
     gain: float = 0.0
+    spread: float = 1.0
 
     def variance(
         self, grey: NDArray[np.floating[Any]] | np.floating[Any]
@@ -46,7 +50,7 @@ class NoiseModel:
 
     def scaled(self, factor: float) -> NoiseModel:
         """Return the noise model with all variances times a factor."""
-        return NoiseModel(self.floor * factor, self.gain * factor)
+        return NoiseModel(self.floor * factor, self.gain * factor, self.spread)
 
 
 def estimate_noise(

@@ -29,10 +29,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from thermocald.arrays import Array, Image, Single, full_scale, scratch
+from thermocald.arrays import Array, Image, Single, scratch
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import inverse_2x2, scaled_solve
-from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
+from thermocald.photogrammetry.targets.frame_status import (
+    NoiseModel,
+    estimate_noise,
+    saturation_level,
+)
 from thermocald.photogrammetry.targets.outline import LocalMap, Windows, windows
 
 if TYPE_CHECKING:
@@ -253,7 +257,7 @@ def fit_circles(
     normal = np.zeros((n, 10, 10))
     pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
     cut = np.zeros(n, dtype=bool)
-    top, residuals = full_scale(image), []
+    top, residuals = saturation_level(image), []
     for w in parts:
         mine = maps.select(w.rows)
         fitted = _step(w, mine, parameters[w.rows], noise, work)

@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from thermocald.arrays import full_scale
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import (
@@ -34,6 +33,7 @@ from thermocald.photogrammetry.targets.circle import (
     neighbour_correlations,
     normal_cdf,
 )
+from thermocald.photogrammetry.targets.frame_status import saturation_level
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -355,7 +355,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     cofactors = _correct_light(pixels, p, r, j, variance)
     residual_sd = np.sqrt(variance)
     move = np.hypot(*(p[:, :2] - found.places).T)
-    top = full_scale(image)
+    top = saturation_level(image)
     saturated = pixels.use & (pixels.grey >= top)
     saturation = np.sum(saturated, axis=1) / np.maximum(m, 1)
     tests = (

@@ -90,6 +90,28 @@ def estimate_noise(
     return NoiseModel(float(floor), float(gain))
 
 
+_PLATEAU = 0.005  # share of the pixels that have the brightest value
+_STEEP = 2.0  # times the pixels one level below
+_ALIKE = 0.5  # share of equal neighbours off a plateau, from which an image has no noise
+
+
+def saturation_level(image: NDArray[Any]) -> int:
+    """Return the grey value at which a sensor saturates, of an image of 8 or 16 bit.
+
+    It is full scale, or less if the brightest pixels have one value and the others noise.
+    """
+    top, sample = full_scale(image), image[::4]
+    level = int(sample.max())
+    full = sample == level
+    if level < top and np.mean(full) > _PLATEAU:
+        below = ~full & (sample >= level - max(level >> 8, 1))
+        rest = ~(full[:, 1:] | full[:, :-1])
+        alike = np.mean((sample[:, 1:] == sample[:, :-1])[rest]) if rest.any() else 1.0
+        if full.sum() > _STEEP * below.sum() and alike < _ALIKE:
+            return level
+    return top
+
+
 Word = Literal[
     "ok", "no_image", "not_grey", "wrong_size", "black", "white", "half", "flat",
     "nothing_found", "other_field", "too_few",

@@ -181,6 +181,15 @@ def test_corners_of_a_jpeg_have_true_sds(quality):
     assert 0.85 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < (1.2 if quality > 50 else 1.5)
 
 
+@pytest.mark.parametrize("gamma", [0.45, 0.8])
+def test_the_tone_curve_of_a_photograph_does_not_move_corners(gamma):
+    """Its blurred edges are nearer to the dark side: error/sd was 8.4 and 3.9."""
+    frame = noisy(255 * (_rendered("frontal") / 255) ** gamma, np.random.default_rng(8))
+    observed, _ = measure_markers(frame, FIELD)
+    z = (observed.points - _truth("frontal")[observed.targets]) / observed.sigmas
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
 @pytest.mark.parametrize("blur", [1.6, 2.0])
 def test_the_bits_of_small_blurred_markers_are_in_the_sds(blur):
     """They reach the edges and move corners by up to 0.3 px: error/sd was 1.7 and 2.3."""

@@ -12,7 +12,8 @@ that of a mean of a first-order autoregression. With a JPEG of quality 30 to 95,
 deviation is 0.8 to 1.6, most often 1.0 to 1.2.
 
 The tone curve of a photograph shifts blurred edges towards their dark side, at gamma 0.45 by a
-quarter of the blur. The residuals across all edges of a frame show it, and it is corrected.
+quarter of the blur. The residuals across all edges of a frame show it, and it is corrected: error
+over standard deviation is 1.0 then, with a coarse JPEG or a curve in the shape of an S 2 to 5.
 
 If squares touch at a corner (chessboards, AprilGrids), the opposite quadrant is dark as well. The
 grey values decide whether it is added to the model.
@@ -60,6 +61,7 @@ _LEAST_SD = 0.3  # DN, of quantisation
 _BITS_PX = 3.3  # rendered markers: how far blurred bits move a corner, per blur and their share
 _BITS_BLURS = 3.0  # blurs between a marker's bits and pixels that show the tone curve
 _EDGE_BLURS = 2.0  # blurs about an edge that are needed for it
+_FEWEST_FOR_TONE = 8  # corners
 _CURVED = 3.0  # standard deviations, from which a tone curve is corrected
 _CLEAR = 6.0  # times its variance, from which the light's squared gradient is corrected
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
@@ -355,7 +357,7 @@ def _correct_light(pixels: _Pixels, p: Array, r: Array, j: Single, variance: Arr
 def _correct_tone(
     pixels: _Pixels, p: Array, r: Array, j: Single, variance: Array, quiet: Array
 ) -> Array:
-    """Correct parameters and residuals in place for the camera's tone curve, if it is significant.
+    """Correct parameters in place for the camera's tone curve, if it is significant.
 
     A photograph's grey values are not linear in the light, which shifts blurred edges towards the
     dark side. To first order the curve adds κ a w (1 − w) to the wedge w, with κ common to all
@@ -379,12 +381,11 @@ def _correct_tone(
     information = float(weight @ np.sum(left * left, axis=1))
     kappa = float(weight @ np.sum(left * r, axis=1)) / max(information, 1e-300)
     tested = kappa**2 * information
-    if tested < _CURVED**2:
+    if np.count_nonzero(near.any(axis=1)) < _FEWEST_FOR_TONE or tested < _CURVED**2:
         return np.zeros((len(p), 2, 2))
     kappa *= 1 - _CURVED**2 / tested  # sets in continuously
     by = response(pixels.use)
     p -= kappa * by
-    r -= kappa * (curve - (j @ by[..., None])[..., 0]) * pixels.use
     return by[:, :2, None] * by[:, None, :2] / information
 
 
@@ -422,12 +423,11 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     )
     reasons = first_reasons(tests)
     good = reasons == ""
-    some = _Pixels(*(v[good] for v in pixels))
-    places, residuals = p[good], r[good]
-    tone = _correct_tone(some, places, residuals, j[good], variance[good], found.quiet[good])
-    p[good], r[good] = places, residuals
-    rho = _correlation(_Pixels(*(v[good] for v in pixels)), p[good], r[good])
+    some, fitted = _Pixels(*(v[good] for v in pixels)), p[good]
+    rho = _correlation(some, fitted, r[good])
     variance[good] *= (1 + rho) / (1 - rho)
+    tone = _correct_tone(some, fitted, r[good], j[good], variance[good], found.quiet[good])
+    p[good] = fitted
     quality = {
         # without the width of the pixel
         "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),

@@ -103,7 +103,7 @@ def test_of_two_prints_of_a_board_one_is_measured():
     assert [*measure(frame, field).missed.values()].count("seen twice") >= 56
     for number in range(13):  # on the second print, but for four
         x, y = np.rint(prints[number in (2, 3, 7, 11)][4 * number : 4 * number + 4].mean(axis=0))
-        cv2.circle(frame, (int(x), int(y)), 8, 120, -1)
+        cv2.circle(frame, (int(x), int(y)), 25, 120, -1)
     seen = measure(frame, field).observations
     off = [np.linalg.norm(seen.points - p[seen.targets], axis=1) for p in prints]
     assert len(seen) >= 48

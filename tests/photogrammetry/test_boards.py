@@ -91,6 +91,25 @@ def test_an_aprilgrid_in_16_bit_with_a_reflection_and_without():
         assert rms(errors / found.sigmas) < 1.4
 
 
+def test_of_two_prints_of_a_board_one_is_measured():
+    """Of tags that something hid on one print, corners of both were measured, and all was ok."""
+    field = boards.aprilgrid(4, 4, 40.0, 0.3)
+    shift = np.array([230.0, 10.0, 0.0])
+    scene = drawn_exactly(field, 4, 4, 40.0, 0.3)
+    scene.shapes += [shape + shift for shape in scene.shapes]
+    station = stood(field, (60.0, -60.0, 750.0))
+    frame = exact_rendering.noisy(scene.render(LARGE, station), np.random.default_rng(1))
+    prints = [LARGE.project(station, points) for points in (field.points, field.points + shift)]
+    assert [*measure(frame, field).missed.values()].count("seen twice") >= 56
+    for number in range(13):  # on the second print, but for four
+        x, y = np.rint(prints[number in (2, 3, 7, 11)][4 * number : 4 * number + 4].mean(axis=0))
+        cv2.circle(frame, (int(x), int(y)), 25, 120, -1)
+    seen = measure(frame, field).observations
+    off = [np.linalg.norm(seen.points - p[seen.targets], axis=1) for p in prints]
+    assert len(seen) >= 48
+    assert min(errors.max() for errors in off) < 0.2
+
+
 def test_small_overexposed_markers_are_not_measured():
     """Cut at full scale, of 12 bit too, their narrow surround gave error/sd of 8 to 19."""
     field = boards.charuco(8, 6, 30.0, 22.0, "DICT_5X5_100")

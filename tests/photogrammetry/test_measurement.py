@@ -160,6 +160,17 @@ def test_tilted_circles_on_no_plane_have_true_sds():
         assert 0.7 <= rms(_z(found, _truth(exterior, field))[loose]) <= 1.3
 
 
+@pytest.mark.parametrize(("noise", "width"), [(1.5, 0.5), (1.5, 1.2)])
+def test_noise_that_a_camera_has_smoothed_widens_the_sds(noise, width):
+    """Neighbouring pixels were taken for independent: error/sd was 1.4 and 2.9."""
+    rng = np.random.default_rng(2)
+    smooth = cv2.GaussianBlur(rng.normal(size=small_frame().shape), (0, 0), width)
+    frame = np.rint(small_frame() + noise * smooth / smooth.std()).clip(0, 255).astype(np.uint8)
+    tracker = Tracker(FIELD, CameraSpec("", SMALL_SENSOR))
+    for _ in range(2):
+        assert 0.8 <= rms(_z(tracker.measure(frame).observations, _truth())) <= 1.3
+
+
 @pytest.mark.parametrize(("light", "noise"), [(0.16, 3.0), (0.2, 4.0)])
 def test_a_dark_frame_is_measured(light, noise):
     """Regression: the noise was too large from outlines off by pixels; 6 of 20 frames had none."""

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.photogrammetry import network_cases as cases
-from tests.photogrammetry.exact_rendering import look_at, rms
-from tests.photogrammetry.fields import corner_field
+from tests.photogrammetry.exact_rendering import look_at, noisy, rms
+from tests.photogrammetry.fields import SMALL_CAMERA, corner_field
+from tests.photogrammetry.test_markers import FIELD, SCENE, VIEWS
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.field.testfield import Distance, TestField
-from thermocald.photogrammetry.survey import survey
+from thermocald.photogrammetry.survey import _measure_again, survey
 from thermocald.physics.scene import Scene
 
 # The binned mode of a Raspberry Pi camera v2.1.
@@ -101,6 +103,18 @@ def test_a_corner_with_four_targets_on_each_wall():
     result = survey(pictures, [distance], 0.00224, nominal=nominal, interior=CAMERA.interior)
     assert len(result.network.names) == 12
     assert_true(result, truth, 1 / 10_000)
+
+
+def test_a_marker_whose_code_is_not_read_is_measured_at_its_predicted_place():
+    view = VIEWS["frontal"]
+    frame = noisy(SCENE.render(SMALL_CAMERA, view), np.random.default_rng(1))
+    x, y = SMALL_CAMERA.project(view, FIELD.points[:4]).mean(axis=0)
+    cv2.circle(frame, (round(x), round(y)), 45, 120, -1)
+    station = SimpleNamespace(photo="a", exterior=view)
+    network = SimpleNamespace(camera=SMALL_CAMERA, stations=[station])
+    normals = np.full((len(FIELD), 3), np.nan)
+    seen = _measure_again({"a": lambda: frame}, network, FIELD, normals, {}, str)["a"]
+    assert seen.targets.tolist() == list(range(48))
 
 
 def test_photographs_that_do_not_fit_together_are_refused(sheet):

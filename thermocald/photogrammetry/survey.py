@@ -32,9 +32,16 @@ from thermocald.photogrammetry.field.testfield import (
     sheet_normals,
     target_normals,
 )
-from thermocald.photogrammetry.frame.measurement import REPEATED, find_repeated, predict_circles
+from thermocald.photogrammetry.frame.measurement import (
+    REPEATED,
+    find_repeated,
+    predict_circles,
+    worth_a_second_look,
+)
 from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
+from thermocald.photogrammetry.orientation import Orientation
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.boards import predict_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
@@ -378,8 +385,16 @@ def _measure_again(
             continue
         progress(f"targets in {name}")
         image = load()
-        corners = measure_corners(image, locate_markers(image, expected, {}), {})
-        rows, maps = predict_circles(expected, network.camera, stations[name].exterior, normals)
+        camera, exterior, missed = network.camera, stations[name].exterior, dict[int, str]()
+        markers = locate_markers(image, expected, missed)
+        corners = measure_corners(image, markers, missed)
+        off = corners.points - camera.project(exterior, expected.points[corners.targets])
+        corners = corners.select(np.linalg.norm(off, axis=1) < _GROSS_PX)
+        again = np.setdiff1d(worth_a_second_look(expected, missed), corners.targets)
+        there = Orientation(camera, exterior, off)
+        places = predict_corners(expected, again.tolist(), there, markers)
+        corners = corners.joined(measure_corners(image, places, {}))
+        rows, maps = predict_circles(expected, camera, exterior, normals)
         fit = fit_circles(image, maps, have_rings(expected, rows))
         off = np.linalg.norm(fit.points - maps.centre, axis=1)
         seen = corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))

@@ -25,14 +25,24 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
+from thermocald.photogrammetry.field.testfield import (
+    FAR_ELSEWHERE,
+    Observations,
+    TestField,
+    field_normals,
+)
 from thermocald.photogrammetry.linalg import inverse_2x2, mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
-from thermocald.photogrammetry.targets.markers import corners_turned_deg, is_marker, locate_markers
+from thermocald.photogrammetry.targets.markers import (
+    SEEN_TWICE,
+    corners_turned_deg,
+    is_marker,
+    locate_markers,
+)
 from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_maps
 from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings, is_ring
 
@@ -109,8 +119,10 @@ _MIRRORED = (
     "the frame is mirrored: the test field is found in its mirror image only. Switch mirroring off "
     "in the camera, or photograph the field without a mirror"
 )
+_ELSEWHERE = "not where the target must be"
 _WORTH_A_SECOND_LOOK = {
-    "not found", "no corner where the marker has one", "the fit does not converge"
+    "not found", SEEN_TWICE, _ELSEWHERE, "no corner where the marker has one",
+    "the fit does not converge",
 }  # fmt: skip
 _FEW_CORNERS = 12
 _REMEDIES = {
@@ -118,6 +130,7 @@ _REMEDIES = {
     "too little contrast": "use more light, or expose longer",
     "too blurred for its size": "focus, then fix the focus",
     "too small": "go nearer, or print larger targets",
+    SEEN_TWICE: "show one print of the test field only",
 }
 
 
@@ -166,6 +179,15 @@ def measure(
     return found
 
 
+def worth_a_second_look(testfield: TestField, missed: Mapping[int, str]) -> list[int]:
+    """Return the rows of corners to be measured at predicted places: some of those missed, for
+    their reason, and the corners of a ChArUco board's squares.
+    """
+    again = {row for row, why in missed.items() if why in _WORTH_A_SECOND_LOOK}
+    appearances = enumerate(zip(testfield.kinds, testfield.codes, strict=True))
+    return sorted(again.union(row for row, how in appearances if how == ("chess_corner", "")))
+
+
 class _Frame:
     """A frame while it is measured; a second look may remove targets from `missed`."""
 
@@ -182,6 +204,8 @@ class _Frame:
             boards = locate_chessboards(self._image, self._field, self._missed)
             self._places = self._markers.joined(boards)
         corners = measure_corners(self._image, self._places, self._missed)
+        if SEEN_TWICE in self._missed.values():
+            corners = self._of_one_print(corners)
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
             return self._finish(corners)
@@ -204,16 +228,28 @@ class _Frame:
         self._missed.update(missed)
         return self._finish(corners.joined(measured), orientation, foreign)
 
+    def _of_one_print(self, corners: Observations) -> Observations:
+        """Return the corners that fit together; the others are on another print of the field."""
+        try:
+            orientation = self._orient(corners.targets, corners.points)
+        except GeometryError:
+            return corners
+        c_px = orientation.camera.interior.c / orientation.camera.sensor.pixel_pitch
+        off = np.hypot(*orientation.residuals.T) > FAR_ELSEWHERE * c_px
+        self._missed.update(dict.fromkeys(corners.targets[off].tolist(), _ELSEWHERE))
+        here = ~np.isin(self._places.rows, corners.targets[off])
+        self._places = self._places.select(here)
+        return corners.select(~off)
+
     def _second_look(self, corners: Observations) -> Observations:
         """Measure further corners at the places predicted by the orientation from the others.
 
         These are corners of markers and chessboards that were not detected or badly placed, and
         the corners of squares of ChArUco boards.
         """
-        missed = self._missed.items() if len(corners) >= _FEW_CORNERS else ()
-        again = {row for row, why in missed if why in _WORTH_A_SECOND_LOOK}
-        appearances = enumerate(zip(self._field.kinds, self._field.codes, strict=True))
-        rows = sorted(again.union(row for row, how in appearances if how == ("chess_corner", "")))
+        rows = worth_a_second_look(
+            self._field, self._missed if len(corners) >= _FEW_CORNERS else {}
+        )
         if len(corners) < _FEWEST or not rows:
             return Observations.none()
         try:
@@ -277,7 +313,7 @@ class _Frame:
         predicted = better.camera.project(better.exterior, field.points[rows])
         off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
         limit = max(_GROSS_PX, _GROSS_SD * min(better.scatter, 1.0))
-        fit.reasons[fit.good & (off > limit)] = "not where the target must be"
+        fit.reasons[fit.good & (off > limit)] = _ELSEWHERE
         add_unknown_tilts(fit.covariances, field, better.camera, rows, maps, fit.parameters)
         return fit.observations(rows, fit.good), fit.missed(rows), better
 

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
-from thermocald.arrays import full_scale
 from thermocald.photogrammetry.frame.measurement import (
     Measurement,
     add_unknown_tilts,
@@ -37,7 +36,7 @@ from thermocald.photogrammetry.frame.measurement import (
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import Corners, measure_corners
-from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel
+from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel, saturation_level
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.photogrammetry.targets.outline import LocalMap, windows
 from thermocald.photogrammetry.targets.ring_code import have_rings
@@ -118,7 +117,7 @@ class GradientWeights:
         delta[:, :6] *= gain[:, None]
         return CircleFit(
             self.parameters + delta,
-            self.inverse[:, :2, :2] * (gain**2)[:, None, None],
+            self.inverse[:, :2, :2] * (self.noise.spread * gain**2)[:, None, None],
             np.sqrt(np.maximum(square, 0.0) / self.freedom),
             np.zeros(n),
             np.full(n, "", dtype=object),
@@ -250,7 +249,7 @@ def _track_circles(
     rows, weights, tilts, seen = circles
     fit = weights.apply(image)
     old, p, misfit = weights.parameters, fit.parameters, fit.misfit
-    top = full_scale(image)
+    top = saturation_level(image)
     level = max(float(np.median(misfit[seen])) if seen.any() else 1.0, 1.0)
     disturbed = (
         (np.abs(p[:, :2] - old[:, :2]).max(axis=1, initial=0.0) > RENEWED_AT_PX)

@@ -29,10 +29,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from thermocald.arrays import Array, Image, Single, full_scale, scratch
+from thermocald.arrays import Array, Image, Single, scratch
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.linalg import inverse_2x2, scaled_solve
-from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
+from thermocald.photogrammetry.targets.frame_status import (
+    NoiseModel,
+    estimate_noise,
+    saturation_level,
+)
 from thermocald.photogrammetry.targets.outline import LocalMap, Windows, windows
 
 if TYPE_CHECKING:
@@ -61,6 +65,32 @@ def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any
     bad, words = zip(*tests, strict=True)
     reasons: NDArray[Any] = np.select(bad, words, "").astype(object)
     return reasons
+
+
+_PROFILE_PX = 10.0
+
+
+def neighbour_correlations(
+    x: Array | Single, use: NDArray[np.bool_], r: Array | Single, depth: Array | Single,
+    contrast: Array,
+) -> tuple[Array, NDArray[np.int64]]:  # fmt: skip
+    """Return the correlation (n,) of a target's residuals r (n, m) in pixels that are neighbours in
+    a row, and the number of pairs (n,).
+
+    x (n, m) px: row by row, those in `use` first; depth (n, m) px: inside the outline. The mean
+    profile across all outlines, as of a sharpened image, is removed first: it is common to all
+    targets, and symmetric. contrast (n,).
+    """
+    bins = np.rint(np.clip(2.0 * (depth + _PROFILE_PX), 0.0, 4.0 * _PROFILE_PX)).astype(np.int64)
+    used = bins[use]
+    sums = np.bincount(used, (r / contrast[:, None])[use], int(4 * _PROFILE_PX) + 1)
+    profile = sums / np.maximum(np.bincount(used, minlength=len(sums)), 1)
+    r = np.where(use, r - profile[bins] * contrast[:, None], 0.0)
+    beside = (np.diff(x, axis=1) == 1) & use[:, 1:]
+    pairs = beside.sum(axis=1)
+    products = np.sum(r[:, 1:] * r[:, :-1], axis=1, where=beside) / np.maximum(pairs, 1)
+    squares = np.sum(r * r, axis=1) / np.maximum(use.sum(axis=1), 1)
+    return products / np.maximum(squares, 1e-9), pairs
 
 
 def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ...]:
@@ -227,7 +257,7 @@ def fit_circles(
     normal = np.zeros((n, 10, 10))
     pixels, square, saturation, last_step = (np.zeros(n) for _ in range(4))
     cut = np.zeros(n, dtype=bool)
-    top = full_scale(image)
+    top, residuals = saturation_level(image), []
     for w in parts:
         mine = maps.select(w.rows)
         fitted = _step(w, mine, parameters[w.rows], noise, work)
@@ -243,6 +273,7 @@ def fit_circles(
         square[w.rows] = np.sum(w.weight / noise.variance(value) * residual * residual, axis=1)
         saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1)
         cut[w.rows] = w.cut
+        residuals.append(residual)
     saturation /= np.maximum(pixels, 1)
     variance = square / np.maximum(pixels - 10, 1)
     # the noise is too large so far if outlines were predicted some pixels off
@@ -253,10 +284,14 @@ def fit_circles(
         # but a hand or a glare of one grey value has no noise.
         level = float(np.median(variance[shown]))
         noise, variance, normal = noise.scaled(level), variance / level, normal / level
+    if given is None:
+        alike = shown & (variance < _MISFIT**2)
+        rho = _usual_correlation(parts, residuals, maps, parameters, alike)
+        noise = replace(noise, spread=(1 + rho) / (1 - rho))
     # A target that is significantly noisier than the frame has its own noise.
     own = np.where(variance > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), variance, 1.0)
     cofactors = scaled_solve(normal, np.eye(10)[None, :, :2], 1e-12)[:, :2]
-    covariances = cofactors * own[:, None, None]
+    covariances = cofactors * (noise.spread * own)[:, None, None]
     none = np.full(n, "", dtype=object)
     fit = CircleFit(parameters, covariances, np.sqrt(variance), saturation, none, noise)
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
@@ -323,6 +358,23 @@ def _step(
     step = np.abs(delta[:, :2]).max(axis=1)
     settled = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
     return p, value + change, residual - change, N, step, settled
+
+
+def _usual_correlation(
+    parts: Sequence[Windows], residuals: Sequence[Single], maps: LocalMap, parameters: Array,
+    alike: NDArray[np.bool_],
+) -> float:  # fmt: skip
+    """Return the correlation of neighbouring residuals of some targets (mask), 0 if negative."""
+    rho = []
+    for every, residual in zip(parts, residuals, strict=True):
+        some = np.flatnonzero(alike[every.rows])
+        w = every.select(some)
+        p = parameters[w.rows]
+        (x, y), shape = (p[:, :2] - w.origin).T[:, :, None], p[:, 2:5]
+        radius, slope, *_ = _in_plane(maps.select(w.rows), shape, w.x - x, w.y - y)
+        depth = (1 - radius) / slope
+        rho.append(neighbour_correlations(w.x, w.weight > 0, residual[some], depth, p[:, 7])[0])
+    return float(np.clip(np.median(np.concatenate(rho)), 0.0, 0.9)) if alike.any() else 0.0
 
 
 def _noise_sd(parameters: Array, noise: NoiseModel) -> Array:

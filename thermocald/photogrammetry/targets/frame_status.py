@@ -33,10 +33,14 @@ _BINS = 6
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """The noise model var(g) = floor + gain·g, with floor DN² and gain DN."""
+    """The noise model var(g) = floor + gain·g, with floor DN² and gain DN.
+
+    spread: by what factor the correlation of neighbouring pixels enlarges the variance of a centre.
+    """
 
     floor: float
     gain: float = 0.0
+    spread: float = 1.0
 
     def variance(
         self, grey: NDArray[np.floating[Any]] | np.floating[Any]
@@ -46,7 +50,7 @@ class NoiseModel:
 
     def scaled(self, factor: float) -> NoiseModel:
         """Return the noise model with all variances times a factor."""
-        return NoiseModel(self.floor * factor, self.gain * factor)
+        return NoiseModel(self.floor * factor, self.gain * factor, self.spread)
 
 
 def estimate_noise(
@@ -84,6 +88,28 @@ def estimate_noise(
     if gain < 0 or floor + gain * x[0] < _QUANTISATION:
         return NoiseModel(max(float(v.mean()), _QUANTISATION))
     return NoiseModel(float(floor), float(gain))
+
+
+_PLATEAU = 0.005  # share of the pixels that have the brightest value
+_STEEP = 2.0  # times the pixels one level below
+_ALIKE = 0.5  # share of equal neighbours off a plateau, from which an image has no noise
+
+
+def saturation_level(image: NDArray[Any]) -> int:
+    """Return the grey value at which a sensor saturates, of an image of 8 or 16 bit.
+
+    It is full scale, or less if the brightest pixels have one value and the others noise.
+    """
+    top, sample = full_scale(image), image[::4]
+    level = int(sample.max())
+    full = sample == level
+    if level < top and np.mean(full) > _PLATEAU:
+        below = ~full & (sample >= level - max(level >> 8, 1))
+        rest = ~(full[:, 1:] | full[:, :-1])
+        alike = np.mean((sample[:, 1:] == sample[:, :-1])[rest]) if rest.any() else 1.0
+        if full.sum() > _STEEP * below.sum() and alike < _ALIKE:
+            return level
+    return top
 
 
 Word = Literal[

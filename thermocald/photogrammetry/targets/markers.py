@@ -14,7 +14,8 @@ A test field names marker corners in its `code` column as `DICT_APRILTAG_36h11:1
 marker, corner. Markers are detected by OpenCV, in a reduced image if the frame is large, with a
 black border of one cell, or of two as Kalibr prints it; the corners are measured by `corner`.
 
-A marker that is detected twice in an image is dropped, since one of the detections is false.
+A marker that is detected twice in an image is dropped, since one of the detections is false or on
+another print of the field.
 """
 
 from __future__ import annotations
@@ -132,6 +133,8 @@ LARGE_PIXELS = 3_000_000
 """A larger image is searched at half its size first."""
 SMALLEST_SIDE_PX = 16.0
 """A marker with a shorter side in the image is not measured."""
+SEEN_TWICE = "seen twice"
+"""Why a marker was missed that is at two places."""
 _LEAST_STEP_DN = 5.0
 
 
@@ -180,17 +183,17 @@ def _searches(
 
 def detect_markers(
     image: Image, name: str, expected: frozenset[int]
-) -> tuple[dict[int, Array], int]:
+) -> tuple[dict[int, Array], int, set[int]]:
     """Detect the markers of one dictionary with `expected` numbers in an image.
 
-    Returns the corners (4, 2) px by number, good to about a pixel, and the width of the black
-    border in cells. A number that is found twice is dropped. A large image is searched at half its
+    Returns the corners (4, 2) px by number, good to about a pixel, the width of the black border in
+    cells, and the numbers that were found twice and dropped. A large image is searched at half its
     size first, at full size if half of the markers or fewer were found, and then, for AprilTags,
     with the wide border of Kalibr's AprilGrids, in the end smoothed.
     """
     grey = eight_bit(image)
     best: dict[int, Array] = {}
-    best_border = 1
+    best_border, twice = 1, set[int]()
     for border, scale, searched in _searches(grey, name.startswith("DICT_APRILTAG")):
         found, numbers, _ = detector(name, border).detectMarkers(searched)
         seen: defaultdict[int, list[Array]] = defaultdict(list)
@@ -206,11 +209,12 @@ def detect_markers(
             # OpenCV may detect the inner and the outer outline of one marker
             if off.max() < 0.1 * np.linalg.norm(quads[0][0] - quads[0][2]):
                 single[number] = quads[0]
+        twice |= seen.keys() - single.keys()
         if len(single) > len(best):
             best, best_border = single, border
         if len(best) > 0.5 * len(expected):
             break
-    return best, best_border
+    return best, best_border, twice - best.keys()
 
 
 def _is_outline(grey: NDArray[np.uint8], quad: Array) -> bool:
@@ -249,7 +253,7 @@ def locate_markers(image: Image, testfield: TestField, missed: dict[int, str]) -
     found: list[tuple[int, float, Array]] = []  # row, border, corner with its neighbours
     for name, known in marker_rows(testfield).items():
         expected = frozenset(marker for marker, _ in known)
-        quads, border = detect_markers(image, name, expected)
+        quads, border, twice = detect_markers(image, name, expected)
         cells = marker_size(name, border)
         for number, quad in quads.items():
             side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min()
@@ -259,8 +263,9 @@ def locate_markers(image: Image, testfield: TestField, missed: dict[int, str]) -
                     found.append((row, border * side / cells, quad[[k, k - 1, (k + 1) % 4]]))
                 elif row is not None:
                     missed[row] = "too small"
-        missing = expected.difference(quads)
-        missed.update({r: "not found" for (m, _), r in known.items() if m in missing})
+        for (number, _), row in known.items():
+            if number not in quads:
+                missed[row] = SEEN_TWICE if number in twice else "not found"
     rows = np.array([row for row, _, _ in found], dtype=np.int64)
     borders = np.array([border for _, border, _ in found])
     places, before, after = (

@@ -277,7 +277,9 @@ def test_the_covariance_of_displacements_is_their_scatter(warm_up):
     _, covariance = image_displacement(series, grid)
     sds = np.nan_to_num(series.sds[0])
     of_epoch = series.correlations[0] * np.outer(sds, sds)
-    # of two independent epochs
+    # of two epochs, independent or with errors of opposite signs: these were left out
+    _, opposed = image_displacement(replace(series, slow=2 * of_epoch), grid)
+    np.testing.assert_allclose(opposed, 2 * covariance)
     later = np.random.default_rng(9).multivariate_normal(INTERIOR, 2 * of_epoch, 2000)
     scene = directions(NEXUS, INTERIOR, grid)
     moved = project(NEXUS, later, np.zeros((len(later), 6)), scene) - grid

@@ -116,7 +116,7 @@ def image_displacement(series: MeasuredSeries, points: Array) -> tuple[Array, Ar
     J = partials(sensor, last, np.zeros(6), scene)[1][..., :10]
     sds = np.nan_to_num(series.sds[[0, -1]])
     covariance = series.correlations[[0, -1]] * sds[:, :, None] * sds[:, None, :]
-    return moved, np.asarray(J @ covariance.sum(axis=0) @ np.swapaxes(J, 1, 2))
+    return moved, np.asarray(J @ (covariance.sum(axis=0) + series.slow) @ np.swapaxes(J, 1, 2))
 
 
 def depth_of_field(
@@ -221,7 +221,7 @@ class SeriesStudy:
 def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
     """Study one series. Never raises because of data; `notes` states what they do not allow."""
     notes = _circumstances(series)
-    slow = dict(zip(IOP_NAMES, series.slow.tolist(), strict=True))
+    slow = dict(zip(IOP_NAMES, np.diagonal(series.slow).tolist(), strict=True))
     deviations = {
         name: d
         for name, column in series.columns.items()

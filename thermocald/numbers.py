@@ -10,19 +10,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-UNITS = {
-    "c": "mm",
-    "x0": "mm",
-    "y0": "mm",
-    "A1": "mm⁻²",
-    "A2": "mm⁻⁴",
-    "A3": "mm⁻⁶",
-    "B1": "mm⁻¹",
-    "B2": "mm⁻¹",
-    "C1": "",
-    "C2": "",
+UNITS = dict.fromkeys(("c", "x0", "y0"), "mm") | {
+    "A1": "mm⁻²", "A2": "mm⁻⁴", "A3": "mm⁻⁶", "B1": "mm⁻¹", "B2": "mm⁻¹", "C1": "", "C2": "",
     "sigma0": "",
-}
+}  # fmt: skip
 _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d{1,3})(?![\w.]*\w)")

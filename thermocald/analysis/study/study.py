@@ -319,25 +319,24 @@ def _significance(
             f"{' but too many gaps' if len(series) >= settings.window else ''}: not tested."
         )
         return {}
+    window, time = settings.window, series.time_s
     drifts = {
-        name: drift_test(*series.column(name), series.redundancy, settings.window, series.time_s)
+        name: drift
         for name in series.free
+        if (drift := drift_test(*series.column(name), series.redundancy, window, time)) is not None
     }
-    tested = _corrected(
-        {name: drift for name, drift in drifts.items() if drift is not None},
-        p_holm="p_value", p_excess_holm="p_excess",
-    )  # fmt: skip
+    tested = _corrected(drifts, p_holm="p_value", p_excess_holm="p_excess")
     result = {}
     for name in series.free:
         values, sds = series.column(name)
         index, ratio, critical, degrees_sd = moving_f_test(
-            values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
+            values, sds, series.redundancy, time, window, settings.alpha
         )
         some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
         result[name] = Significance(
             float(np.mean(ratio > critical)), len(ratio), len(values) - len(ratio),
-            settings.window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
-            float(np.median(ratio)), np.column_stack([series.time_s[index[some]], ratio[some]]),
+            window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
+            float(np.median(ratio)), np.column_stack([time[index[some]], ratio[some]]),
             tested.get(name),
         )  # fmt: skip
     return result

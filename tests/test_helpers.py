@@ -149,6 +149,7 @@ def test_powers_are_raised_and_names_are_left():
         "a_B1 = (-7.69 ± 0.33)e-7 mm-1/K, 2.0e-06": "a_B1 = (−7.69 ± 0.33)·10⁻⁷ mm⁻¹/K, 2.0·10⁻⁶",
         "A2 = (4.9 ± 0.3)e+12 mm-4": "A2 = (4.9 ± 0.3)·10¹² mm⁻⁴",
         "above 40.2 ± 0.3 degC; --unit degC": "above 40.2 ± 0.3 °C; --unit degC",
+        "from -35 (-1.5 K) by 3-4 of M-1, -x": "from −35 (−1.5 K) by 3-4 of M-1, -x",
         "series mm-1-b of IMG_1e5.jpg at 10 mm": "series mm-1-b of IMG_1e5.jpg at 10 mm",
         "(see M1)e-7, 0x1e5, 1e5b": "(see M1)e-7, 0x1e5, 1e5b",
     }.items():

@@ -20,6 +20,7 @@ _COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d
 _UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
 _MEASURED = re.compile(r"(?<![\w.,-])[+−]?\d[\d,]*(?:\.\d+)?(?: ± [\d.]*\d)?(?!\w)")
 _DEGREES = re.compile(r"(?<=[\d)] )degC\b")
+_NEGATIVE = re.compile(r"(?<![^\s(])-(?=\d)")
 _MINUS = "−"
 _LETTERS = {"c": "degC", "℃": "degC", "k": "K"}  # others, also 华, stand for °F
 _STATED = re.compile(
@@ -123,11 +124,11 @@ def superscript(exponent: int) -> str:
 def typeset_powers(text: str) -> str:
     """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
 
-    The unit degC behind a number, as files spell it, becomes °C, and a minus behind = is one.
+    The unit degC behind a number, as files spell it, becomes °C, a hyphen that opens one a minus.
     """
-    text = _DEGREES.sub("°C", text).replace(" = -", f" = {_MINUS}")
-    text = _COMPUTED.sub(lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text)
-    return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
+    text = _COMPUTED.sub(lambda m: f"{m[1]}·10{superscript(int(m[2]))}", text)
+    text = _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
+    return _NEGATIVE.sub(_MINUS, _DEGREES.sub("°C", text))
 
 
 def with_sd(value: float, sd: float, unit: str = "") -> str:

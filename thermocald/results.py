@@ -19,7 +19,7 @@ from thermocald.discovery.result import build_model, field_lines, mount_lines, s
 from thermocald.errors import DataError
 from thermocald.figures import draw_figure
 from thermocald.names import tell_apart
-from thermocald.numbers import counted, percent, plain, typeset_powers, with_sd
+from thermocald.numbers import counted, percent, plain, with_sd
 from thermocald.output import calibration as calibration_report
 from thermocald.output import discovery as discovery_report
 from thermocald.output.study import report as study_report
@@ -93,7 +93,7 @@ class Discovery(discoveries.Discovery, Result):
         if self.verdict == "adequate":
             lines.append(say_adequate(self.examination))
         for effect in self.effects:
-            lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
+            lines.append(f"{effect.effect}: {effect.statement}")
             for name, e in effect.estimates.items():
                 if isinstance(e["value"], float):
                     sd = math.nan if e["sd"] is None else e["sd"]

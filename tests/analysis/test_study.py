@@ -19,7 +19,9 @@ from thermocald.analysis.study.study import (
     study_series,
 )
 from thermocald.errors import DataError, UsageError
-from thermocald.output.study.report import answer_sentences
+from thermocald.output.study.figures import study_figures
+from thermocald.output.study.report import answer_sentences, rate_in_px_and_mm
+from thermocald.output.study.tables import object_space_tables
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording
@@ -105,6 +107,10 @@ def test_a_warm_up_is_found_in_its_parameters_only(warm_up):
     assert found.significance["x0"].success_ratio == 1.0
     assert found.significance["x0"].drift.p_value <= 0.001
     assert found.significance["B2"].drift.p_value > 0.01
+    half = 0.5 * NEXUS.width * NEXUS.pixel_pitch / INTERIOR[0]
+    at_edge = rate_in_px_and_mm(found, "c", 1e-3, 1e4)[1]  # X = D x' / c
+    assert at_edge == pytest.approx(1e-3 * 1e4 / INTERIOR[0] * half, rel=0.01)
+    assert found.focus.confusion == pytest.approx(4080 * NEXUS.pixel_pitch / 2000)
     slope = channel.dependences["x0"]
     assert abs(slope.slope - 0.0194 / 12) < 4 * slope.sd_slope
     # parameters held fixed are named, and absent
@@ -217,6 +223,12 @@ def test_first_order_agrees_where_errors_are_small(warm_up):
     assert "mostly the noise" not in " ".join(camera.notes)
     np.testing.assert_allclose(first.mean, drawn.mean, rtol=0.02)
     np.testing.assert_allclose(first.fractions, drawn.fractions, atol=0.01)
+    outline = study_figures(camera)["object-space-errors"].panels[0].curves[-1]
+    xy = 10 * np.array([outline.x, outline.y])
+    inside = np.sum(xy * np.linalg.solve(first.covariance[0], xy), axis=0)
+    np.testing.assert_allclose(1 - np.exp(-inside / 2), 0.95, rtol=1e-3)
+    tall = replace(drawn, covariance=np.tile(np.diag([1.0, 4.0]), (9, 1, 1)))
+    assert object_space_tables(replace(camera, montecarlo=tall))[1].rows[0][6] == "90°"
     # maxima of 50,000 draws scatter by several per cent
     np.testing.assert_allclose(first.expected_largest, drawn.largest, rtol=0.2)
     # the draws give a variance to 0.6 %, a mean to 0.0045 sd
@@ -229,6 +241,9 @@ def test_a_shift_of_the_principal_point_moves_all_points_equally(warm_up):
     """A change of x0 alone moves every image point by D Δx0 / c, with little distortion."""
     series = warm_up(drift={"x0": 0.0194}, sds=np.full(10, 1e-12))()
     first, mean, last = trajectories([series], 10_000.0, 3, (15.0, 50.0, 100.0))
+    jump = replace(series, values=series.values[[0, 0, -1]], time_s=series.time_s[:3])
+    of_first, _, of_last = trajectories([jump], 10_000.0, 3, (15.0,))
+    assert of_last.mean == pytest.approx(2 * of_first.mean, rel=0.03)
     away = np.abs(series.values[:, 1] - series.values[0, 1]) * 10_000.0 / series.values[0, 0]
     assert first.reference == "first"
     assert first.mean == pytest.approx(away.mean(), rel=0.03)
@@ -277,7 +292,9 @@ def test_the_covariance_of_displacements_is_their_scatter(warm_up):
     _, covariance = image_displacement(series, grid)
     sds = np.nan_to_num(series.sds[0])
     of_epoch = series.correlations[0] * np.outer(sds, sds)
-    # of two independent epochs
+    # of two epochs, independent or with errors of opposite signs: these were left out
+    _, opposed = image_displacement(replace(series, slow=2 * of_epoch), grid)
+    np.testing.assert_allclose(opposed, 2 * covariance)
     later = np.random.default_rng(9).multivariate_normal(INTERIOR, 2 * of_epoch, 2000)
     scene = directions(NEXUS, INTERIOR, grid)
     moved = project(NEXUS, later, np.zeros((len(later), 6)), scene) - grid

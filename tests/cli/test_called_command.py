@@ -116,3 +116,16 @@ def test_a_signal_ends_a_command_silently_while_it_is_imported_and_in_a_destruct
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=50, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "closed", "status"), [("simulate --list", 1, 0), ("stduy", 2, 2)]
+)
+def test_a_reader_that_has_gone_changes_no_status(words, closed, status):
+    """The status was 1, and of a progress that nobody read no result was written."""
+    reader, pipe = os.pipe()
+    os.close(reader)
+    streams = {["stdin", "stdout", "stderr"][closed]: pipe}
+    command = [sys.executable, "-m", "thermocald", *words.split()]
+    assert subprocess.run(command, timeout=60, check=False, **streams).returncode == status
+    os.close(pipe)

@@ -56,6 +56,7 @@ ONE_LINE = [
     pytest.param(f"doctor --root {'/y' * 300}", "/y/y…y/y/y", id="a long path"),
     ("camera foo", "error: no such command 'foo'; see 'thermocald camera --help'"),
     ("replay M1 --exteriorr series", "no such option: --exteriorr"),
+    ("--json - replay M1", "--json is no option before a command; a command's follow its name"),
     ("import p --log l", "error: --testfield is missing: give it, or --dry-run"),
     ("study M1 --report a.html --json ./a.html", "would be ./a.html"),
     ("fit 1 -o c.yaml --code a --json a.h", "--json: both would be a"),

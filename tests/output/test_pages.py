@@ -414,7 +414,8 @@ def test_the_page_is_whole_and_holds_the_numbers_of_the_study(page_text):
     assert "<script>M2" not in html  # labels are text and no markup
     assert "a &amp; &lt;b&gt;" in html
     words = words_of(html)
-    assert re.search(r"M1: in .* the principal point moved by (up to )?15\.\d", words)
+    # the sd of the movement, not the root of those of x0 and y0 squared
+    assert re.search(r"M1: in .* the principal point moved by 15\.\d+ ± 0\.0071 px", words)
     mc = warm_study().cameras[0].montecarlo
     for said in (
         "to the lower right", f"{100 * mc.fractions[0]:.1f} %", f"{mc.overall_mean / 10:.2f} cm",

@@ -73,6 +73,8 @@ def test_frames_and_readings_have_their_own_instants(simulation):
     assert 1.1 < shift.max() <= 1.2
     assert np.all(np.diff(s.frame_times) > 5)
     assert 0.2 < np.diff(s.frame_times).std() / np.sqrt(2) < 0.4
+    wild = replace(s, programme=replace(s.programme, jitter=100.0))
+    assert np.diff(wild.frame_times).min() >= 0.2 * s.programme.interval - 1e-9
 
 
 def test_another_camera_and_a_view_without_targets_are_refused(simulation):

@@ -111,8 +111,8 @@ def main() -> None:
         say(f"error: {error.object[:200]}: is not UTF-8 text; choose another name")
         sys.exit(2)
     except BrokenPipeError:
-        # The reader of our output has closed the pipe, as `head` does.
-        sys.stderr.close()
+        # The reader of our output has closed the pipe, as `head` does; what is left goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(0)
     except OSError as error:
         # a folder without write permission or a full disk, wherever it is noticed first
@@ -145,6 +145,8 @@ def _print_usage_error(error: Any) -> int:
     # an option without its value has no context
     command = error.ctx.command_path if error.ctx else f"thermocald {_command_name()}".strip()
     message = error.format_message()
+    if error.ctx and not error.ctx.parent and hasattr(error, "option_name"):
+        message = f"{error.option_name} is no option before a command; a command's follow its name"
     if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
         return int(error.exit_code)

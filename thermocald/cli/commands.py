@@ -171,7 +171,10 @@ class Command(TyperCommand):
                 for other in given.intersection(others.split()) if (name in given) is here else ():
                     does = "has no effect with" if here else "needs"
                     raise UsageError(f"{options[other]} {does} {options[name]}")
-        return super().invoke(ctx)
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:  # Typer would exit with 1
+            raise typer.Exit from None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, the options, and last the advanced options."""

@@ -8,7 +8,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +34,9 @@ def say(text: str) -> None:
     may contain and a terminal would obey, are shown as codes.
     """
     text = re.sub(r"\S+", lambda word: files.shown(word[0]), printable(without_secrets(text)))
-    sys.stderr.write(f"{text}\n")
-    sys.stderr.flush()
+    with suppress(BrokenPipeError):  # nobody reads it, which harms no result
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
 
 
 def printable(text: str) -> str:

@@ -20,6 +20,7 @@ from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, imag
 from thermocald.numbers import (
     UNITS,
     coefficient,
+    counted,
     enumerated,
     listed,
     parameter_label,
@@ -268,7 +269,7 @@ def render_field_check(result: FieldCheck, title: str = "") -> str:
             ),
             Section(
                 "Which targets are not seen, and why",
-                items=tuple((f"{reasons.count(r)} targets", r) for r in sorted(set(reasons))),
+                items=tuple((counted(reasons.count(r), "target"), r) for r in sorted(set(reasons))),
                 text=() if reasons else ("All are seen.",),
             ),
         ),

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _BASE, _FOUND = PALETTE[1], PALETTE[0]
 _AT_NOISE = 1.1  # times the noise: a misfit up to this counts as noise
 _ADVICE = {
-    "effects_found": "Write the model with --model-out and correct measurements with it.",
+    "effects_found": "Correct measurements with the model, which --model-out writes.",
     "adequate": "See which effects this set-up would reveal: thermocald discover --plan.",
     "unexplained": "Also record possible causes (light, current, a second temperature).",
 }

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.numbers import parameter_label
+from thermocald.numbers import parameter_label, with_sd
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
 
 if TYPE_CHECKING:
@@ -144,19 +144,11 @@ class Parameter:
 
 def say_estimate(estimate: Values) -> str:
     """Format an estimate with two digits of its standard deviation: 84.1 ± 1.9 s."""
-    value, sd, unit = estimate.get("value"), estimate.get("sd"), estimate.get("unit", "")
-    unit = "" if unit == "1" else f" {unit.replace('degC', '°C')}"
+    value, unit = estimate.get("value"), estimate.get("unit", "")
+    unit = "" if unit == "1" else unit
     if isinstance(value, str) or value is None:
-        return f"{value}{unit}"
-    if not sd or not np.isfinite(sd):
-        return f"{value:.4g}{unit}"
-    digits = 1 - int(np.floor(np.log10(sd)))
-    if -2 <= digits <= 5:
-        d = max(digits, 0)
-        return f"{round(value, digits):.{d}f} ± {round(sd, digits):.{d}f}{unit}"
-    exponent = int(np.floor(np.log10(max(abs(value), sd))))
-    d = max(digits + exponent, 0)
-    return f"({value / 10.0**exponent:.{d}f} ± {sd / 10.0**exponent:.{d}f})e{exponent}{unit}"
+        return f"{value} {unit}".rstrip()
+    return with_sd(value, estimate.get("sd") or np.nan, unit)
 
 
 def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -> dict[str, str]:

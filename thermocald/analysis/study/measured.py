@@ -83,9 +83,9 @@ class MeasuredSeries:
     orientation was estimated; choice: why; without_result: {reason: epochs}; start_utc: s UTC of
     the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
     image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that
-    moved, for which the observations are corrected; doubts: implausible recorded data; slow (10,):
-    variances of last minus first by which slow errors exceed independent ones; c_known_to: relative
-    sd of the level of c, 0 if unknown.
+    moved, for which the observations are corrected; doubts: implausible recorded data; slow
+    (10, 10): covariance of last minus first by which slow errors exceed independent ones;
+    c_known_to: relative sd of the level of c, 0 if unknown.
     """
 
     label: str
@@ -107,7 +107,7 @@ class MeasuredSeries:
     image_noise_ratio: float = float("nan")
     field_movements: tuple[FieldMovement, ...] = ()
     doubts: tuple[str, ...] = ()
-    slow: Array = field(default_factory=lambda: np.zeros(10))
+    slow: Array = field(default_factory=lambda: np.zeros((10, 10)))
     c_known_to: float = 0.0
 
     def __len__(self) -> int:
@@ -204,6 +204,11 @@ def measured_series(
     choice, moved = "" if adjustment is None else adjustment.choice, count_moved(table.stillness)[0]
     if moved:
         choice += f"; but the camera did not stand still in {counted(moved, 'epoch')}"
+    slow = np.zeros((10, 10))
+    if adjustment is not None:  # errors of a course have opposite signs in the first and last epoch
+        ends = table.slow_errors[0][:, np.flatnonzero(table.ok)[[0, -1]]]
+        for (_, changes), (first, last) in zip(adjustment.slow, ends, strict=True):
+            slow -= 2.0 * first * last * changes[:10, :10]
     time_s, thermometers = table.frame_time[ok], []
     for name, channel in source.head.channels.items():
         read, readings = source.columns.readings_of(name)
@@ -219,6 +224,6 @@ def measured_series(
         correlations(covariances), exterior, without_result, float(time_s[0]),
         choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
-        slow=table.slow_between_ends[:10],
+        slow=slow,
         c_known_to=float(np.nan_to_num(table.level_sd[0]) / np.median(table.values[ok, 0])),
     )  # fmt: skip

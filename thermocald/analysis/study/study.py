@@ -116,7 +116,7 @@ def image_displacement(series: MeasuredSeries, points: Array) -> tuple[Array, Ar
     J = partials(sensor, last, np.zeros(6), scene)[1][..., :10]
     sds = np.nan_to_num(series.sds[[0, -1]])
     covariance = series.correlations[[0, -1]] * sds[:, :, None] * sds[:, None, :]
-    return moved, np.asarray(J @ covariance.sum(axis=0) @ np.swapaxes(J, 1, 2))
+    return moved, np.asarray(J @ (covariance.sum(axis=0) + series.slow) @ np.swapaxes(J, 1, 2))
 
 
 def depth_of_field(
@@ -221,7 +221,7 @@ class SeriesStudy:
 def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
     """Study one series. Never raises because of data; `notes` states what they do not allow."""
     notes = _circumstances(series)
-    slow = dict(zip(IOP_NAMES, series.slow.tolist(), strict=True))
+    slow = dict(zip(IOP_NAMES, np.diagonal(series.slow).tolist(), strict=True))
     deviations = {
         name: d
         for name, column in series.columns.items()
@@ -319,25 +319,24 @@ def _significance(
             f"{' but too many gaps' if len(series) >= settings.window else ''}: not tested."
         )
         return {}
+    window, time = settings.window, series.time_s
     drifts = {
-        name: drift_test(*series.column(name), series.redundancy, settings.window, series.time_s)
+        name: drift
         for name in series.free
+        if (drift := drift_test(*series.column(name), series.redundancy, window, time)) is not None
     }
-    tested = _corrected(
-        {name: drift for name, drift in drifts.items() if drift is not None},
-        p_holm="p_value", p_excess_holm="p_excess",
-    )  # fmt: skip
+    tested = _corrected(drifts, p_holm="p_value", p_excess_holm="p_excess")
     result = {}
     for name in series.free:
         values, sds = series.column(name)
         index, ratio, critical, degrees_sd = moving_f_test(
-            values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
+            values, sds, series.redundancy, time, window, settings.alpha
         )
         some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
         result[name] = Significance(
             float(np.mean(ratio > critical)), len(ratio), len(values) - len(ratio),
-            settings.window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
-            float(np.median(ratio)), np.column_stack([series.time_s[index[some]], ratio[some]]),
+            window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
+            float(np.median(ratio)), np.column_stack([time[index[some]], ratio[some]]),
             tested.get(name),
         )  # fmt: skip
     return result

@@ -33,6 +33,7 @@ from thermocald.numbers import (
     plain,
     spanned,
     superscript,
+    typeset_powers,
     with_sd,
     without_numbers,
 )
@@ -83,6 +84,7 @@ def by_series(
     groups: dict[object, dict[str, list[str]]] = {}
     for study, text in texts:
         if text:
+            text = typeset_powers(text)
             alike = without_numbers(text), tuple(t.name for t in study.series.thermometers)
             groups.setdefault(alike, {}).setdefault(text, []).append(study.series.name)
     said = []

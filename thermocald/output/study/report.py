@@ -294,7 +294,7 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
     )
     T = channel.thermometer.values
     low, high = float(np.nanmin(T)), float(np.nanmax(T))
-    rough = " (standard deviations are rough, because the series is short)"
+    rough = " (short series: standard deviations are rough)"
     where = parameter_label(channel.thermometer.name)
     return (
         f"between {low:.0f} and {high:.0f} °C "
@@ -350,14 +350,16 @@ def _change(study: SeriesStudy) -> str:
     if "x0" in d and "y0" in d:
         way = np.hypot(*s.path_px.T)
         moved, farthest = float(way[-1]), float(way.max())
-        sd = float(np.hypot(d["x0"].sd_change, d["y0"].sd_change)) / s.sensor.pixel_pitch
+        sds = np.array([d["x0"].sd_change, d["y0"].sd_change]) / s.sensor.pixel_pitch
+        sd = float(np.hypot(*sds))
         if farthest > max(1.5 * moved, 6 * sd):
             words.append(
                 f"the principal point moved by up to {plain(farthest, 'px', 3)} and ended "
                 f"{plain(moved, 'px', 3)} from where it started"
             )
         elif moved > 3 * sd:
-            words.append(f"the principal point moved by {with_sd(moved, sd, 'px')}")
+            along = float(np.hypot(*(s.path_px[-1] * sds))) / moved
+            words.append(f"the principal point moved by {with_sd(moved, along, 'px')}")
         else:
             words.append(
                 f"the principal point stayed within {plain(max(farthest, 3 * sd), 'px', 2)}"

@@ -78,10 +78,15 @@ def test_a_driver_is_looked_up_among_what_there_is(monkeypatch):
         assert load_driver(kind, "mock").__name__.startswith("Mock")
         with pytest.raises(ConfigurationError, match=f"no {kind} driver 'none'; .*are: .*mock"):
             load_driver(kind, "none")
-    point = EntryPoint("lost", "thermocald_drivers.no_such_module:Lost", "thermocald.cameras")
-    monkeypatch.setattr(hal, "entry_points", lambda group: [point])
-    with pytest.raises(DriverMissing, match="'lost' cannot be imported"):
-        load_driver("camera", "lost")
+    for place, why in (
+        ("no_such_module:Lost", "cannot be imported: ModuleNotFoundError: "),
+        ("mock:Lost", "cannot be imported: AttributeError: "),  # `devices` ended by it
+        ("mock:MockThermometer", "is no class derived from thermocald.hal.Camera"),
+    ):
+        point = EntryPoint("lost", f"thermocald_drivers.{place}", "thermocald.cameras")
+        monkeypatch.setattr(hal, "entry_points", lambda group, point=point: [point])
+        with pytest.raises(DriverMissing, match=f"^camera driver 'lost' {why}"):
+            load_driver("camera", "lost")
 
 
 def test_a_devices_name_cannot_leave_its_comment():

@@ -404,7 +404,7 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
     """Return a driver's class.
 
     Raises ConfigurationError, which lists the installed drivers, DriverMissing if it cannot be
-    imported.
+    imported or is no such driver.
     """
     points = {point.name: point for point in entry_points(group=f"thermocald.{kind}s")}
     if name not in points:
@@ -412,8 +412,13 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
         raise ConfigurationError(f"there is no {kind} driver {name!r}; installed are: {installed}")
     try:
         loaded: type[Any] = points[name].load()
-    except ImportError as error:
-        raise DriverMissing(f"{kind} driver {name!r} cannot be imported: {error}") from error
+    except Exception as error:  # whatever a module raises that somebody else wrote
+        why = f"{type(error).__name__}: {error}"
+        raise DriverMissing(f"{kind} driver {name!r} cannot be imported: {why}") from error
+    base = {"camera": Camera, "thermometer": Thermometer, "output": Output}[kind]
+    if not (isinstance(loaded, type) and issubclass(loaded, base)):
+        why = f"is no class derived from thermocald.hal.{base.__name__}"
+        raise DriverMissing(f"{kind} driver {name!r} {why}")
     return loaded
 
 
@@ -429,6 +434,9 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock)
         device = driver(clock=clock, **options)
     except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no text
         raise ConfigurationError(f"{where}: {error}") from error
+    except Exception as error:
+        why = f"its driver failed: {type(error).__name__}: {error}"
+        raise ConfigurationError(f"{where}: {why}") from error
     if kind == "thermometer":
         require_channels(device.named_channels(), where, ConfigurationError)
     return device

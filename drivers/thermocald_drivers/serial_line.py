@@ -293,8 +293,9 @@ class SerialThermometer(support.CheckedThermometer):
                 if not whole and self.command:
                     self.handle.write(self.command)  # the answer may have been joined to it
                 line = line.strip(b"\0")
-                if len(line) > 8 and not any(line[1::2]):  # UTF-16
-                    line = line[::2]
+                wide = re.sub(rb"\A(\xff\xfe|\xfe\xff\0)", b"", line)  # without a byte-order mark
+                if len(wide) > 8 and not any(wide[1::2]):  # UTF-16
+                    line = wide[::2]
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
                 match = next(filter(None, map(self.pattern.fullmatch, _decodings(line))), None)

@@ -98,7 +98,7 @@ class FrameFolder:
 
     def free_bytes(self) -> int:
         """Return the free space of the disk, bytes; 0 if it cannot be read."""
-        folder = next(f for f in (self.root, *self.root.parents) if f.exists())
+        folder = next(f for f in (self.root, *self.root.parents) if os.path.exists(f))
         try:
             return shutil.disk_usage(folder).free
         except OSError:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -381,7 +382,7 @@ class SeriesRun:
                     frame = stored.epoch.frame
                     if stored.result.status == NOT_CALIBRATED and frame is not None:
                         path = self.frames.root / frame
-                        if path.is_file():
+                        if os.path.isfile(path):  # False, too, in a closed folder
                             self._backlog.append(replace(stored.epoch, frame=path))
                             self.pipeline.dropped += stored.epoch.number < self.first
             except StoreError as error:

@@ -40,13 +40,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from thermocald.addresses import hide_secrets
 from thermocald.config import Section, in_words
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceGone,
-    DriverMissing,
-    WrongDevice,
-)
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DriverMissing, WrongDevice
 from thermocald.names import channel_fault as channel_fault
 from thermocald.names import require_channels
 
@@ -350,19 +344,19 @@ class SystemClock:
         delay = monotonic - time.monotonic()
         if wake is not None:
             return not wake.wait(max(0.0, delay))
-        if delay > 0:
-            time.sleep(delay)
+        time.sleep(max(0.0, delay))
         return True
 
 
 class VirtualClock:
     """A clock that jumps to the end of each wait, so that 25 minutes take no time.
 
-    utc: UTC at the start, when the other scale is at `monotonic`; `step_utc` imitates an NTP step.
+    utc: UTC at the start, when the other scale is at `monotonic`.
+    offset: UTC minus the other scale, s; a change imitates a step by NTP.
     """
 
     def __init__(self, utc: float = 1_600_000_000.0, monotonic: float = 0.0) -> None:
-        self._offset = utc - monotonic
+        self.offset = utc - monotonic
         self._now = monotonic
         self._lock = threading.Lock()
 
@@ -370,16 +364,7 @@ class VirtualClock:
         return self._now
 
     def utc(self) -> float:
-        return self._now + self._offset
-
-    def advance(self, seconds: float) -> None:
-        """Advance both scales, as while a slow device works."""
-        with self._lock:
-            self._now += seconds
-
-    def step_utc(self, seconds: float) -> None:
-        """Set the UTC clock forward or back; the monotonic clock is not affected."""
-        self._offset += seconds
+        return self._now + self.offset
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
         if wake is not None and wake.is_set():
@@ -432,10 +417,11 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock)
     hide_secrets(options)
     try:
         device = driver(clock=clock, **options)
-    except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no text
-        raise ConfigurationError(f"{where}: {error}") from error
     except Exception as error:
-        why = f"its driver failed: {type(error).__name__}: {error}"
+        known = isinstance(
+            error, ConfigurationError | TypeError
+        )  # TypeError: a key that is no text
+        why = error if known else f"its driver failed: {type(error).__name__}: {error}"
         raise ConfigurationError(f"{where}: {why}") from error
     if kind == "thermometer":
         require_channels(device.named_channels(), where, ConfigurationError)

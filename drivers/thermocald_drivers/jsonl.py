@@ -66,8 +66,8 @@ class JsonLinesOutput(Output):
         except OSError as error:
             if error.errno == errno.ENXIO:
                 raise DeviceGone(f"{self.path}: no program reads the pipe") from error
-            hint = "the daemon's user must be able to write it"
-            raise support.fault(error, str(self.path), seen=self.seen, hint=hint) from error
+            hint = "check its folder and permissions"
+            raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
         mode = os.fstat(self.handle.fileno()).st_mode
         self._pipe = stat.S_ISFIFO(mode)
         if stat.S_ISREG(mode):

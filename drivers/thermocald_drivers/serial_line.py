@@ -161,8 +161,9 @@ class SerialThermometer(support.CheckedThermometer):
         o = self.options
         self.where = f"{o.instrument or 'serial line'} on {o.port}"
         self.command = o.command.encode("ascii")
-        if o.chip is not None and o.chip.lower() not in chips.names():
-            raise ConfigurationError(f"chip: {o.chip!r} is not one of {', '.join(chips.names())}")
+        if o.chip is not None and o.chip.lower() not in chips.BY_NAME:
+            known = ", ".join(sorted(chips.BY_NAME))
+            raise ConfigurationError(f"chip: {o.chip!r} is not one of {known}")
         if o.scale == 0.0:
             raise ConfigurationError("scale: 0 makes every number the same")
         if o.unit == "mA" and o.scale == 1.0:

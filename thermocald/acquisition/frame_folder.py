@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import logging
 import os
 import re
@@ -126,12 +127,8 @@ class FrameFolder:
         missing = int(config.min_free_gb * _GB) - self.free_bytes()
         if missing > surplus:
             surplus, why = missing, f"less than {config.min_free_gb:g} GB of the disk were free"
-        victims = []
-        for file in files:
-            if surplus <= 0:
-                break
-            victims.append(file)
-            surplus -= file[1]
+        freed = itertools.accumulate((size for _, size, _ in files), initial=0)
+        victims = [file for file, before in zip(files, freed, strict=False) if before < surplus]
         return [*deleted, *self._delete(victims, why)]
 
     def restamp(self, seconds: float) -> None:

@@ -49,8 +49,7 @@ def attached() -> tuple[list[dict[str, Any]], list[str]]:
                 ]
             except DeviceError as error:
                 driver = f"{kind} driver {name!r}"
-                known = str(error).startswith(driver)
-                notes.append(str(error) if known else f"{driver}: {error}")
+                notes.append(f"{driver}: {str(error).removeprefix(driver).strip()}")
     return found, notes
 
 

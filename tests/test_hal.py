@@ -65,14 +65,6 @@ def test_clocks_keep_one_contract(clock):
     assert not clock.sleep_until(clock.monotonic() + 60.0, wake)
 
 
-def test_a_virtual_clock_jumps():
-    clock = VirtualClock(utc=1000.0, monotonic=5.0)
-    clock.sleep_until(3605.0)
-    clock.offset += -3600.0
-    clock.sleep_until(clock.monotonic() + 2.0)
-    assert (clock.monotonic(), clock.utc()) == (3607.0, 1002.0)
-
-
 def test_a_driver_is_looked_up_among_what_there_is(monkeypatch):
     for kind in ("camera", "thermometer", "output"):
         assert load_driver(kind, "mock").__name__.startswith("Mock")

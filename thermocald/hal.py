@@ -341,11 +341,7 @@ class SystemClock:
         return time.time()
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
-        delay = monotonic - time.monotonic()
-        if wake is not None:
-            return not wake.wait(max(0.0, delay))
-        time.sleep(max(0.0, delay))
-        return True
+        return not (wake or threading.Event()).wait(max(0.0, monotonic - time.monotonic()))
 
 
 class VirtualClock:

@@ -66,8 +66,9 @@ class JsonLinesOutput(Output):
         except OSError as error:
             if error.errno == errno.ENXIO:
                 raise DeviceGone(f"{self.path}: no program reads the pipe") from error
-            hint = "check its folder and permissions"
-            raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
+            raise support.fault(
+                error, self.where, seen=self.seen, hint="check its folder"
+            ) from error
         mode = os.fstat(self.handle.fileno()).st_mode
         self._pipe = stat.S_ISFIFO(mode)
         if stat.S_ISREG(mode):

@@ -219,7 +219,9 @@ def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon, recording, wh
     assert camera("device") == "closed"
     daemon.ask("session start", session={**SESSION, "epochs": 3})
     daemon.until(lambda: daemon.session()["state"] == ("refused" if what else "done"))
-    assert re.search(f"the check failed: .*{what}" if what else "all 3", daemon.session()["why"])
+    assert re.search(
+        f"the check failed: .*{what}" if what else "complete: 3 epochs", daemon.session()["why"]
+    )
     daemon.until(lambda: camera("device") == "closed")
     assert daemon.stop() == 0
     assert series_of(daemon.store) == ({} if what else {"M7": ("cold", [1, 2, 3])})

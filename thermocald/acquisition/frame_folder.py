@@ -99,11 +99,10 @@ class FrameFolder:
 
     def free_bytes(self) -> int:
         """Return the free space of the disk, bytes; 0 if it cannot be read."""
-        folder = next(f for f in (self.root, *self.root.parents) if os.path.exists(f))
-        try:
-            return shutil.disk_usage(folder).free
-        except OSError:
-            return 0
+        for folder in (self.root, *self.root.parents):
+            with contextlib.suppress(OSError):  # it does not exist, or in a closed folder
+                return shutil.disk_usage(folder).free
+        return 0
 
     def enforce(self, now_utc: float | None) -> list[str]:
         """Delete frames that are too old, then the oldest if space is short.

@@ -19,6 +19,7 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
+from thermocald.numbers import counted
 from thermocald.store.database.store import Store
 from thermocald.store.sources import require_file
 
@@ -258,7 +259,7 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
             for s in store.all_series()
         ]
     state = "a damaged store" if found.damaged else "an intact store"
-    lines = [f"{path}: {state} of {len(series)} series, {found.epochs} epochs"]
+    lines = [f"{path}: {state} of {len(series)} series, {counted(found.epochs, 'epoch')}"]
     for s in series:
         last = "no epochs" if s["last_epoch"] is None else f"up to epoch {s['last_epoch']}"
         lines.append(f"  {s['camera']}/{s['series']}: {last}")

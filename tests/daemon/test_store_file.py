@@ -216,9 +216,7 @@ def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
     assert numbers(path) == [1, 2, 3, 5]
 
 
-def test_a_disk_that_is_nearly_full_keeps_no_observations_until_some_room_is_left(
-    guard, monkeypatch
-):
+def test_a_disk_that_is_nearly_full_gets_results_alone(guard, monkeypatch):
     disk, states = SimpleNamespace(free=0), []
     monkeypatch.setattr("thermocald.daemon.store_guard.shutil.disk_usage", lambda _: disk)
     for number, disk.free in enumerate((17e6, 15e6, 17e6, 21e6), 4):

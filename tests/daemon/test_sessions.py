@@ -269,7 +269,7 @@ def test_a_session_in_the_daemon_ends_when_the_effects_are_separated(live, daemo
 
 @pytest.mark.parametrize(
     ("changed", "state", "why"),
-    [pytest.param({"seed": 2}, "done", "all 12 epochs", marks=pytest.mark.slow),
+    [pytest.param({"seed": 2}, "done", "complete: 12 epochs", marks=pytest.mark.slow),
      ({"name": "phone-2"}, "stopped", "there are: phone-2")],
 )  # fmt: skip
 def test_reload_leaves_a_session_alone_whose_camera_stays(live, daemon, changed, state, why):

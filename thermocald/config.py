@@ -9,6 +9,7 @@ begin with `./` or `../`.
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from collections.abc import Callable
 from datetime import date
@@ -504,8 +505,9 @@ def parse_config(
     for i, camera in enumerate(config.cameras):
         for key in ("testfield", "thermal_model", "control_points", "control_reference"):
             file = getattr(camera, key)
-            if file is not None and not file.is_file():
-                raise ConfigurationError(f"{path}: cameras[{i}].{key}: there is no file {file}")
+            if file is not None and not (os.path.isfile(file) and os.access(file, os.R_OK)):
+                why = f"there is no file {file} that can be read"
+                raise ConfigurationError(f"{path}: cameras[{i}].{key}: {why}")
     _check_places(config, path)
     return config
 
@@ -521,7 +523,7 @@ def _check_places(config: Config, path: Path) -> None:
         place = output.options.get("path")
         if not isinstance(place, str) or "\0" in place:
             continue
-        if Path(place).exists() and not is_ordinary(Path(place)):  # several may write to a device
+        if os.path.exists(place) and not is_ordinary(Path(place)):  # several may write to a device
             continue
         for what, files in taken.items():
             if any(_same_file(Path(place), file) for file in files):
@@ -541,7 +543,7 @@ def _same_file(one: Path, other: Path) -> bool:
     try:
         return one.samefile(other)
     except OSError:
-        return one.resolve() == other.resolve()
+        return os.path.realpath(one) == os.path.realpath(other)
 
 
 def _check_options(

@@ -40,13 +40,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from thermocald.addresses import hide_secrets
 from thermocald.config import Section, in_words
-from thermocald.errors import (
-    BadReading,
-    ConfigurationError,
-    DeviceGone,
-    DriverMissing,
-    WrongDevice,
-)
+from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DriverMissing, WrongDevice
 from thermocald.names import channel_fault as channel_fault
 from thermocald.names import require_channels
 
@@ -347,22 +341,18 @@ class SystemClock:
         return time.time()
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
-        delay = monotonic - time.monotonic()
-        if wake is not None:
-            return not wake.wait(max(0.0, delay))
-        if delay > 0:
-            time.sleep(delay)
-        return True
+        return not (wake or threading.Event()).wait(max(0.0, monotonic - time.monotonic()))
 
 
 class VirtualClock:
     """A clock that jumps to the end of each wait, so that 25 minutes take no time.
 
-    utc: UTC at the start, when the other scale is at `monotonic`; `step_utc` imitates an NTP step.
+    utc: UTC at the start, when the other scale is at `monotonic`.
+    offset: UTC minus the other scale, s; a change imitates a step by NTP.
     """
 
     def __init__(self, utc: float = 1_600_000_000.0, monotonic: float = 0.0) -> None:
-        self._offset = utc - monotonic
+        self.offset = utc - monotonic
         self._now = monotonic
         self._lock = threading.Lock()
 
@@ -370,16 +360,7 @@ class VirtualClock:
         return self._now
 
     def utc(self) -> float:
-        return self._now + self._offset
-
-    def advance(self, seconds: float) -> None:
-        """Advance both scales, as while a slow device works."""
-        with self._lock:
-            self._now += seconds
-
-    def step_utc(self, seconds: float) -> None:
-        """Set the UTC clock forward or back; the monotonic clock is not affected."""
-        self._offset += seconds
+        return self._now + self.offset
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
         if wake is not None and wake.is_set():
@@ -404,7 +385,7 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
     """Return a driver's class.
 
     Raises ConfigurationError, which lists the installed drivers, DriverMissing if it cannot be
-    imported.
+    imported or is no such driver.
     """
     points = {point.name: point for point in entry_points(group=f"thermocald.{kind}s")}
     if name not in points:
@@ -412,8 +393,13 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
         raise ConfigurationError(f"there is no {kind} driver {name!r}; installed are: {installed}")
     try:
         loaded: type[Any] = points[name].load()
-    except ImportError as error:
-        raise DriverMissing(f"{kind} driver {name!r} cannot be imported: {error}") from error
+    except Exception as error:  # whatever a module raises that somebody else wrote
+        why = f"{type(error).__name__}: {error}"
+        raise DriverMissing(f"{kind} driver {name!r} cannot be imported: {why}") from error
+    base = {"camera": Camera, "thermometer": Thermometer, "output": Output}[kind]
+    if not (isinstance(loaded, type) and issubclass(loaded, base)):
+        why = f"is no class derived from thermocald.hal.{base.__name__}"
+        raise DriverMissing(f"{kind} driver {name!r} {why}")
     return loaded
 
 
@@ -427,8 +413,12 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock)
     hide_secrets(options)
     try:
         device = driver(clock=clock, **options)
-    except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no text
-        raise ConfigurationError(f"{where}: {error}") from error
+    except Exception as error:
+        known = isinstance(
+            error, ConfigurationError | TypeError
+        )  # TypeError: a key that is no text
+        why = error if known else f"its driver failed: {type(error).__name__}: {error}"
+        raise ConfigurationError(f"{where}: {why}") from error
     if kind == "thermometer":
         require_channels(device.named_channels(), where, ConfigurationError)
     return device

@@ -26,6 +26,7 @@ from thermocald.addresses import hide
 from thermocald.errors import ConfigurationError
 from thermocald.hal import DriverOptions, Output
 from thermocald.names import WITH_VALUES
+from thermocald.numbers import counted
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -175,7 +176,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 def _counted(count: int, most: int, described: str) -> Measured:
     """Return a count of epochs with its bounds: out at `most` or more, back below it."""
-    words = f"{count} epochs {described}"
+    words = f"{counted(count, 'epoch')} {described}"
     return Measured(float(count), -math.inf, most - 1, most - 1, words, step=1)
 
 
@@ -197,7 +198,7 @@ class Lost(Condition):
     called: ClassVar[str] = "lost"
 
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
-        return _counted(lost, self.lost, "were taken but not stored")
+        return _counted(lost, self.lost, "taken but not stored")
 
 
 class FreeDisk(Condition):

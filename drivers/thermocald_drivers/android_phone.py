@@ -156,8 +156,7 @@ class AdbPhone(Device):
             if any(state == "device" for _, state in listed):
                 advice += ", or set `serial` to another phone's"
             raise support.absent(
-                f"{self.where}: not attached; adb lists {others}; {advice}",
-                seen=self.seen,
+                f"{self.where}: not attached; adb lists {others}; {advice}", seen=self.seen
             )
         if states != ["device"]:
             raise self._translated(f"its state is {states[0]!r}; let it boot into Android")

@@ -171,7 +171,7 @@ CHIPS = (  # each with its data sheet or survey
     Chip("imx219 imx296 imx477 imx500 imx519 imx708 ov5647 ov64a40", (-20.0, 80.0, 0.0)),
 )  # fmt: skip
 _ALARM = Chip(celsius=(37.0,))  # Linux qcom-spmi-temp-alarm.c: DEFAULT_TEMP of a PMIC
-_BY_NAME = {name: chip for chip in CHIPS for name in chip.names.split()}
+BY_NAME = {name: chip for chip in CHIPS for name in chip.names.split()}
 
 LOWEST_LIKELY_C, HIGHEST_LIKELY_C, HIGHEST_OF_A_PROCESSOR_C = -39.0, 84.0, 110.0
 FIRMWARE_C = tuple(
@@ -183,11 +183,6 @@ FIRMWARE_C = tuple(
 UNLIKELY_C = tuple(c for c in FIRMWARE_C if not LOWEST_LIKELY_C < c < HIGHEST_OF_A_PROCESSOR_C)
 
 
-def names() -> list[str]:
-    """Return the names of all chips in the table, sorted."""
-    return sorted(_BY_NAME)
-
-
 def idle_celsius(name: str) -> tuple[float, ...]:
     """Return a chip's idle values, °C; () if it is not in the table."""
     return (_chip(name) or Chip()).celsius
@@ -196,7 +191,7 @@ def idle_celsius(name: str) -> tuple[float, ...]:
 def _chip(name: str) -> Chip | None:
     """Find a chip by a name that may have a suffix (ms8607-temppressure, bq27541_0)."""
     first = re.split("[-_ ]", name.lower())[0]
-    known = _BY_NAME.get(name.lower()) or _BY_NAME.get(first)
+    known = BY_NAME.get(name.lower()) or BY_NAME.get(first)
     return known or (_ALARM if re.fullmatch(r"pmi?\d{2,4}\w{0,2}", first) else None)
 
 

@@ -66,7 +66,7 @@ class JsonLinesOutput(Output):
         except OSError as error:
             if error.errno == errno.ENXIO:
                 raise DeviceGone(f"{self.path}: no program reads the pipe") from error
-            raise support.fault(error, str(self.path), seen=self.seen) from error
+            raise support.fault(error, self.where, seen=self.seen, hint="check the path") from error
         mode = os.fstat(self.handle.fileno()).st_mode
         self._pipe = stat.S_ISFIFO(mode)
         if stat.S_ISREG(mode):

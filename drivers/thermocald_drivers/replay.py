@@ -17,6 +17,7 @@ and no image.
 
 from __future__ import annotations
 
+import os
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,10 +42,10 @@ if TYPE_CHECKING:
 
 @contextmanager
 def _permanent_errors() -> Iterator[None]:
-    """Raise a DataError as a PermanentDeviceError: reading the file again does not help."""
+    """Raise an error of a file as a PermanentDeviceError: reading it again does not help."""
     try:
         yield
-    except DataError as error:
+    except (DataError, OSError) as error:
         raise PermanentDeviceError(str(error)) from error
 
 
@@ -67,7 +68,7 @@ class _Replay(Device):
         self._shift_s = 0.0
 
     def open(self) -> None:
-        if not self._path.is_dir():
+        if not os.path.isdir(self._path):
             raise DeviceNotFound(f"{self._path}: there is no such recording")
         if self._recording is None:
             from thermocald.store.recording.reader import open_recording
@@ -109,7 +110,7 @@ class ReplayCamera(_Replay, Camera):
     def frame_size(self) -> tuple[int, int] | None:
         from thermocald.store.recording.head import read_head
 
-        with suppress(DataError):  # `open` reports it
+        with suppress(DataError, OSError):  # `open` reports it
             sensor = read_head(self._path).camera.sensor
             return sensor.width, sensor.height
         return None

@@ -161,8 +161,9 @@ class SerialThermometer(support.CheckedThermometer):
         o = self.options
         self.where = f"{o.instrument or 'serial line'} on {o.port}"
         self.command = o.command.encode("ascii")
-        if o.chip is not None and o.chip.lower() not in chips.names():
-            raise ConfigurationError(f"chip: {o.chip!r} is not one of {', '.join(chips.names())}")
+        if o.chip is not None and o.chip.lower() not in chips.BY_NAME:
+            known = ", ".join(sorted(chips.BY_NAME))
+            raise ConfigurationError(f"chip: {o.chip!r} is not one of {known}")
         if o.scale == 0.0:
             raise ConfigurationError("scale: 0 makes every number the same")
         if o.unit == "mA" and o.scale == 1.0:
@@ -293,8 +294,9 @@ class SerialThermometer(support.CheckedThermometer):
                 if not whole and self.command:
                     self.handle.write(self.command)  # the answer may have been joined to it
                 line = line.strip(b"\0")
-                if len(line) > 8 and not any(line[1::2]):  # UTF-16
-                    line = line[::2]
+                wide = re.sub(rb"\A(\xff\xfe|\xfe\xff\0)", b"", line)  # without a byte-order mark
+                if len(wide) > 8 and not any(wide[1::2]):  # UTF-16
+                    line = wide[::2]
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
                 match = next(filter(None, map(self.pattern.fullmatch, _decodings(line))), None)

@@ -345,14 +345,6 @@ def _plane(data: memoryview, height: int, row_bytes: int, stride: int) -> NDArra
     return rows.copy()  # the camera overwrites its buffer as soon as it is queued again
 
 
-def unpack_10(packed: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Unpack MIPI RAW10: four high bytes, then one byte with the four pairs of low bits."""
-    high = packed.reshape(packed.shape[0], -1, 5)
-    low = high[..., 4:5] >> np.array([0, 2, 4, 6], np.uint8) & 3
-    pixels = (high[..., :4].astype(np.uint16) << np.uint16(2)) | low
-    return pixels.reshape(packed.shape[0], -1).astype(np.uint16)
-
-
 def _grey(data: memoryview, fourcc: str, width: int, height: int, stride: int) -> Grey:
     """Return the grey image in one buffer."""
     image: Grey
@@ -361,8 +353,10 @@ def _grey(data: memoryview, fourcc: str, width: int, height: int, stride: int) -
         return np.ascontiguousarray(_plane(data, height, 2 * width, stride)[:, first::2])
     if fourcc in _ONE_BYTE:
         image = _plane(data, height, width, stride)
-    elif fourcc in _PACKED:
-        image = unpack_10(_plane(data, height, width * 5 // 4, stride))
+    elif fourcc in _PACKED:  # MIPI RAW10: four high bytes, then one with four pairs of low bits
+        packed = _plane(data, height, width * 5 // 4, stride).reshape(height, -1, 5)
+        low = packed[..., 4:] >> np.array([0, 2, 4, 6], np.uint8) & np.uint8(3)
+        image = (packed[..., :4].astype(np.uint16) << np.uint16(2) | low).reshape(height, -1)
     else:
         image = _plane(data, height, 2 * width, stride).view("<u2")
     if fourcc not in BAYER_ORDERS:

@@ -67,10 +67,12 @@ def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
     assert folder.enforce(now - 1.0) == []
 
 
-def test_below_the_least_free_space_no_frame_is_written(folder_of, caplog):
-    folder = folder_of(min_free_gb=1e6)
+@pytest.mark.parametrize(("option", "value"), [("min_free_gb", 1e6), ("folder", "f" * 300)])
+def test_without_free_space_or_a_folder_no_frame_is_written(folder_of, caplog, option, value):
+    """Of a folder that could not be entered, each frame to be kept cost its epoch."""
+    folder = folder_of(**{option: value})
     assert [keep(folder, n) for n in (1, 2)] == [None, None]
-    assert "min_free_gb" in folder.paused
+    assert folder.enforce(None) == []
     assert caplog.text.count("no frames are kept") == 1
 
 

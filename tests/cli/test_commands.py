@@ -34,12 +34,17 @@ def test_the_system_s_files_are_nothing_to_check(path):
     assert refuse("check", path, status=1) == said
 
 
-def test_a_store_below_proc_is_not_sound(tmp_path):
-    (tmp_path / "config.yaml").write_text(
-        "store: {path: /proc/self/t.db}\nthermometers: [{name: a, driver: mock}]\n"
-    )
-    said = refuse("check", tmp_path / "config.yaml")
-    assert "store.path: /proc/self/t.db: nothing can be stored there" in said
+@pytest.mark.parametrize(("store", "why"), [
+    ("/proc/self/t.db", "store.path: /proc/self/t.db: nothing can be stored there"),
+    ("none/t.db", "none/t.db: its folder does not exist; make it"),
+    ("config.yaml.d", "config.yaml.d: is a folder, not a store"),
+])  # fmt: skip
+def test_a_store_that_run_refuses_is_not_sound(tmp_path, store, why):
+    (tmp_path / "config.yaml.d").mkdir()
+    devices = "thermometers: [{name: a, driver: mock}]"
+    (tmp_path / "config.yaml").write_text(f"store: {{path: {store}}}\n{devices}\n")
+    status = 1 if store.startswith("config") else 2
+    assert why in refuse("check", tmp_path / "config.yaml", status=status)
 
 
 def test_a_store_of_two_series_tells_them_and_their_fields_apart(world, tmp_path):

@@ -10,6 +10,8 @@ import sys
 import threading
 import time
 from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -242,19 +244,22 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(
 def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
     daemon, measured, monkeypatch
 ):
-    """It went on without any device, and looked healthy."""
+    """It went on without any device, and looked healthy. A file that only root may read is no
+    such failure: it ended the daemon, too."""
     built = []
 
     def build(*arguments):
         built.append(True)
-        if len(built) == 3:  # after the first and the one that is only a trial
+        if len(built) == 2:
+            raise PermissionError(13, "Permission denied", "testfield.csv")
+        if len(built) == 4:  # after the first and the two that are only trials
             raise StoreError("its disk is gone")
         return Station(*arguments)
 
     def reload(service) -> bool:
         daemon.configure(**measured, logging={"level": "error"})
-        service._reload = len(built) == 1
-        return len(built) > 3
+        service._reload = len(built) < 3
+        return len(built) > 4
 
     monkeypatch.setattr("thermocald.daemon.service.Station", build)
     daemon.configure(**measured)
@@ -278,6 +283,10 @@ def test_an_epoch_that_cannot_be_calibrated_later_is_not_waited_for(line):
     line.run.keep(AcquiredEpoch(1, frame, True, epoch))
     assert line.run.last["status"] == "frame_not_kept"
     assert line.status()["deferred"] == 0
+    photograph = Frame(None, 0.0, 1.7e9, encoded=b"\xff\xd8")
+    line.run.keep(AcquiredEpoch(2, photograph, True, replace(epoch, number=2)))
+    line.run.frames.root = Path("f" * 300)  # a folder that could not be entered ended the thread
+    assert line.run.backlog(3) is None
 
 
 def test_a_frame_stamped_before_the_new_time_was_followed_is_not_trusted(line, monkeypatch):

@@ -102,9 +102,10 @@ def test_a_recording_is_not_played_twice_into_a_store(run):
     recording, path, play = run
     Store.open(path, "append").close()  # an empty one is no hindrance
     stop = {"on_turn": lambda service: service.station.cameras[0].run.stored >= 4}
-    Service(recording_config(recording, path), fast=True, until_finished=True, **stop).run()
-    # on a busy machine all epochs may be taken before it is stopped
-    assert len(stored_numbers(path)) == 20 or play().returncode == 0
+    config = recording_config(recording, path)
+    # at most 12 of 20 epochs, also if a busy machine stops it late
+    Service(config, fast=True, until_finished=True, epochs=12, **stop).run()
+    assert play().returncode == 0
     again = play()
     assert again.returncode == 1
     assert "choose another --store to play it again" in again.stderr

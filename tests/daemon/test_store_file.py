@@ -10,6 +10,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -213,6 +214,15 @@ def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
     guard.keep(5)
     assert guard.told[5]
     assert numbers(path) == [1, 2, 3, 5]
+
+
+def test_a_disk_that_is_nearly_full_gets_results_alone(guard, monkeypatch):
+    disk, states = SimpleNamespace(free=0), []
+    monkeypatch.setattr("thermocald.daemon.store_guard.shutil.disk_usage", lambda _: disk)
+    for number, disk.free in enumerate((17e6, 15e6, 17e6, 21e6), 4):
+        guard.keep(number)
+        states.append(guard.status()["state"])
+    assert states == ["ok", "results_only", "results_only", "ok"]
 
 
 def test_an_event_that_quotes_the_name_of_a_file_holds_up_no_epoch(guard, path):

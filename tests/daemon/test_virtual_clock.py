@@ -37,7 +37,7 @@ def run(tmp_path, small_camera, small_field, monkeypatch):
 
         def set_clock(_):
             if clock.monotonic() >= 60.0:
-                clock.step_utc(steps.pop() if steps else 0.0)
+                clock.offset += steps.pop() if steps else 0.0
 
         Service(config, epochs=epochs, until_finished=True, clock=clock, on_turn=set_clock).run()
         opened.append(store := Store.open(config.store.path))

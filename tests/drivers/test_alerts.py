@@ -68,6 +68,8 @@ def test_a_change_is_told_once(case):
     device = output("exec", command=["true"], when=[when])
     alerts = [alert for one in given for alert in device.changes(one, "cam")]
     assert [(alert.epoch, alert.state) for alert in alerts] == expected
+    if case == "a full disk":  # it is back at a tenth more
+        assert device._conditions[0].measure({}, 0, 0).back == pytest.approx(1e5)
     if case == "lost":
         assert (alerts[2].text[-20:], alerts[2].threshold) == ("not stored (limit 1)", 1)
 

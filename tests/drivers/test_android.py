@@ -176,7 +176,7 @@ def test_warm_up_by_load_which_the_limit_stops_for_good(bench, fake):
         for processes in (2, 2, 4):  # the load is a lease that is renewed
             output.emit({})
             assert sum(c.startswith("timeout 30 ") for c in fake.commands) == processes
-            clock.advance(10)
+            clock.sleep_until(clock.monotonic() + 10)
         fake.battery = "  voltage: 4000\n  temperature: 420\n"
         with pytest.raises(errors.PermanentDeviceError, match=r"42\.00 °C reached the limit"):
             output.emit({})

@@ -48,7 +48,6 @@ each_driver = pytest.mark.parametrize("driver", REGISTERED, ids="-".join)
 def test_driver_is_what_it_is_registered_as_and_explains_its_stanza(driver):
     kind, name = driver
     made = load_driver(kind, name)
-    assert issubclass(made, KINDS[kind])
     assert issubclass(made.Options, DriverOptions)
     assert all(c.startswith("char-") for c in made.device_classes)
     if kind == "output":  # a session replaces the programme of a heating output

@@ -26,8 +26,9 @@ def test_a_result_arrives_and_is_announced(bench, tmp_path):
         device.emit(RESULT)
     assert bench.fake.credentials == ("me", "swordfish")
     by_topic = {}
-    for topic, payload, _ in bench.fake.messages:
+    for topic, payload, retained in bench.fake.messages:
         by_topic.setdefault(topic, []).append(payload)
+        assert retained != topic.endswith("/result")
     sent = [json.loads(payload) for payload in by_topic[f"{NODE}/result"]]
     assert sent == [RESULT | {"sigma0": None}, RESULT]
     assert by_topic[f"{NODE}/available"] == [b"online", b"offline"]

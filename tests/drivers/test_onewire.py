@@ -73,7 +73,7 @@ def test_the_power_on_value_needs_a_neighbour(sysfs, case):
 
     def put(step):
         sysfs.w1(rom, step[0])
-        clock.advance(step[1])
+        clock.sleep_until(clock.monotonic() + step[1])
 
     sysfs.w1(rom, NEAR)
     with thermometer(sysfs, clock, sensors={"temperature": rom}) as device:

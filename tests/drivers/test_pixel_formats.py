@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from linuxpy.video import raw
-from thermocald_drivers.support import BAYER_ORDERS, FORMATS, decode, unpack_10
+from thermocald_drivers.support import BAYER_ORDERS, FORMATS, decode
 
 from thermocald.errors import BadReading
 
@@ -55,11 +55,6 @@ def pack_10(values):
     four = values.reshape(HEIGHT, -1, 4)
     low = np.sum((four & 3) << np.arange(0, 8, 2), axis=-1, keepdims=True)
     return np.concatenate([four >> 2, low], axis=-1).astype(np.uint8)
-
-
-def test_packed_ten_bits_come_back():
-    values = rng.integers(0, 1024, (HEIGHT, WIDTH), np.uint16)
-    assert np.array_equal(unpack_10(pack_10(values).reshape(HEIGHT, -1)), values)
 
 
 def test_mjpeg_is_decoded_and_kept():

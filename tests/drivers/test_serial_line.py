@@ -83,6 +83,8 @@ ANSWERS = {
     "an old answer in the queue": (b"T=99.00\r\n", b"T=20.50\r\n", b""),
     "an echo": (b"", b"T?\r\nT=20.50\r\n", b""),
     "in UTF-16": (b"", "T=20.50\r\n".encode("utf-16-le"), b""),
+    "with a mark of the byte order": (b"", "\ufeffT=20.50\r\n".encode("utf-16-le"), b""),
+    "the other byte order": (b"", "\ufeffT=20.50\r\n".encode("utf-16-be"), b""),
     "garbage": (b"", b"\xff\x00\x91~\r\nready\r\nT=20.50\r\n", b""),
     "one channel without a sensor": (b"", b"T=20.5;A=-127.0;B=nan\r\n", b""),
     "a prompt, which is no late line": (b"T=9.00\r\n> ", b"T=20.50\r\n> ", b""),

@@ -18,7 +18,7 @@ from psycopg.rows import dict_row
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import refuse, succeed
 from tests.fleet.conftest import address, execute
-from thermocald.fleet.overview import _calibration, _sensors, fleet_lines, render_fleet
+from thermocald.fleet.overview import _calibration, _sensors, _shift, fleet_lines, render_fleet
 from thermocald.store.recording.head import Channel
 from thermocald.store.server.connection import grant
 from thermocald.store.server.fleet_reader import SPREAD, FleetCamera, FleetReader, RecentEpoch
@@ -135,6 +135,12 @@ def test_a_thermometer_without_fault_alone_leaves_the_rates_to_a_warmer_camera(
     assert [*_sensors(camera)] == ([("sensor", f"t: {trouble}")] if trouble else [])
     warm_up = [text for _, text in _calibration(camera, times[0]) if "21.5 to 22.0 °C" in text]
     assert bool(warm_up) == (not trouble)
+
+
+def test_a_shift_is_counted_in_its_standard_deviations():
+    noise = np.random.default_rng(1).normal(0.0, 2e-4, (400, 200))
+    in_sds = [_shift(residual)[1] for residual in noise]
+    assert np.sqrt(np.mean(np.square(in_sds))) == pytest.approx(1.0, abs=0.12)
 
 
 def test_a_station_without_a_possible_epoch_is_shown(server):

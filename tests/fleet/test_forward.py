@@ -177,6 +177,20 @@ def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, 
     assert caplog.text.count("cannot be reached") == 1
 
 
+def test_a_cursor_that_cannot_be_written_is_waited_for(filled, server):
+    """Its unit is not started again after this exit status: nothing more was sent until a boot."""
+    forwarder, pauses = Forwarder(filled[0].path, address(server), "bank"), []
+    forwarder._path.mkdir()
+
+    def wait(seconds):
+        pauses.append(seconds)
+        shutil.rmtree(forwarder._path, ignore_errors=True)
+        return len(pauses) == 2
+
+    forward_forever(forwarder, wait)
+    assert (pauses, count(server, "epoch")) == ([300.0, 30.0], 20)
+
+
 def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
     """Bits flipped on an SD card must not become values on the server."""
     store, _ = filled

@@ -71,4 +71,4 @@ def test_several_series_at_an_address_are_said(server, tmp_path):
 def test_a_wrong_address_is_one_line():
     result = answer("study", "postgresql://127.0.0.1:1/none")
     assert result.exit_code == 1
-    assert "cannot be reached" in str(result.exception)
+    assert "127.0.0.1:1/none: the server cannot be reached" in str(result.exception)

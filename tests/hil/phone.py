@@ -16,7 +16,6 @@ from tests.hil.bars import stamp
 
 # not 5555 to 5585, which the adb server uses for emulators
 PHONE_PORT = 5600
-ADB_PORT = 5037
 ADBD = "/usr/lib/android-sdk/platform-tools/adbd"
 
 

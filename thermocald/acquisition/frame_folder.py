@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import logging
 import os
 import re
@@ -98,11 +99,10 @@ class FrameFolder:
 
     def free_bytes(self) -> int:
         """Return the free space of the disk, bytes; 0 if it cannot be read."""
-        folder = next(f for f in (self.root, *self.root.parents) if f.exists())
-        try:
-            return shutil.disk_usage(folder).free
-        except OSError:
-            return 0
+        for folder in (self.root, *self.root.parents):
+            with contextlib.suppress(OSError):  # it does not exist, or in a closed folder
+                return shutil.disk_usage(folder).free
+        return 0
 
     def enforce(self, now_utc: float | None) -> list[str]:
         """Delete frames that are too old, then the oldest if space is short.
@@ -126,12 +126,8 @@ class FrameFolder:
         missing = int(config.min_free_gb * _GB) - self.free_bytes()
         if missing > surplus:
             surplus, why = missing, f"less than {config.min_free_gb:g} GB of the disk were free"
-        victims = []
-        for file in files:
-            if surplus <= 0:
-                break
-            victims.append(file)
-            surplus -= file[1]
+        freed = itertools.accumulate((size for _, size, _ in files), initial=0)
+        victims = [file for file, before in zip(files, freed, strict=False) if before < surplus]
         return [*deleted, *self._delete(victims, why)]
 
     def restamp(self, seconds: float) -> None:

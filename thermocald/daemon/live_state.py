@@ -137,7 +137,7 @@ class LiveState:
 
 def _beside(store: Path) -> Path:
     # the same through any link, as the -wal file
-    return Path(f"{store.resolve() if store.is_symlink() else store}.live")
+    return Path(f"{os.path.realpath(store) if os.path.islink(store) else store}.live")
 
 
 def _without_secrets(value: Any) -> Any:
@@ -151,7 +151,8 @@ def _without_secrets(value: Any) -> Any:
 def find_state(store: Path) -> Path:
     """Return the live folder of the daemon that writes a store, running or not."""
     for found in sorted(_RUN.glob("thermocald*/status.json")):  # thermocald-NAME: of the template
-        if Path(read_json(found).get("store", {}).get("path", "")).resolve() == store.resolve():
+        other = read_json(found).get("store", {}).get("path", "")
+        if os.path.realpath(other) == os.path.realpath(store):
             return found.parent
     return _beside(store)  # also while a killed one's, since started by systemd, is there
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -383,7 +384,7 @@ class SeriesRun:
                 for number in found:
                     for stored in self._guard.epochs(series, number, number, details=False):
                         path = self.frames.root / (stored.epoch.frame or "")
-                        if path.is_file():
+                        if os.path.isfile(path):  # False, too, in a closed folder
                             self._backlog.append(replace(stored.epoch, frame=path))
                             self.pipeline.dropped += number < self.first
             except StoreError as error:

@@ -332,7 +332,7 @@ class Service:
         notify(f"RELOADING=1\nMONOTONIC_USEC={now_us}")  # READY=1 ends it
         try:
             text = self._apply_configuration()
-        except ThermocaldError as error:
+        except (ThermocaldError, OSError) as error:
             if self.station.stopping.is_set():
                 raise  # a daemon that takes nothing would look healthy: a restart may help
             text = f"the configuration cannot be reloaded, the old one stays in force: {error}"

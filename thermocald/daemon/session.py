@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
 from thermocald.hal import HeatingStep  # noqa: TC001
+from thermocald.numbers import counted
 
 if TYPE_CHECKING:
     from thermocald.daemon.station import CameraLine, Station
@@ -140,7 +141,7 @@ class Sessions:
                 )
             if (taken := self._guard.last_epoch(stored)) >= session.epochs:
                 raise DataError(
-                    f"series {stored.name!r} has {taken} epochs already; choose another --series"
+                    f"series {stored.name!r} has {counted(taken, 'epoch')}; choose another --series"
                 )
         if session.programme:
             for other in self._active.values():
@@ -175,7 +176,7 @@ class Sessions:
             if active.state == "checking":
                 self._finish_check(line, active)
             elif line.run is not None and line.run.full and not line.waiting():
-                self._end(active, "done", f"all {active.session.epochs} epochs were taken")
+                self._end(active, "done", f"complete: {counted(active.session.epochs, 'epoch')}")
             elif line.link.state == "finished":
                 self._end(active, "stopped", line.link.why)
 
@@ -223,7 +224,7 @@ class Sessions:
         session = active.session
         self._take(session)
         active.state = "running"
-        self._record("session_begun", active, f"a session of {session.epochs} epochs begins")
+        self._record("session_begun", active, f"begins: {counted(session.epochs, 'epoch')}")
 
     def _take(self, session: Session) -> None:
         line = self._line(session.camera)

@@ -7,8 +7,10 @@ comment.
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,11 +19,12 @@ from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
+from thermocald.numbers import counted
+from thermocald.store.database.store import Store
 from thermocald.store.server.connection import require_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from thermocald.config import DeviceConfig
     from thermocald.hal import Kind
@@ -46,7 +49,8 @@ def attached() -> tuple[list[dict[str, Any]], list[str]]:
                     for one in load_driver(kind, name).attached()
                 ]
             except DeviceError as error:
-                notes.append(f"{kind} driver {name}: {error}")
+                driver = f"{kind} driver {name!r}"
+                notes.append(f"{driver}: {str(error).removeprefix(driver).strip()}")
     return found, notes
 
 
@@ -123,7 +127,7 @@ def examine(source: Path, probe: bool, say: Callable[[str], None]) -> dict[str, 
 
 def _is_system(path: Path) -> bool:
     """Return whether a path leads into a file system of the kernel, which stores nothing."""
-    return path.resolve().parts[:2] in (("/", "proc"), ("/", "sys"), ("/", "dev"))
+    return Path(os.path.realpath(path)).parts[1:2] in (("proc",), ("sys",), ("dev",))
 
 
 def _examine_recording(path: Path) -> dict[str, Any]:
@@ -207,6 +211,11 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
     for key, place in (("store.path", config.store.path), ("frames.folder", config.frames.folder)):
         if _is_system(place):
             raise ConfigurationError(f"{path}: {key}: {place}: nothing can be stored there")
+    store = config.store.path
+    if not os.path.isdir(store.parent):
+        raise ConfigurationError(f"{path}: store.path: {store}: its folder does not exist; make it")
+    if os.access(store, os.R_OK | os.W_OK) and os.path.getsize(store):
+        Store.open(store).close()  # raises for a folder, and for a file that is no store
     devices: list[dict[str, Any]] = []
     clock = SystemClock()
     for kind in KINDS:
@@ -242,8 +251,6 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
 
 
 def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    from thermocald.store.database.store import Store
-
     with Store.open(path) as store:
         say(f"{path}: reading the whole file")
         found = store.examine()
@@ -252,7 +259,7 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
             for s in store.all_series()
         ]
     state = "a damaged store" if found.damaged else "an intact store"
-    lines = [f"{path}: {state} of {len(series)} series, {found.epochs} epochs"]
+    lines = [f"{path}: {state} of {len(series)} series, {counted(found.epochs, 'epoch')}"]
     for s in series:
         last = "no epochs" if s["last_epoch"] is None else f"up to epoch {s['last_epoch']}"
         lines.append(f"  {s['camera']}/{s['series']}: {last}")

@@ -86,8 +86,8 @@ class FollowedStore:
             text = f"the file has {self._file.names} names (hard links); write it only under this"
             self._note("store_linked", text)
         if lost:
-            many = "all transactions" if lost < 0 else f"{lost} transactions"
-            text = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
+            many = "all transactions" if lost < 0 else counted(lost, "transaction")
+            text = f"its -wal file was damaged and has lost {many}; a copy is in {kept}"
             self._note("wal_damaged", text)
         elif unfinished:
             text = "the last write was cut off before its commit: a full disk, or a killed writer"

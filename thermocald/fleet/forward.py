@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from thermocald.acquisition.frame_folder import is_chosen
 from thermocald.config import ForwardConfig
-from thermocald.errors import ServerError, ServerGone, StoreError
+from thermocald.errors import OutputError, ServerError, ServerGone, StoreError
 from thermocald.files import write_text
 from thermocald.names import FileFolder
 from thermocald.store.database.columns import KEPT
@@ -304,7 +304,7 @@ def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None
     while True:
         try:
             progress = forwarder.send_waiting()
-        except ServerError as error:
+        except (ServerError, OutputError) as error:  # a cursor on a card that is read-only
             if str(error) != trouble:
                 log.warning("%s; rows wait in the store", error)
             trouble = str(error)
@@ -314,7 +314,7 @@ def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None
                 return
             continue
         if trouble:
-            log.info("%s can be reached again, %d rows sent", forwarder.address, progress.rows)
+            log.info("rows are sent to %s again: %d", forwarder.address, progress.rows)
         pause, trouble = _FIRST_PAUSE_S, ""
         if wait(_IDLE_S):
             return

@@ -184,7 +184,7 @@ def _late(camera: FleetCamera, now: float) -> Findings:
             ago = short_duration(now - state.contact)
             why = f"; its station last reported {ago} ago: check its power and network"
         elif state.waiting:
-            why = f"; {state.waiting} rows wait at its station and are being sent"
+            why = f"; {counted(state.waiting, 'row')} waiting at its station to be sent"
         else:
             why = ", though its station reports: check the camera and its daemon"
         yield "late", since + why
@@ -201,7 +201,7 @@ def _late(camera: FleetCamera, now: float) -> Findings:
         )
         yield "twins", text
     if count := camera.state.refused:
-        yield "refused", f"the server refused {count} rows of its station; its log names them"
+        yield "refused", f"the server refused {counted(count, 'row')} of its station; see its log"
 
 
 def _sensors(camera: FleetCamera) -> Findings:

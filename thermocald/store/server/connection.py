@@ -166,8 +166,8 @@ def _explain(address: ServerAddress | str, doing: str, cause: Any) -> StoreError
         # libpq failed without an answer: name resolution, refusal, TLS, a lost connection
         for pattern, advice in _REFUSED.items():
             if re.search(pattern, text, re.IGNORECASE):
-                return ServerError(f"{address}: {doing}: {advice} ({text})")
-        return ServerGone(f"{address}: {doing}: the server cannot be reached ({text})")
+                return ServerError(f"{address}: {advice} ({text})")
+        return ServerGone(f"{address}: the server cannot be reached ({text})")
     message = f"{address}: {doing}: {advice + ' ' if advice else ''}({text})"
     if state[:2] in _TEMPORARY:
         return ServerGone(message)

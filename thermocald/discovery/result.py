@@ -307,7 +307,7 @@ def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> Effect
         statement += f". Alternatives not excluded: {names}"
     lags = _find_lagging_thermometer(x, fit, k)
     if x.late and term.effect not in x.late.names:
-        lags = x.late.describe(x.best.names)
+        lags = x.late.describe(x.best.names[len(x.base.terms) :])
     if lags is not None:
         alternatives.append(lags)
         statement += f". Or {lags['statement']}"

@@ -9,7 +9,8 @@ import pytest
 
 from tests.analysis.test_thermal_model import for_fit, simulated
 from tests.blind.world import lagged
-from thermocald.discovery.entries import find_tied_constants, lagging_thermometer
+from thermocald.discovery.entries import find_tied_constants
+from thermocald.discovery.lag import lagging_thermometer
 from thermocald.discovery.result import discover_series
 from thermocald.physics import catalogue
 from thermocald.physics.formula import Node, say_together
@@ -121,3 +122,17 @@ def test_a_slow_thermometer_is_offered_where_a_gradient_has_other_proportions(ev
 
     assert found.headline.endswith("thermal_gradient or lagging_thermometer, and permanent_set")
     assert abs(found.effects[0].alternatives[-1]["values"]["tau"] - 40.0) < 1.0
+
+
+@pytest.mark.parametrize(
+    "effect", ["radial_distortion_drift", pytest.param("softening", marks=pytest.mark.slow)]
+)
+def test_a_slow_thermometer_beside_an_effect_is_no_unknown_cause(evidence_of, effect):
+    """Regression: whatever else follows the temperature lags too, which no gradient describes."""
+    (series,), _ = evidence_of(effect, seed=1, epochs=60, with_m2=False)
+
+    found = discover_series([reduce_series(late(series.source, 40.0))])
+
+    assert found.headline == f"unexplained: unnamed or lagging_thermometer+{effect}"
+    assert abs(found.effects[0].alternatives[0]["values"]["tau"] - 40.0) < 1.0
+    assert found.effects[0].statement.endswith(f"40 s, which with {effect} reproduces the data")

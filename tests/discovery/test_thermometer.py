@@ -81,7 +81,7 @@ def test_a_coarse_thermometer_is_read_where_it_changes():
         t, y = read(int(20 * phase))
         passages = find_passages(t, np.round(y + phase) - phase, None)
         z.append((passages.values - trajectory(passages.times)) / passages.sd)
-    assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.1
+    assert 0.55 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 0.85
     assert find_step(np.round(y), 0.0625) == 1.0
     assert find_step(y, None) < 0.07
     assert find_passages(t, y, 0.0625) is None
@@ -125,6 +125,8 @@ def test_between_sparse_readings_the_temperature_follows_its_curve():
     )
     assert straight < -0.005
     assert abs(curved) < 0.001
+    # 360 s before the first reading, half of what its slope makes of that
+    assert c.sd[0] == pytest.approx(0.5 * 360.0 * 20 / 250 * np.exp(-100 / 250), rel=0.1)
 
 
 def test_on_a_curve_nothing_is_unknown_but_the_readings():
@@ -153,3 +155,5 @@ def test_jumps_of_a_long_series_need_no_matrix_of_frames_and_readings():
     assert peak < 20e6
     assert frames[jump > 0].tolist() == [20_000.0, 20_005.0]
     assert jump.max() == pytest.approx(0.01, rel=0.01)
+    between = thermometer.between(np.array([20_000.5]), np.zeros(1), 0.0)
+    assert between == pytest.approx(0.05 * 0.02 * 2.0, rel=0.01)

@@ -40,6 +40,9 @@ MOUNT_WORSE = 0.25  # share of its gain in one series by which an effect may wor
 # sd by which a movement exceeds what the exterior orientation explains, in too few epochs for
 # SMOOTH: -2 in real corners, 97 and more where the camera's interior moved by 0.3 px. Scored
 INTERIOR = 60.0
+# the same where only an effect may be a random walk: -1 to 7 in walks, 25 and more where a lag or
+# |dT/dt| of 0.1 px was left to the mount. Scored
+INTERIOR_OF_WALK = 20.0
 
 # -- validation --------------------------------------------------------------------------------
 

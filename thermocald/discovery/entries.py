@@ -10,39 +10,33 @@ Source: canonical correlations, Hotelling (1936), Biometrika 28, 321-377.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.numbers import enumerated, parameter_label
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined, unit_diagonal
 from thermocald.physics import catalogue
-from thermocald.physics.effect import say_estimate
 from thermocald.physics.formula import known_together
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal import criteria as noise_criteria
-from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.scan import normals_of_term
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
+    from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.noise import NoiseGrowth
     from thermocald.thermal.series import ReducedSeries
 
 Estimate = dict[str, Any]
 
-_SURE = 3.0  # least lag of a thermometer, in its standard deviations
 _EXCHANGED = 1e-9  # eigenvalue of the scaled normal matrix below which a direction is undetermined
 _TAKES_PART = 0.1  # least component of a constant in such a direction's unit vector
-_LAGS_S = 2.0, 600.0, 11  # least and largest lag of a thermometer, number of trials
-_UNLIKE = 0.01  # probability below which the gradients are not one lag times the rates
 
 
 def _make_estimate(value: float, sd: float, unit: str) -> Estimate:
@@ -77,123 +71,6 @@ def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, E
         key, unit = ("phase", "rad") if name == "phase" else (f"a_{short}", units.get(short, ""))
         out[key] = _make_estimate(value, sd, unit)
     return out
-
-
-def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
-    """Return a lag of the thermometer as an alternative to a thermal gradient; None if it is none.
-
-    A thermometer that follows the camera with a lag τ reads T - τ dT/dt. Every parameter that
-    drifts with T then has a gradient of τ times its rate, which a bent mount has only by chance.
-    """
-    from scipy.special import chdtri
-
-    term = fit.terms[number]
-    base = next(b for b in fit.blocks if b.term < 0)
-    own = next((b for b in fit.blocks if b.term == number), None)
-    if not term.kind.follows_rate or own is None or len(own.parameters) < 2:
-        return None
-    if not set(own.parameters) <= set(base.parameters):
-        return None
-    a = np.arange(own.start, own.stop)
-    r = base.start + np.array([base.parameters.index(p) for p in own.parameters])
-    gradients, rates = fit.coefficients[a], fit.coefficients[r]
-    tau = float(gradients @ rates / (rates @ rates))
-    for _ in range(5):
-        J = np.zeros((len(a), len(fit.covariance)))
-        J[np.arange(len(a)), a], J[np.arange(len(a)), r] = 1.0, -tau
-        weight = np.linalg.inv(J @ fit.covariance @ J.T)
-        information = float(rates @ weight @ rates)
-        tau = float(rates @ weight @ gradients) / information
-    left = gradients - tau * rates
-    off = float(left @ weight @ left)
-    sd = information**-0.5
-    if tau < _SURE * sd or off > chdtri(len(a) - 1, _UNLIKE):
-        return None
-    said = say_estimate(_make_estimate(tau, sd, "s"))
-    return _describe_lag(tau, said, off, ", ".join(own.parameters))
-
-
-def _describe_lag(tau: float, said: str, worse: float, explains: str) -> dict[str, Any]:
-    return {
-        "effect": "lagging_thermometer",
-        "score_difference": worse,
-        "values": {"tau": tau},
-        "statement": f"the thermometer lags behind the camera by {said}: it explains "
-        f"{explains} by one number",
-        "experiment": "put a small, fast thermometer beside the present one and record again: a "
-        "lag of the thermometer disappears, any other cause remains",
-    }
-
-
-def replace_by_lag(x: Examination) -> tuple[dict[str, Any], tuple[Term, ...]] | None:
-    """Explain effects found better by a lag of the thermometer; None if it does not.
-
-    All that follows T then follows T + τ dT/dt, which a gradient adds to the linear terms only, so
-    that further effects imitate the rest. Examined if two or more effects leave a misfit. Returns
-    the lag as an alternative to those that it replaces, and the effects left beside it.
-    """
-    from scipy.optimize import minimize_scalar
-
-    best, kept = x.best, len(x.base.terms)
-    found = best.terms[kept:]
-    leaves = max(a.significance for a in x.adequacy) > criteria.LEFT_SIGMAS
-    if len(found) < 2 or not leaves or not any(t.kind.follows_rate or t.kind.delay for t in found):
-        return None
-
-    def fit_beside(terms: Sequence[Term], tau: float) -> Fit:
-        fitter = HypothesisFitter([_lead_readings(e, tau) for e in best.fitter.series])
-        return fitter.refine(fitter.fit(terms), max_iterations=8)
-
-    def solve(left: Sequence[int], trials: Array) -> tuple[float, float, tuple[Term, ...]]:
-        """Fit the effects `left` and τ; return the score, τ and the terms."""
-        terms = (*best.terms[:kept], *(best.terms[i] for i in left))
-        at = int(np.argmin([fit_beside(terms, t).objective for t in trials[1:-1]]))
-        most = minimize_scalar(
-            lambda t: fit_beside(terms, t).objective, bounds=trials[[at, at + 2]],
-            method="bounded", options={"xatol": 0.005 * trials[at + 1], "maxiter": 14},
-        )  # fmt: skip
-        penalties = best.penalties[:kept] + tuple(best.penalties[i] for i in left)
-        return float(most.fun) + sum(penalties), float(most.x), terms
-
-    left = [i for i in range(kept, len(best.terms)) if not best.terms[i].kind.delay]
-    score, tau, terms = solve(left, np.geomspace(*_LAGS_S))
-    while left:
-        ways = [[j for j in left if j != i] for i in left]
-        tried = [solve(way, tau * np.array([0.5, 1.0, 2.0])) for way in ways]
-        fewest = min(range(len(ways)), key=lambda k: tried[k][0])
-        if tried[fewest][0] > score + criteria.BAND:
-            break
-        left, (score, tau, terms) = ways[fewest], tried[fewest]
-    explained_by_it = enumerated([t.effect for t in found if t not in terms])
-    if not explained_by_it or score > best.score or fit_beside(terms, tau).chi2 > best.fit.chi2:
-        return None
-    about = f"about {tau:.0f} s, which fits better"
-    return _describe_lag(tau, about, score - best.score, explained_by_it), terms
-
-
-def _lead_readings(e: ReducedSeries, tau: float) -> ReducedSeries:
-    """Return the series with the temperature that a thermometer with the lag τ s has read."""
-    from scipy.sparse import csr_array, diags_array, eye_array
-
-    history, channel = e.history, e.history.reference
-    rate, here = catalogue.find(lambda k: k.follows_rate), history.at(history.reading_times)
-    change = tau * rate.signal(here)[:, 0]
-    instrument = e.thermometers[channel]
-    mixing = (eye_array(len(change)) + tau * rate.sensitivity(here)) @ instrument.mixing
-    sign = np.where(mixing.diagonal() < 0.0, -1.0, 1.0)  # a knot with an own error has it positive
-    late = replace(
-        instrument,
-        trajectory=instrument.trajectory + change,
-        deviation=instrument.deviation * sign,
-        mixing=csr_array(mixing @ diags_array(sign)),
-    )
-    return replace(
-        e,
-        history=replace(history, readings={
-            **history.readings, channel: history.readings[channel] + change
-        }),
-        thermometers={**e.thermometers, channel: late},
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

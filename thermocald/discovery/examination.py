@@ -14,6 +14,14 @@ from thermocald.discovery.evidence import (
     find_displaced_targets,
     replace_moved_boards,
 )
+from thermocald.discovery.lag import (
+    LAGS_S,
+    NEAR,
+    Late,
+    estimate_lag,
+    fit_behind,
+    lead_readings,
+)
 from thermocald.discovery.mounted import (
     KNOCKS,
     contradict,
@@ -24,7 +32,7 @@ from thermocald.discovery.mounted import (
     search_beside_mount,
     split_knocks,
 )
-from thermocald.discovery.search import Search, Solution, by_score, say_searched
+from thermocald.discovery.search import Search, Solution, by_score, list_candidates, say_searched
 from thermocald.discovery.validation import (
     SurrogateTest,
     compare_with_surrogates,
@@ -33,6 +41,7 @@ from thermocald.discovery.validation import (
 )
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
+from thermocald.physics.formula import Node, Proportional
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
 from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
 from thermocald.thermal.movement import (
@@ -68,6 +77,9 @@ _EFFECTS = 3
 _COMBINATIONS = 8  # fitted in full per level
 _WIDTH = 4  # solutions of a level that are extended
 _GUIDES = 3  # effects fitted to estimate how far the image moves
+_TURNS = 4  # estimates of a thermometer's lag, each beside the effects found with the one before
+_SAME_LAG = 0.02  # share of a lag by which a further estimate may change it
+_BESIDE_LAG = 2  # effects beside a lag of the thermometer
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +94,8 @@ class Examination:
     well. unblocked: the series as examined, not averaged in blocks. field_movements: of boards and
     targets, per series. distortion_sigmas: significance of what the distortion follows.
     knows_noise: whether the model has the growth of the noise already. walks: whether an effect of
-    `best` may be a random walk of the camera.
+    `best` may be a random walk of the camera. late: a lag of the thermometer that with few
+    effects explains what no or many effects do.
     """
 
     base: Solution
@@ -104,6 +117,7 @@ class Examination:
     field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
     distortion_sigmas: float = 0.0
     walks: bool = False
+    late: Late | None = None
 
     @property
     def fitter(self) -> HypothesisFitter:
@@ -158,6 +172,8 @@ def examine_series(
         if result.walks:
             say("the camera may have moved at random: searching again")
             result = _examine_beside_mount(calibrated, say, given, jobs, result.best) or result
+    if _may_be_late(result):
+        result = replace(result, late=_search_behind_lag(result, say, given, jobs))
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
@@ -209,6 +225,51 @@ def _examine_standing(
         if knocked is not None and len(knocked.best.terms) <= most:
             return knocked
     return found
+
+
+def _may_be_late(x: Examination) -> bool:
+    """Test whether a lag of the thermometer may explain a series better.
+
+    What follows T then follows T + τ dT/dt, which a gradient adds to the linear terms only, so that
+    further effects imitate the rest.
+    """
+    found = x.best.terms[len(x.base.terms) :]
+    leaves = max(a.significance for a in x.adequacy) > criteria.LEFT_SIGMAS
+    many = len(found) > 2 or (len(found) == 2 and leaves)
+    return not x.adequate or (many and any(t.kind.follows_rate or t.kind.delay for t in found))
+
+
+def _search_behind_lag(
+    found: Examination, say: Callable[[str], None], given: Sequence[ModelEffect], jobs: int
+) -> Late | None:
+    """Find a lag of the thermometer and few effects that explain the series; None if none do.
+
+    All that drifts with the temperature follows T + τ dT/dt then, which gives τ at first.
+    """
+    say("the thermometer may lag behind the camera: searching again")
+    series = found.fitter.series
+    drifts = {
+        c.effect: c.term(None, len(series))
+        for c in list_candidates(series)
+        if isinstance(c.kind, Proportional) and not c.fixed
+    }
+    terms = (*drifts.values(), *(t for t in found.best.terms if t.effect not in drifts))
+    trials, before = LAGS_S, np.inf
+    for _ in range(_TURNS):
+        terms = tuple(t for t in terms if not (t.kind.follows_rate or t.kind.delay))
+        objective, tau = estimate_lag(series, terms, trials)
+        if np.isinf(before) and objective > fit_behind(series, terms, 0.0).objective:
+            return None
+        search = Search(HypothesisFitter([lead_readings(e, tau) for e in series]), say)
+        late = _search_standing(search, search.base(given), jobs)
+        names, worse = late.best.names[len(given) :], late.best.score - found.best.score
+        if worse > -criteria.BAND or not names:
+            return None
+        few = len(names) <= _BESIDE_LAG
+        if late.adequate and few and abs(tau - before) < _SAME_LAG * tau:
+            return Late(tau, worse, names)
+        terms, trials, before = late.best.terms, tau * NEAR, tau
+    return None
 
 
 def _search_beside_knocks(
@@ -299,7 +360,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     adequacy = examine_all(fitter, best.fit)
     complete = _is_adequate(adequacy, base_adequacy)
     walks = complete and _imitates_walk(search, base, best)
-    complete = complete and not walks
+    complete = complete and not walks and not _magnitude_does_better(search, base, best)
     if len(best.terms) > kept and len(fitter.series) < 2:
         # if single targets wander much, one series alone names no effect
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
@@ -322,6 +383,21 @@ def _imitates_walk(search: Search, base: Solution, best: Solution) -> bool:
         return False
     limit = fit_beside_walk(best).score + criteria.BAND
     return any(fit_beside_walk(_drop_effect(search, base, best, i)).score < limit for i in found)
+
+
+def _magnitude_does_better(search: Search, base: Solution, best: Solution) -> bool:
+    """Test whether |dT/dt| alone, which has no name, does better than a gradient and the others."""
+    rate = Node("rate", (Node("", name=search.fitter.series[0].history.reference),))
+    kept = len(base.terms)
+    return any(
+        search.refine(
+            (*base.terms, Term(Node("magnitude", (rate,)).text(), term.parameters)),
+            (*base.penalties, penalty),
+        ).score
+        < best.score - criteria.BAND
+        for term, penalty in zip(best.terms[kept:], best.penalties[kept:], strict=True)
+        if term.kind.follows_rate
+    )
 
 
 def _is_short(search: Search, base: Solution, best: Solution) -> bool:
@@ -473,12 +549,13 @@ def _examine_beside_mount(
     guide: if the camera may walk, the effects beside which the tremble is measured, as the ends of
     a strong one look like it.
     """
+    walks = guide is not None
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     still = HypothesisFitter(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
     shaken = HypothesisFitter(add_tremble(still, still.fit(guide.terms if guide else ())))
-    beside, ranking, seen, like = search_beside_mount(shaken, say, given, guide is not None)
+    beside, ranking, seen, like = search_beside_mount(shaken, say, given, walks)
     fitter, mount = beside.fitter, beside.mount
     base, whole, knocks = split_knocks(beside, len(given))
     if mount is None or mount.smoothness(fitter, whole.fit) > criteria.SMOOTH:
@@ -491,7 +568,11 @@ def _examine_beside_mount(
         best, blocks, tests = _keep_named(search, base, whole, jobs)
     if not is_convincing(base, best):
         best, blocks, tests = base, [], ()
-    if contradict(best) or leaves_kinks(fitter, best.fit) or moves_interior(still, best.terms):
+    if (
+        contradict(best)
+        or leaves_kinks(fitter, best.fit)
+        or moves_interior(still, best.terms, walks)
+    ):
         return None
     tried = iter(beside.as_slips)
     as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)

@@ -233,14 +233,16 @@ def make_own_rates(series: int, count: int) -> Term:
     return Term(along_T, BASE, fresh=fresh, through_drive=True)
 
 
-def moves_interior(fitter: HypothesisFitter, terms: Sequence[Term]) -> bool:
+def moves_interior(fitter: HypothesisFitter, terms: Sequence[Term], walks: bool) -> bool:
     """Test whether terms leave a slow movement that moves more than the exterior orientation.
 
     It is no movement of a mount, which moves the whole camera. In many epochs its smoothness tells
-    more, since errors of the temperature move the interior too. fitter: of the series without one.
+    more, since errors of the temperature move the interior too. fitter: of the series without one;
+    walks: whether the camera is taken to move only since an effect may be a random walk.
     """
-    if max(len(e.times) for e in fitter.series) >= criteria.NO_WALK_EACH:
+    if max(len(e.times) for e in fitter.series) >= criteria.NO_WALK_EACH and not walks:
         return False
+    most = criteria.INTERIOR_OF_WALK if walks else criteria.INTERIOR
     fit = fitter.fit(terms)
     own = np.array([PARAMETER_NAMES.index(name) for name in EOP_NAMES])
     for e, weighting, (C, V, index) in zip(fitter.series, fit.weightings, fit.designs, strict=True):
@@ -250,7 +252,7 @@ def moves_interior(fitter: HypothesisFitter, terms: Sequence[Term]) -> bool:
         whole = explained(A, rest, 1e-9)
         camera = explained(A[:, own[:, None], own], rest[:, own], 1e-9)
         free = len(c) * (len(PARAMETER_NAMES) - len(own))
-        if float(np.sum(whole - camera)) - free > criteria.INTERIOR * np.sqrt(2.0 * free):
+        if float(np.sum(whole - camera)) - free > most * np.sqrt(2.0 * free):
             return True
     return False
 

@@ -21,12 +21,11 @@ from thermocald.discovery.entries import (
     compare_shift_and_tilt,
     effects_of,
     estimate_term,
-    lagging_thermometer,
     list_image_effects,
-    replace_by_lag,
 )
 from thermocald.discovery.examination import Examination, examine_series
 from thermocald.discovery.gap import Gap, Stage, fit_first, measure_gap, measure_stage
+from thermocald.discovery.lag import lagging_thermometer
 from thermocald.discovery.proposal import propose
 from thermocald.discovery.search import by_score
 from thermocald.discovery.unnamed import (
@@ -246,11 +245,10 @@ def discover_series(
     if not x.adequate:
         return _conclude_unexplained(x, fits[0], stages, n, progress)
     estimated = estimate_first(x, fits[-1].terms) if len(terms) > known else None
-    lag = replace_by_lag(x)
     for k in range(known, len(terms)):
         stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
         assert estimated is not None
-        found.append(_describe_effect(x, fits[-1], estimated[1], k, lag))
+        found.append(_describe_effect(x, fits[-1], estimated[1], k))
     verdict = "effects_found" if found else "adequate"
     return Discovery(
         verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], estimated=estimated
@@ -270,17 +268,8 @@ def estimate_first(x: Examination, terms: Sequence[Term]) -> tuple[HypothesisFit
     return fitter, fit if delayed else fitter.refine_in(sharpen_trajectories(fitter, fit), fit)
 
 
-def _describe_effect(
-    x: Examination,
-    fit: Fit,
-    estimated: Fit,
-    k: int,
-    lag: tuple[dict[str, Any], tuple[Term, ...]] | None,
-) -> EffectFound:
-    """Describe a term beyond the base model; both fits are of M1 alone.
-
-    lag: of the thermometer, and the effects left beside it, if it explains others better.
-    """
+def _describe_effect(x: Examination, fit: Fit, estimated: Fit, k: int) -> EffectFound:
+    """Describe a term beyond the base model; both fits are of M1 alone."""
     term = fit.terms[k]
     e = x.fitter.series[0]
     number = k - len(x.base.terms)
@@ -316,10 +305,9 @@ def _describe_effect(
     if alternatives:
         names = ", ".join(a["effect"] for a in alternatives)
         statement += f". Alternatives not excluded: {names}"
-    if lag is not None and term not in lag[1]:
-        lags: dict[str, Any] | None = lag[0]
-    else:
-        lags = _find_lagging_thermometer(x, fit, k)
+    lags = _find_lagging_thermometer(x, fit, k)
+    if x.late and term.effect not in x.late.names:
+        lags = x.late.describe(x.best.names[len(x.base.terms) :])
     if lags is not None:
         alternatives.append(lags)
         statement += f". Or {lags['statement']}"
@@ -423,7 +411,7 @@ def _conclude_unexplained(
         for s in sorted(nearest.values(), key=by_score)[:4]
     ]
     fits = base, base
-    proposal = propose(x, described.where["parameters"], progress)
+    proposal = None if x.late else propose(x, described.where["parameters"], progress)
     if proposal is not None:
         best, fitter = proposal.best, proposal.best.fitter
         x = replace(x, base=proposal.base, best=best, adequacy=examine_all(fitter, best.fit))
@@ -447,10 +435,14 @@ def _conclude_unexplained(
         }
         if alone.adequate:
             del evidence["bridge"]
-        statement = say_contradiction(x) or (
-            f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
-        )
-        entry = replace(described, statement=statement, evidence=evidence)
+        late = [x.late.describe(())] if x.late else []
+        if late:
+            statement = f"{described.statement}. Or {late[0]['statement']}"
+        else:
+            statement = say_contradiction(x) or (
+                f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
+            )
+        entry = replace(described, statement=statement, evidence=evidence, alternatives=late)
     entry = replace(entry, alternatives=[*entry.alternatives, *resembling])
     return Discovery("unexplained", (entry,), tuple(stages), x, *fits)
 

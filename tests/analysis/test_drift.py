@@ -34,11 +34,12 @@ def table_of(values, sd, exterior):
 
 def series(
     seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60, targets: int = 60,
-    field_mm: float = 0.02, moves=None,
+    field_mm: float = 0.02, moves=None, lost=range(0), knock: float = 0.0,
 ) -> Epochs:  # fmt: skip
     """Simulate circles before a camera that warms up with 400 s; one may wander by some px.
 
-    moves (epochs,): of every second target, px.
+    moves (epochs,): of every second target, px; lost: epochs without observations, in which the
+    camera turns by `knock` rad.
     """
     plain = corner_field("plain", per_side=5, pitch_mm=124.0)
     rng = np.random.default_rng(seed)
@@ -52,11 +53,13 @@ def series(
         now = iop.copy()
         if warms:
             now[:3] += np.array([8e-4, -1.8e-3, -1.2e-3]) * (1 - np.exp(-10.0 * k / 400.0))
-        points = project(model.sensor, now, eop, true)
+        turned = eop + np.r_[knock * (k >= lost.start), np.zeros(5)]
+        points = project(model.sensor, now, turned, true)
         points[7, 0] += wanders * k / epochs
         points[::2, 0] += 0.0 if moves is None else moves[k]
         points += rng.normal(0, SIGMA, points.shape)
-        observations.append(Observations(np.arange(targets), points, np.full(points.shape, SIGMA)))
+        seen = Observations(np.arange(targets), points, np.full(points.shape, SIGMA))
+        observations.append(None if k in lost else seen)
     start = np.tile(np.r_[iop, eop], (epochs, 1))
     apart = table_of(start, np.ones((epochs, 16)), "per_epoch")
     head = SimpleNamespace(name="test", camera=SimpleNamespace(sensor=model.sensor))
@@ -75,6 +78,18 @@ def test_a_warm_up_of_any_length_is_a_drift_and_no_target_is_blamed(seed, epochs
     x0 = table.drifts[1]
     expected = -1.8e-3 * (1 - np.exp(-10.0 * (epochs - 1) / 400.0))
     assert x0.last_minus_first == pytest.approx(expected, abs=4 * x0.sd_last_minus_first)
+
+
+@pytest.mark.parametrize("knock", [0.0, 4e-4])
+def test_what_a_camera_drifts_in_lost_epochs_is_no_knock(knock):
+    """It was one, with sds eight times as large; a true one was 20 sds off."""
+    table = series(2, lost=range(14, 18), knock=knock)
+    assert table.exterior == ("mount" if knock else "series")
+    assert table.adjustment.movement.jumps == ((18,) if knock else ())
+    for line, size in zip(courses(table), (8e-4, -1.8e-3, -1.2e-3), strict=True):
+        off = line.last_minus_first - size * (1.0 - np.exp(-59 / 40))
+        assert abs(off) < 3.0 * line.sd_last_minus_first
+    assert line.sd_last_minus_first < 3e-5
 
 
 @pytest.mark.parametrize(("field_mm", "hangs"), [(0.02, False), (2.0, True)])

@@ -338,7 +338,7 @@ class Epochs(Result):
             nor = ", nor faster changes of the camera from the mount's"
             out.append(
                 f"movements of the mount slower than {FASTEST_DRIFT_S / 60:.0f} min cannot be "
-                f"separated from the camera's{nor if self.exterior == 'mount' else ''}; last - "
+                f"separated from the camera's{nor if self.exterior == 'mount' else ''}; last − "
                 f"first by the perspective alone, whatever the mount does: {sds} µm"
             )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 _JUMP_SD = 4.0  # standard deviations of the images' slope, from which its change is a jump
 
 _LEAST = 0.005  # least noise, as a fraction of that at T0
-_LEAST_AT_T0 = 0.1  # of that at the nearest recorded temperature, below which a defocus has no effect
+_LEAST_AT_T0 = 0.1  # of that at the nearest recorded temperature: at less, a defocus stops
 
 _FEIGNED = 0.8  # of a delay's sd half an interval between readings later: a smaller one is feigned
 _BY_READINGS = 0.9  # of a rate's sd beside known readings: a smaller one comes from the images
@@ -86,13 +86,12 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
         if name != series[0].history.reference and all(name in e.history.readings for e in series):
             trajectory = [e.history.temperature(name) for e in series]
             others.append((_estimate_slope([c - c.mean() for c in trajectory], data)[1], name))
-    # two thermometers of a camera rise together: only a clearly better one excludes the reference
-    if others and gain < max(others)[0] - criteria.CLEAR:
-        return None
     time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
     by_time = _estimate_slope(time, data)[1]
     other_gain, other = max([*others, (by_time, "time")])
-    if gain < criteria.GROWTH or gain < by_time + criteria.CLEAR:
+    # two thermometers of a camera rise together: only a clearly better one excludes the reference
+    least = [criteria.GROWTH, by_time + criteria.CLEAR, *(g - criteria.CLEAR for g, _ in others)]
+    if gain < max(least):
         return None
     growth = estimate_noise_slope(series)
     if growth.gain < criteria.GROWTH:
@@ -114,7 +113,7 @@ def estimate_noise_slope(series: Sequence[ReducedSeries]) -> NoiseGrowth:
     if at_T0 < _LEAST_AT_T0:
         raise DataError(
             f"the measuring noise follows the temperature so closely that at T0 = {T0:g} °C there "
-            f"would be none; choose T0 nearer to the recorded temperatures, such as {nearest:.1f} °C"
+            f"would be none; choose T0 nearer to the recorded temperatures, as {nearest:.1f} °C"
         )
     noise = tuple(np.maximum(1.0 + k * t, _LEAST) / at_T0 for t in temperature)
     return NoiseGrowth(

@@ -278,9 +278,7 @@ def reduce_series(
     reference = next(iter(source.readings))
     if reference not in present:
         raise _no_temperature(source, reference)
-    noises = None
-    if source.noises is not None:
-        noises = {name: source.noises[name][usable] for name in present}
+    noises = source.noises and {name: source.noises[name][usable] for name in present}
     knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
     # without the knots on curves between readings
     trajectory = instruments[reference].trajectory[instruments[reference].erring]

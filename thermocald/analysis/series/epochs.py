@@ -262,8 +262,7 @@ class Epochs(Result):
         document = self.as_dict()
         exterior = _EXTERIOR_WORDS[self.exterior]
         calibrated = f"{document['ok']} of {document['epochs']} epochs calibrated"
-        count = document["rejected"]
-        rejected = counted(count, "rejected observation")
+        rejected = counted(document["rejected"], "rejected observation")
         out = [f"{calibrated}, exterior orientation {exterior}, {rejected}"]
         still = document.get("stood_still")
         if (sigma0 := document["sigma0"]) is not None:

@@ -124,8 +124,7 @@ def estimate_noise_slope(series: Sequence[ReducedSeries]) -> NoiseGrowth:
 def _temperatures(series: Sequence[ReducedSeries]) -> tuple[float, list[Array]]:
     """Return the recorded temperature nearest to T0, and each series' temperatures minus it."""
     recorded = [e.history.temperature() for e in series]
-    every = np.concatenate(recorded)
-    nearest = float(np.clip(series[0].T0, every.min(), every.max()))
+    nearest = float(np.clip(series[0].T0, min(map(np.min, recorded)), max(map(np.max, recorded))))
     return nearest, [T - nearest for T in recorded]
 
 

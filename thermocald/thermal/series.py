@@ -74,19 +74,15 @@ class SeriesInput:
 
     def polygons(self) -> dict[str, tuple[Array, Array]]:
         """Return the times, s from the start, and values of each column with enough values."""
-        t = self.frame_times - self.frame_times[0]
-        out = {}
-        for name, values in (self.columns or {}).items():
-            there = np.isfinite(values)
-            if there.mean() > 0.5:
-                out[name] = (t[there], values[there])
-        return out
+        t, columns = self.frame_times - self.frame_times[0], self.columns or {}
+        known = {name: np.isfinite(values) for name, values in columns.items()}
+        return {n: (t[k], columns[n][k]) for n, k in known.items() if k.mean() > 0.5}
 
     @property
     def per_row(self) -> Array:
         """The number of epochs in each row (E,)."""
-        ones: Array = np.ones(len(self.frame_times))
-        return ones if self.counts is None else self.counts.astype(np.float64)
+        counts = np.ones(len(self.frame_times)) if self.counts is None else self.counts
+        return counts.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from thermocald.analysis.statistics.dependence import (
     slope_p_value,
     unbroken_windows,
 )
-from thermocald.analysis.statistics.noise_models import cosines, drift_test
+from thermocald.analysis.statistics.noise_models import Frequencies, cosines, drift_test
 
 N = 150
 TIME_S = np.arange(N) * 10.0
@@ -75,11 +75,13 @@ def test_drift_of_some_sds_is_found(drift):
     assert all(one.p_excess <= 1e-6 for one in tests)
 
 
-def test_one_bad_epoch_is_no_drift():
+@pytest.mark.parametrize(("epochs", "bad"), [(N, 40), (10, 9)])
+def test_one_bad_epoch_is_no_drift(epochs, bad):
     rng = np.random.default_rng(10)
-    spike = 100.0 * (np.arange(N) == 40)
-    found = [drift_test(spike + noise(rng), ONES, REDUNDANCY).p_value for _ in range(50)]
-    assert min(found) > 0.05
+    spike = 100.0 * (np.arange(N) == bad)
+    series = [(spike + noise(rng))[:epochs] for _ in range(50)]
+    found = [drift_test(y, ONES[:epochs], REDUNDANCY[:epochs]).p_value for y in series]
+    assert min(found) > 0.01
 
 
 def test_a_warm_up_with_a_gap_is_found():
@@ -87,6 +89,14 @@ def test_a_warm_up_with_a_gap_is_found():
     y = 40 * WARM_UP[kept] + noise(np.random.default_rng(15))[kept]
     assert drift_test(y, ONES[kept], REDUNDANCY[kept], times=TIME_S[kept]).p_value < 1e-3
     assert slope_p_value(y, WARM_UP[kept], TIME_S[kept]) < 1e-3
+
+
+def test_means_of_stretches_have_the_covariance_of_their_noise():
+    epoch = np.r_[0:12, 30:38]
+    of = np.array([epoch < 20, epoch > 20]) / np.sqrt([[12.0], [8.0]])
+    true = of @ 0.9 ** np.abs(epoch - epoch[:, None]) @ of.T
+    found = Frequencies.of(len(epoch), 10.0 * epoch).means_covariance(0.9)
+    np.testing.assert_allclose(found, true, rtol=1e-9)
 
 
 def test_a_series_of_prime_length_is_shortened_by_a_few_epochs():

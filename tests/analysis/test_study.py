@@ -20,7 +20,7 @@ from thermocald.analysis.study.study import (
 )
 from thermocald.errors import DataError, UsageError
 from thermocald.output.study.figures import study_figures
-from thermocald.output.study.report import answer_sentences, rate_in_px_and_mm
+from thermocald.output.study.report import answer_sentences, detail_sentences, rate_in_px_and_mm
 from thermocald.output.study.tables import object_space_tables
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.store.database.store import Store
@@ -148,7 +148,7 @@ def with_a_gap(series):
         pytest.param({}, lambda s: with_temperature(s, 25 + 0.05 * np.sin(np.arange(150.0))),
                      "which its noise of 0.050 K", {"dependence"}, id="only noise"),
         pytest.param({}, lambda s: with_temperature(s, np.full(150, np.nan)),
-                     "is known in 0 of 150 epochs", {"dependence"}, id="never read"),
+                     "is known in 0 epochs", {"dependence"}, id="never read"),
         pytest.param({}, with_a_gap, "1 gap, the longest of 410 s at an interval of 10 s", set(),
                      id="a gap"),
         pytest.param({}, lambda s: replace(s, correlations=np.empty((0, 10, 10))),
@@ -176,6 +176,15 @@ def test_what_the_data_do_not_allow_is_said(warm_up, options, change, words, lac
     assert {part for part, missing in absent.items() if missing} == lacks
     if "gap" in words:
         assert one.significance["c"].tests == 30 + 20
+
+
+@pytest.mark.parametrize(("epochs", "stated"), [(32, ""), (150, "scatter 1.60 ± 0.20 times")])
+def test_only_a_scatter_beyond_chance_is_stated(warm_up, epochs, stated):
+    """Of 32 epochs, a ratio of 1.18 by chance was."""
+    series = warm_up(epochs=epochs, seed=2)()
+    noisy = replace(series, sds=series.sds / 1.5) if stated else series
+    text = " ".join(detail_sentences(study_camera("c", [noisy], SETTINGS)))
+    assert stated in text if stated else "scatter" not in text
 
 
 def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):

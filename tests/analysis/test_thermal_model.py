@@ -147,6 +147,20 @@ def test_refusals():
         for_fit(epochs_input(steady.head, steady.field, few, "few"))
 
 
+def test_a_defocus_is_stated_at_any_t0_or_refused():
+    """At a T0 at which there would be no noise, the factor was 10⁹ ± 10² per kelvin."""
+    defocus = ModelEffect("defocus", {"factor": 0.15})
+    series = [reduced(simulated(1, epochs=60, listed=[defocus]))]
+    own = fit_thermal_model(series, [defocus]).model
+    k, T0 = own.value("defocus.factor"), own.T0
+    low = T0 - 0.8 / k
+    assert low < series[0].history.temperature().min()
+    cold = fit_thermal_model(series, [defocus], T0=low).model
+    assert cold.value("defocus.factor") == pytest.approx(k / 0.2, rel=1e-3)
+    with pytest.raises(DataError, match="there would be none; choose T0 nearer"):
+        fit_thermal_model(series, [defocus], T0=T0 - 1.0 / k)
+
+
 @pytest.mark.parametrize(("depth", "doubtful"), [("corner", False), ("wall", True)])
 def test_rates_are_doubtful_with_a_field_that_hardly_shows_c(depth, doubtful):
     """With one wall they are off by 4 to 19 standard deviations, with a corner by 1.2."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from year_of_means import DAY, year
@@ -54,6 +56,8 @@ def test_the_afternoon_keeps_short_rows():
     np.testing.assert_allclose(blocks.N.sum(axis=0), evidence.N.sum(axis=0), rtol=1e-12)
     np.testing.assert_allclose(blocks.b.sum(axis=0), evidence.b.sum(axis=0), rtol=1e-9)
     np.testing.assert_allclose(blocks.averaged(evidence.times), blocks.times, rtol=1e-9)
+    fewer = (evidence.n > 0).sum() - (blocks.n > 0).sum()
+    assert blocks.blocks.within_free == evidence.rank * fewer
 
 
 @pytest.mark.slow
@@ -129,7 +133,9 @@ def test_rows_are_weighted_means_without_gross_errors_and_short_where_it_is_fast
 
 def test_the_blocks_that_are_read_do_not_matter(recorded):
     whole, grid = recorded
-    one, other = (condensed(whole, InBlocks(grid, size), most=500) for size in (E, 480))
+    coarse = replace(whole, resolutions={"temperature": 0.5})
+    one, other = (condensed(coarse, InBlocks(grid, size), most=500) for size in (E, 480))
+    assert one.noises["temperature"].min() > 0.04  # what the steps hide is no noise of each reading
     # except for points at the limit of gross errors
     assert np.mean(np.abs(one.grid.points - other.grid.points) > 1e-9) < 0.002
     np.testing.assert_array_equal(one.counts, other.counts)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.errors import DataError
 from thermocald.photogrammetry.linalg import (
     orthonormal_combinations,
     scaled_inverse,
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 _JUMP_SD = 4.0  # standard deviations of the images' slope, from which its change is a jump
 
 _LEAST = 0.005  # least noise, as a fraction of that at T0
+_LEAST_AT_T0 = 0.1  # of that at the nearest recorded temperature: at less, a defocus stops
 
 _FEIGNED = 0.8  # of a delay's sd half an interval between readings later: a smaller one is feigned
 _BY_READINGS = 0.9  # of a rate's sd beside known readings: a smaller one comes from the images
@@ -77,20 +79,19 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
     of the epochs' adjustments are χ² distributed about (1 + k (T - T0))².
     """
     data = _list_variances(series)
-    temperature = [e.history.temperature() - e.T0 for e in series]
+    temperature = _temperatures(series)[1]
     gain = _estimate_slope(temperature, data)[1]
     others: list[tuple[float, str]] = []
     for name in series[0].history.readings:
         if name != series[0].history.reference and all(name in e.history.readings for e in series):
             trajectory = [e.history.temperature(name) for e in series]
             others.append((_estimate_slope([c - c.mean() for c in trajectory], data)[1], name))
-    # two thermometers of a camera rise together: only a clearly better one excludes the reference
-    if others and gain < max(others)[0] - criteria.CLEAR:
-        return None
     time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
     by_time = _estimate_slope(time, data)[1]
     other_gain, other = max([*others, (by_time, "time")])
-    if gain < criteria.GROWTH or gain < by_time + criteria.CLEAR:
+    # two thermometers of a camera rise together: only a clearly better one excludes the reference
+    least = [criteria.GROWTH, by_time + criteria.CLEAR, *(g - criteria.CLEAR for g, _ in others)]
+    if gain < max(least):
         return None
     growth = estimate_noise_slope(series)
     if growth.gain < criteria.GROWTH:
@@ -99,13 +100,32 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
 
 
 def estimate_noise_slope(series: Sequence[ReducedSeries]) -> NoiseGrowth:
-    """Estimate how the measuring noise follows the reference temperature, significant or not."""
+    """Estimate how the measuring noise follows the reference temperature, significant or not.
+
+    Raises DataError if there would be none at a T0 beyond the recorded temperatures.
+    """
     data = _list_variances(series)
-    temperature = [e.history.temperature() - e.T0 for e in series]
+    nearest, temperature = _temperatures(series)
     k, gain, sd = _estimate_slope(temperature, data)
     rough = _measure_roughness(temperature, data, k)
-    noise = tuple(np.maximum(1.0 + k * t, _LEAST) for t in temperature)
-    return NoiseGrowth(k, sd * float(np.sqrt(rough)), gain / rough, 0.0, "", noise)
+    T0 = series[0].T0
+    at_T0 = 1.0 + k * (T0 - nearest)
+    if at_T0 < _LEAST_AT_T0:
+        raise DataError(
+            f"the measuring noise follows the temperature so closely that at T0 = {T0:g} °C there "
+            f"would be none; choose T0 nearer to the recorded temperatures, as {nearest:.1f} °C"
+        )
+    noise = tuple(np.maximum(1.0 + k * t, _LEAST) / at_T0 for t in temperature)
+    return NoiseGrowth(
+        k / at_T0, sd * float(np.sqrt(rough)) / at_T0**2, gain / rough, 0.0, "", noise
+    )
+
+
+def _temperatures(series: Sequence[ReducedSeries]) -> tuple[float, list[Array]]:
+    """Return the recorded temperature nearest to T0, and each series' temperatures minus it."""
+    recorded = [e.history.temperature() for e in series]
+    nearest = float(np.clip(series[0].T0, min(map(np.min, recorded)), max(map(np.max, recorded))))
+    return nearest, [T - nearest for T in recorded]
 
 
 def _list_variances(

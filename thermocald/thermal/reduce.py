@@ -83,16 +83,14 @@ def require(source: SeriesInput, strict: bool) -> None:
             )
         return
     reference = next(iter(source.readings))
-    if np.isfinite(source.readings[reference]).sum() < criteria.MIN_EPOCHS and (
-        len(source.frame_times) >= criteria.MIN_EPOCHS
-    ):
-        raise _no_temperature(source, reference)
     good = int(np.sum(seen >= criteria.MIN_TARGETS))
     if good < criteria.MIN_EPOCHS:
         raise DataError(
             f"{source.name}: {good} of {len(seen)} epochs have {criteria.MIN_TARGETS} targets or "
             f"more; discovery needs {criteria.MIN_EPOCHS} such epochs, better 100"
         )
+    if np.isfinite(source.readings[reference]).sum() < criteria.MIN_EPOCHS:
+        raise _no_temperature(source, reference)
     duration = float(source.frame_times[-1] - source.frame_times[0])
     if duration < criteria.MIN_DURATION:
         raise DataError(
@@ -278,21 +276,18 @@ def reduce_series(
     reference = next(iter(source.readings))
     if reference not in present:
         raise _no_temperature(source, reference)
-    noises = None
-    if source.noises is not None:
-        noises = {name: source.noises[name][usable] for name in present}
+    noises = source.noises and {name: source.noises[name][usable] for name in present}
     knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
     # without the knots on curves between readings
-    trajectory = instruments[reference].trajectory[instruments[reference].erring]
+    known = instruments[reference]
+    trajectory = known.trajectory[known.erring]
     trajectory = trajectory[np.isfinite(trajectory)]
     history = History(
         times, knots, {name: c.trajectory for name, c in instruments.items()}, reference,
         float(np.mean(trajectory)) if T0 is None else T0, source.polygons(),
     )  # fmt: skip
     change = float(np.ptp(trajectory))
-    least_change = max(
-        criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * instruments[reference].noise
-    )
+    least_change = max(criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * known.noise)
     if strict and change < least_change:
         raise DataError(
             f"{source.name}: the temperature {reference!r} is constant within "

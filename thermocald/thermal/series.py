@@ -74,19 +74,15 @@ class SeriesInput:
 
     def polygons(self) -> dict[str, tuple[Array, Array]]:
         """Return the times, s from the start, and values of each column with enough values."""
-        t = self.frame_times - self.frame_times[0]
-        out = {}
-        for name, values in (self.columns or {}).items():
-            there = np.isfinite(values)
-            if there.mean() > 0.5:
-                out[name] = (t[there], values[there])
-        return out
+        t, columns = self.frame_times - self.frame_times[0], self.columns or {}
+        known = {name: np.isfinite(values) for name, values in columns.items()}
+        return {n: (t[k], columns[n][k]) for n, k in known.items() if k.mean() > 0.5}
 
     @property
     def per_row(self) -> Array:
         """The number of epochs in each row (E,)."""
-        ones: Array = np.ones(len(self.frame_times))
-        return ones if self.counts is None else self.counts.astype(np.float64)
+        counts = np.ones(len(self.frame_times)) if self.counts is None else self.counts
+        return counts.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,14 +130,6 @@ class HiddenTargets:
     def normal(self) -> Array:
         """The diagonal (S,) of the offsets' own normal matrix."""
         return np.asarray(self.patterns.sum(axis=1)[self.group] + _LOOSE)
-
-    def in_blocks(self, starts: NDArray[np.int64]) -> HiddenTargets:
-        """Sum over blocks of neighbouring epochs, which begin at the rows `starts`."""
-        return replace(
-            self,
-            patterns=np.add.reduceat(self.patterns, starts, axis=1),
-            right=np.add.reduceat(self.right, starts, axis=1),
-        )
 
     def turned(self, T: Array, values: Array) -> HiddenTargets:
         """Transform the offsets with normal matrices to T N Tᵀ, about the epochs' values (E, P)."""
@@ -349,7 +337,7 @@ class ReducedSeries:
         """
         f: Array = np.broadcast_to(factor, self.yy.shape)
         h = self.hidden
-        hidden = replace(h, patterns=h.patterns * f, right=h.right * f) if h else None
+        hidden = h and replace(h, patterns=h.patterns * f, right=h.right * f)
         N, b = self.N * f[:, None, None], self.b * f[:, None]
         return replace(self, N=N, b=b, yy=self.yy * f, hidden=hidden)
 
@@ -497,15 +485,11 @@ def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], flo
     """Return a function of `start` and `stop`: these epochs' χ² about their mean, minus its
     expectation.
     """
-
-    def running(each: Array) -> Array:  # (E + 1, …) sums of all epochs before each
-        out = np.zeros((len(each) + 1, *each.shape[1:]))
-        np.cumsum(each, axis=0, out=out[1:])
-        return out
-
     right = np.einsum("epq,eq->ep", evidence.N, values)
     square = np.einsum("ep,ep->e", right, values)
-    sums = [running(x) for x in (evidence.N, right, square, (evidence.n > 0).astype(float))]
+    each = (evidence.N, right, square, (evidence.n > 0).astype(float))
+    # (E + 1, …) sums of all epochs before each
+    sums = [np.cumsum(np.concatenate([np.zeros_like(x[:1]), x]), axis=0) for x in each]
     rank = evidence.rank
 
     def within(start: int, stop: int) -> float:
@@ -526,7 +510,7 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
     """
     from scipy.sparse import csr_array
 
-    E = len(evidence.times)
+    E, hidden = len(evidence.times), evidence.hidden
     if rows >= E:
         return evidence
     size = int(np.ceil(E / rows))
@@ -563,6 +547,9 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
         n=np.add.reduceat(evidence.n, first),
         sigma0=np.sqrt(np.add.reduceat(evidence.sigma0**2, first) / there),
         blocks=Blocks(average, pool, free, first),
-        hidden=evidence.hidden.in_blocks(first) if evidence.hidden else None,
+        hidden=hidden and replace(
+            hidden, patterns=np.add.reduceat(hidden.patterns, first, axis=1),
+            right=np.add.reduceat(hidden.right, first, axis=1),
+        ),
         slope_jumps=None,
     )  # fmt: skip

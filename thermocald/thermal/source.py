@@ -29,7 +29,7 @@ from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -244,12 +244,9 @@ def _choose_fast_windows(
     z = trajectory[:n] - trajectory[:n].mean(axis=0)
     if (T @ T) > 0:
         z = z - np.outer(T, T @ z / (T @ T))
-    windows = -(-n // length)
-    odd, warm = np.zeros(windows), np.zeros(windows)
-    for k in range(windows):
-        part = slice(k * length, min((k + 1) * length, n))
-        odd[k] = _roughness(z[part])
-        warm[k] = _roughness(temperature[part, None])
+    parts = [slice(start, min(start + length, n)) for start in range(0, n, length)]
+    odd = np.array([_roughness(z[part]) for part in parts])
+    warm = np.array([_roughness(temperature[part, None]) for part in parts])
     first = np.argsort(-odd, kind="stable")[: -(-count // 2)].tolist()
     rest = [int(k) for k in np.argsort(-warm, kind="stable") if k not in first]
     return sorted({int(k) for k in first} | set(rest[: count - len(first)]))
@@ -272,13 +269,16 @@ def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: st
         channel: np.array([e.temperatures.get(channel, np.nan) for e in epochs], dtype=float)
         for channel in head.channels
     }
-    return _start_input(
-        head, field, name,
-        np.array([e.number for e in epochs], dtype=np.int64),
-        np.array([e.frame_time for e in epochs], dtype=float),
-        np.array([e.temperature_time for e in epochs], dtype=float),
-        readings,
-        ObservationGrid.from_observations(field, [e.observations for e in epochs]),
+    camera = head.camera
+    return SeriesInput(
+        name=name, camera=camera.name, sensor=camera.sensor, field=field,
+        principal_distance=camera.principal_distance,
+        frame_times=np.array([e.frame_time for e in epochs], dtype=float),
+        reading_times=np.array([e.temperature_time for e in epochs], dtype=float),
+        readings=readings, resolutions={n: c.resolution for n, c in head.channels.items()},
+        grid=ObservationGrid.from_observations(field, [e.observations for e in epochs]),
+        numbers=np.array([e.number for e in epochs], dtype=np.int64), series=head.series,
+        interior=camera.interior,
     )  # fmt: skip
 
 
@@ -313,13 +313,13 @@ def series_input(
     """
     source.head.require_calibrated(source.title)
     if source.has_observations and len(source) > limit_rows(len(source.testfield)):
-        every, nothing = source.columns, np.empty((0, len(source.testfield), 3))
-        whole = _start_input(
-            source.head, source.testfield, source.title, every.numbers, every.frame_time,
-            every.temperature_time, every.temperatures,
-            ObservationGrid(nothing[..., :2], nothing),
+        every = source.columns
+        whole = replace(
+            epochs_input(source.head, source.testfield, (), source.title), numbers=every.numbers,
+            frame_times=every.frame_time, reading_times=every.temperature_time,
+            readings=every.temperatures, columns=source.further_columns(),
         )  # fmt: skip
-        return condensed(replace(whole, columns=source.further_columns()), source)
+        return condensed(whole, source)
     if isinstance(source, Recording) and not source.has_observations:
         if say is not None:
             say(f"measuring the {len(source)} frames of {source.title}")
@@ -339,17 +339,3 @@ def series_input(
         channels = {name: values[rows] for name, values in log.channels.items()}
         found = replace(found, reading_times=log.times[rows], readings=channels)
     return replace(found, columns=source.further_columns())
-
-
-def _start_input(
-    head: Head, field: TestField, name: str, numbers: NDArray[np.int64], frame_times: Array,
-    reading_times: Array, readings: Mapping[str, Array], grid: ObservationGrid,
-) -> SeriesInput:  # fmt: skip
-    camera = head.camera
-    resolutions = {channel: c.resolution for channel, c in head.channels.items()}
-    return SeriesInput(
-        name=name, camera=camera.name, sensor=camera.sensor, field=field,
-        principal_distance=camera.principal_distance, frame_times=frame_times,
-        reading_times=reading_times, readings=readings, resolutions=resolutions, grid=grid,
-        numbers=numbers, series=head.series, interior=camera.interior,
-    )  # fmt: skip

@@ -311,11 +311,10 @@ class OnlineObserver:
         taken = np.isfinite(adjusted.residuals).all(axis=1)
         used = set(adjusted.targets[taken].tolist()) - set(adjusted.rejected)
         rejected = set(calibrated.adjustment.rejected) - used
-        measured = set(calibrated.adjustment.targets.tolist())
-        for row in list(self._rejected):
-            if row in measured and row not in rejected:
-                del self._rejected[row]
-                self._reported.discard(row)
+        agrees = set(calibrated.adjustment.targets.tolist()) - rejected
+        self._reported -= agrees
+        for row in agrees:
+            del self._rejected[row]
         self._rejected.update(rejected)
         epoch = calibrated.epoch
         for row in sorted(rejected - self._reported):

@@ -102,12 +102,13 @@ class Course:
 def table_of(drifts: Sequence[Course]) -> list[str]:
     """Return a line per parameter below a line of titles; [] without parameters."""
     titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm ± sd",
-              "last - first µm ± sd", "drift")  # fmt: skip
+              "last − first µm ± sd", "drift")  # fmt: skip
     rows = [
         (
-            c.name, f"{c.mean:.5f}", f"{1e3 * c.scatter:.3f}", f"{1e3 * c.sd:.3f}",
-            f"{c.scatter_over_sd:.2f}", f"{1e3 * c.change:+.3f} ± {1e3 * c.sd_change:.3f}",
-            f"{1e3 * c.last_minus_first:+.3f} ± {1e3 * c.sd_last_minus_first:.3f}", c.in_words,
+            c.name, f"{c.mean:.5f}".replace("-", "−"), f"{1e3 * c.scatter:.3f}",
+            f"{1e3 * c.sd:.3f}", f"{c.scatter_over_sd:.2f}",
+            signed(1e3 * c.change, 1e3 * c.sd_change),
+            signed(1e3 * c.last_minus_first, 1e3 * c.sd_last_minus_first), c.in_words,
         )
         for c in drifts
     ]  # fmt: skip

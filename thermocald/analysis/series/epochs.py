@@ -262,8 +262,7 @@ class Epochs(Result):
         document = self.as_dict()
         exterior = _EXTERIOR_WORDS[self.exterior]
         calibrated = f"{document['ok']} of {document['epochs']} epochs calibrated"
-        count = document["rejected"]
-        rejected = counted(count, "rejected observation")
+        rejected = counted(document["rejected"], "rejected observation")
         out = [f"{calibrated}, exterior orientation {exterior}, {rejected}"]
         still = document.get("stood_still")
         if (sigma0 := document["sigma0"]) is not None:
@@ -338,7 +337,7 @@ class Epochs(Result):
             nor = ", nor faster changes of the camera from the mount's"
             out.append(
                 f"movements of the mount slower than {FASTEST_DRIFT_S / 60:.0f} min cannot be "
-                f"separated from the camera's{nor if self.exterior == 'mount' else ''}; last - "
+                f"separated from the camera's{nor if self.exterior == 'mount' else ''}; last − "
                 f"first by the perspective alone, whatever the mount does: {sds} µm"
             )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]

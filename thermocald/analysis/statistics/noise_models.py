@@ -269,8 +269,9 @@ def drift_test(
     standardised = (values - values.mean()) / np.sqrt(np.mean(sds**2))
     # single epochs that contradict both neighbours are no drift
     between = np.median([standardised[:-2], standardised[1:-1], standardised[2:]], axis=0)
-    spike = _few_far(standardised[1:-1] - between, np.diff(standardised))
-    standardised[1:-1][spike] = between[spike]
+    between = np.pad(between, 1, mode="edge")
+    spike = _few_far(standardised - between, np.diff(standardised))
+    standardised[spike] = between[spike]
     # sudden steps would count as noise with a memory; many of them are noise itself, of few
     # distinct values: rounded, or alternating
     steps = np.diff(standardised)

@@ -362,7 +362,7 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     reason = ""
     if len(t) < _LEAST_DEPENDENCE:
         reason = (
-            f"{name} is known in {len(t)} of {counted(len(series), 'epoch')}: a dependence on it "
+            f"{name} is known in {counted(len(t), 'epoch')}: a dependence on it "
             f"needs {_LEAST_DEPENDENCE}."
         )
     elif not np.ptp(t) > 0:

@@ -420,9 +420,14 @@ def _noise(study: SeriesStudy) -> str:
     ratio = study.noise_ratio
     if not np.isfinite(ratio) or 1 / _NOISE_AGREES <= ratio <= _NOISE_AGREES:
         return ""
+    # the parameters may be correlated: then they show it together as well as one
+    one = next(t.drift for t in study.significance.values() if t.drift)
+    sd = ratio * one.sd_noise_ratio / one.noise_ratio
+    if abs(ratio - 1.0) < 2.0 * sd:
+        return ""
     return (
-        f"neighbouring epochs scatter {ratio:.2f} times as much as the standard deviations state "
-        f"(σ₀ {study.series.rms_sigma0:.2f})."
+        f"neighbouring epochs scatter {with_sd(ratio, sd)} times as much as the standard "
+        f"deviations state (σ₀ {study.series.rms_sigma0:.2f})."
     )
 
 

@@ -36,6 +36,8 @@ _BESIDE = 5  # epochs around a change in which a step may be instead
 _TOGETHER = 0.7  # epochs between a bend and a step that may be between the same two epochs
 SIDE = 8  # epochs before and after a gap that give its step
 _WINDOW = SIDE + 2  # epochs before and after a change that show what happened
+_FEW_MISSING = 12  # epochs, for which the drift around them predicts it to a noise of the pose
+_PREDICTED = 0.03  # variance of the slope around them, a third of it noise, the rest curvature
 _BRIEF = SIDE - 1  # most epochs for which a mount is touched
 _MOST = 8  # jumps examined
 _MOST_TOUCHED = 2 * _BRIEF  # epochs, or an eighth of them
@@ -47,14 +49,15 @@ _NEIGHBOURS = 5  # epochs on one side that predict an epoch
 
 
 def find_jumps(
-    trajectory: Array, M: Array, g: Array, scale: Array, gaps: Sequence[int]
+    trajectory: Array, M: Array, g: Array, scale: Array, numbers: Index, gaps: Sequence[int]
 ) -> tuple[Array, dict[int, Step], Array, dict[int, tuple[Array, float]]]:
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free; scale
-    (E,): noise of an epoch over the typical one, as a camera may defocus; gaps: the first epoch
-    after each gap. Returns the trajectory without any jumps and touches, what is known of the
-    mount's jumps by their epochs, the covariance (k, k) of a step in a gap that shows none, and the
+    (E,): noise of an epoch over the typical one, as a camera may defocus; numbers (E,): of the
+    epochs; gaps: the first epoch after each gap. Returns the trajectory without any jumps and
+    touches, and without what it drifts while a few epochs are missing; what is known of the mount's
+    jumps by their epochs, the covariance (k, k) of a step in a gap that shows none, and the
     displacement (k,) of each epoch in which the mount was elsewhere, as if touched, with its
     variance over an epoch's; M and g of these are then 0.
     """
@@ -62,13 +65,17 @@ def find_jumps(
     left, jumps, hidden = trajectory.copy(), {}, np.zeros(M.shape[1:])
     # in a gap the camera drifts, too: only the perspective shows how far the mount moved
     for row in gaps:
-        step = _step(left, row)
+        _, step = _line(left, numbers, row)
         left[row:] -= step
         jumps[row] = np.zeros_like(step), _loose(step)
     for row, (moved, V) in zip(gaps, estimate_steps(M, g, jumps), strict=True):
         if _chi2(moved, V) < _SHOWN:
             del jumps[row]
             hidden = max(hidden, V, key=np.trace)
+    missing = np.diff(numbers, prepend=numbers[0] - 1) - 1
+    for row in np.flatnonzero((missing > 0) & (missing <= _FEW_MISSING)).tolist():
+        if row not in gaps:  # else a steep drift would be a jump
+            left[row:] -= missing[row] * _line(trajectory, numbers, row)[0]
     pair = np.hypot(scale[1:], scale[:-1])[:, None]
     change = _without_drift(np.diff(left, axis=0)) / pair
     noise = pair * np.maximum(mad_sd(change, axis=0), 1.0)
@@ -95,6 +102,7 @@ def find_jumps(
         M[away], g[away] = 0.0, 0.0
         if row and row not in jumps:
             left[row:] -= step
+            variance = variance + np.eye(len(step)) * _PREDICTED * missing[row] ** 2
             if jump := _find_mover(row, step, variance, M, g):
                 jumps[row] = jump
     if len(touches) > max(_MOST_TOUCHED, len(left) // 8):
@@ -177,11 +185,12 @@ def _is_abrupt(change: Array) -> Mask:
     return abrupt
 
 
-def _step(trajectory: Array, row: int) -> Array:
-    """Return the step (k,) of a straight line at an epoch."""
-    t = np.arange(max(row - SIDE, 0), min(row + SIDE, len(trajectory))) - row
+def _line(trajectory: Array, numbers: Index, row: int) -> Array:
+    """Return the slope and the step (2, k) of a straight line at an epoch."""
+    near = slice(max(row - SIDE, 0), row + SIDE)
+    t = numbers[near] - numbers[row]
     line = np.column_stack([np.ones(len(t)), t, t >= 0])
-    return np.asarray(np.linalg.pinv(line)[2] @ trajectory[row + t])
+    return np.asarray(np.linalg.pinv(line)[1:] @ trajectory[near])
 
 
 def _find_displacement(

@@ -232,7 +232,7 @@ def estimate_movement(
     pauses = sorted({*missing.tolist(), *np.searchsorted(rows, gaps).tolist()})
     pauses = _apart(pauses, len(rows), SIDE)
     cuts = _apart(pauses, len(rows), FEWEST_EPOCHS)
-    trajectory, jumps, hidden, touches = find_jumps(trajectory, M, g, scale, pauses)
+    trajectory, jumps, hidden, touches = find_jumps(trajectory, M, g, scale, rows, pauses)
     steps = estimate_steps(M, g, jumps)
     drift = find_drift(M, g)
     # what the free parameters do not follow is the mount's, however slow

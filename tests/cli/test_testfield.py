@@ -73,6 +73,11 @@ def test_survey_writes_the_field_and_everything_about_it(sheet, tmp_path):
     # JPEG: these errors come from the image, not from the program
     assert np.sqrt(np.mean((moved - known) ** 2)) < 490 / 20_000
     told = json.loads((tmp_path / "survey.json").read_text())
+    # the ruler's error is common to all targets: a camera's calibration reads the shape's
+    stated = np.array([t["sd_X"] for t in sorted(told["targets"], key=lambda t: t["target"])])
+    assert surveyed.scale is not None
+    total = np.hypot(surveyed.sigmas, surveyed.scale)[np.argsort(surveyed.names), 0]
+    assert total == pytest.approx(stated, rel=0.03)
     assert (len(told["targets"]), len(told["stations"])) == (len(surveyed), 8)
     first = told["targets"][0]
     assert np.sqrt(np.diag(first["covariance"])) == pytest.approx(

@@ -49,11 +49,17 @@ def test_standard_deviations_and_correlations_are_true():
     length = np.linalg.norm(field[b] - field[a], axis=1)
     e = (field[b] - field[a]) / length[:, None]
     errors, variances, interiors, interior_variances, sigma0, ratios = [], [], [], [], [], []
+    along = (field - field.mean(axis=0)) / np.linalg.norm(field - field.mean(axis=0))
+    shapes, shares = [], []
     for seed in range(100):
         taped = [cases.distance(field, 0, 29, 0.01, rng.normal(0, 0.01))]
         network = _survey(field, stations, seed, taped, 0.0, nominal=field, **KNOWN)
         errors.append(network.points - field)
         variances.append(network.sigmas**2)
+        shape, scale = network.shape_and_scale()
+        of_scale = np.sum(errors[-1] * along)
+        shapes.append((errors[-1] - of_scale * along) / shape)
+        shares.append(of_scale / np.linalg.norm(scale))
         interiors.append(network.camera.interior.as_array() - cases.INTERIOR.as_array())
         interior_variances.append(np.diag(network.interior_covariance))
         sigma0.append(network.sigma0)
@@ -63,6 +69,9 @@ def test_standard_deviations_and_correlations_are_true():
         ratios.append(error / np.sqrt(np.einsum("ni,nij,nj->n", e, V, e)))
     per_axis = rms(errors, axis=(0, 1)) / np.sqrt(np.mean(variances, axis=(0, 1)))
     assert np.all((per_axis > 0.9) & (per_axis < 1.1))
+    # what is left without the error of the scale, and this error
+    assert 0.97 < rms(shapes) < 1.03
+    assert 0.79 < rms(shares) < 1.21
     per_parameter = rms(interiors, axis=0) / np.sqrt(np.mean(interior_variances, axis=0))
     assert np.all((per_parameter > 0.79) & (per_parameter < 1.21))
     assert abs(np.mean(sigma0) - 1) < 0.01

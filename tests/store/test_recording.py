@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recordings import read_rows, write_rows
 from tests.store.small import assert_same_epochs, write_recording
 from thermocald.epoch import Epoch
-from thermocald.errors import RecordingError
+from thermocald.errors import RecordingError, TestFieldError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.recording import observation_file, table
@@ -56,6 +57,15 @@ def test_names_and_keys_of_any_kind_are_kept(tmp_path, head):
         assert (read.names, read.kinds, read.codes) == (field.names, field.kinds, field.codes)
         assert np.array_equal(read.points, field.points)
         assert np.array_equal(read.sigmas, field.sigmas)
+    write_testfield(tmp_path / "f.csv", replace(field, scale=field.points / 1e4))
+    read = read_testfield(tmp_path / "f.csv")
+    assert read.sigmas == pytest.approx(field.sigmas)
+    assert np.array_equal(read.scale, field.points / 1e4)
+    rows = read_rows(tmp_path / "f.csv")
+    assert float(rows[0]["sX"]) == pytest.approx(np.hypot(0.1, read.scale[0, 0]))
+    write_rows(tmp_path / "f.csv", [row | {"sX": "0.01"} for row in rows])
+    with pytest.raises(TestFieldError, match=r"line 2, column scaleX: must not exceed"):
+        read_testfield(tmp_path / "f.csv")
 
 
 def rewrite(path, change) -> None:

@@ -149,14 +149,16 @@ def field_of_codes(
         ring_code.write(14 if "-" in name else 12, int(name.rpartition("-")[2].lstrip("R")))
         for name in network.names
     ]
-    return TestField.build(network.names, network.points, network.sigmas, diameters, codes=codes)
+    built = TestField.build(network.names, network.points, 0.0, diameters, codes=codes)
+    return surveyed_field(network, built)
 
 
 def surveyed_field(network: Network, template: TestField) -> TestField:
     """Return the network's targets as a field: the template's with surveyed points and sigmas."""
     order = np.argsort([template.index[name] for name in network.names])
     part = template.subset([template.index[network.names[i]] for i in order])
-    return replace(part, points=network.points[order], sigmas=network.sigmas[order])
+    shape, scale = network.shape_and_scale()
+    return replace(part, points=network.points[order], sigmas=shape[order], scale=scale[order])
 
 
 _PASSES = 2
@@ -221,6 +223,7 @@ class Survey(Result):
         """Return the lines that `testfield survey` prints."""
         n = self.network
         mean = (n.sigmas**2).mean(axis=0) ** 0.5
+        accuracy = float(f"{1 / n.relative_accuracy:.2g}")
         return [
             (
                 f"{len(n.names)} targets from {len(n.stations)} photographs, sigma0 "
@@ -230,7 +233,7 @@ class Survey(Result):
             (
                 f"  mean standard deviations {mean[0]:.4f}, {mean[1]:.4f}, {mean[2]:.4f} mm in X, "
                 f"Y, Z; the scale alone gives {n.sd_scale * n.extent / 2:.4f} mm at the edge, the "
-                f"shape is accurate to 1:{1 / n.relative_accuracy:.0f} of the field"
+                f"shape is accurate to 1:{accuracy:.0f} of the field"
             ),
             f"  datum: {n.datum}",
             *(f"  left out: {name}: {reason}" for name, reason in n.unused.items()),

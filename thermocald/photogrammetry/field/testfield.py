@@ -42,7 +42,9 @@ class TestField:
     """A test field's targets: names, coordinates with standard deviations, and appearance.
 
     names: n unique strings; points (n, 3) mm; sigmas (n, 3) mm; diameters (n,) mm, NaN for targets
-    without one; kinds, codes: n strings as defined in CONVENTIONS §3; a code may be empty.
+    without one; kinds, codes: n strings as defined in CONVENTIONS §3; a code may be empty; scale
+    (n, 3) mm: what one standard deviation of the field's scale changes, None if unknown. The sigmas
+    are without it: the scale is common to all targets, and does not affect a camera.
     """
 
     __test__ = False  # pytest would collect a class of this name
@@ -53,6 +55,7 @@ class TestField:
     diameters: Array
     kinds: tuple[str, ...]
     codes: tuple[str, ...]
+    scale: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -149,7 +152,10 @@ class TestField:
         names, kinds, codes = (
             tuple(column[i] for i in r) for column in (self.names, self.kinds, self.codes)
         )
-        return TestField(names, self.points[r], self.sigmas[r], self.diameters[r], kinds, codes)
+        scale = None if self.scale is None else self.scale[r]
+        return TestField(
+            names, self.points[r], self.sigmas[r], self.diameters[r], kinds, codes, scale
+        )
 
 
 def same_targets(one: TestField, other: TestField) -> bool:

@@ -116,10 +116,22 @@ class Network:
     @property
     def relative_accuracy(self) -> float:
         """Mean standard deviation of a coordinate over the extent, without that of the scale."""
-        centred = self.points - self.points.mean(axis=0)
-        of_scale = self.sd_scale**2 * float(np.mean(centred**2))
-        shape = np.diag(self.covariance).mean() - of_scale
-        return float(np.sqrt(max(shape, 0.0)) / self.extent)
+        return float(np.sqrt(np.mean(self.shape_and_scale()[0] ** 2)) / self.extent)
+
+    def shape_and_scale(self) -> tuple[Array, Array]:
+        """Return the standard deviations (m, 3) mm of the shape alone, and what one standard
+        deviation of the scale adds to the coordinates (m, 3) mm.
+
+        Source: S-transformation to a datum with the scale among its inner constraints (Baarda
+        1973).
+        """
+        along = (self.points - self.points.mean(axis=0)).ravel()
+        along /= np.linalg.norm(along)
+        Qu = self.covariance @ along
+        of_scale = float(along @ Qu)
+        shape = np.diag(self.covariance) - 2.0 * along * Qu + along**2 * of_scale
+        scale = along * np.sqrt(of_scale)
+        return np.sqrt(shape.clip(0.0)).reshape(-1, 3), scale.reshape(-1, 3)
 
 
 MIN_PHOTOS = 3

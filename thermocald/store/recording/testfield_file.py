@@ -6,6 +6,7 @@ These are Kalibr, OpenCV, calib.io, and lists of ring-coded targets.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +29,8 @@ _LARGEST_MM = 1e9  # a thousand kilometres
 _SIGMAS_MM = (1e-9, 1e4)
 _NUMBERS = ("X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 _REQUIRED = ("target", *_NUMBERS)
+_SCALE = ("scaleX", "scaleY", "scaleZ")
+"""Shares in sX, sY, sZ of the scale that all targets have in common, with their signs."""
 
 # Too small for a camera to be calibrated with; a field given in metres is (a room: 6 "mm").
 _SMALLEST_FIELD_MM = 25.0
@@ -81,8 +84,9 @@ def parse_testfield(text: str, path: Path | str) -> TestField:
 
 def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
     given = [name for name in ("kind", "code") if name in table.columns]
+    shares = _SCALE if set(_SCALE) <= set(table.columns) else ()
     found = table.read(
-        (), [n for n in _NUMBERS if n != "diameter"], ["diameter"], ["target", *given]
+        (), [*(n for n in _NUMBERS if n != "diameter"), *shares], ["diameter"], ["target", *given]
     )
     names = [text.strip() for text in found["target"]]
     first: dict[str, int] = {}
@@ -119,11 +123,16 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
         )
     if not names and not may_be_empty:
         raise TestFieldError(f"{table.title}: holds no targets")
-    return TestField.build(
-        names, np.array([found[name] for name in "XYZ"]).T,
-        np.array([found[name] for name in ("sX", "sY", "sZ")]).T, found["diameter"].tolist(),
-        kinds, codes,
-    )  # fmt: skip
+    for share in shares:
+        larger = abs(found[share]) > found[share.replace("scale", "s")]
+        table.check(share, larger, "must not exceed the standard deviation of which it is a share")
+    points, sigmas = (np.array([found[s + axis] for axis in "XYZ"]).T for s in ("", "s"))
+    diameters = found["diameter"].tolist()
+    if not shares:
+        return TestField.build(names, points, sigmas, diameters, kinds, codes)
+    scale = np.array([found[name] for name in shares]).T
+    shape = np.sqrt(sigmas**2 - scale**2)
+    return replace(TestField.build(names, points, shape, diameters, kinds, codes), scale=scale)
 
 
 def require_millimetres(
@@ -149,12 +158,16 @@ def require_millimetres(
 
 def testfield_csv(field: TestField) -> str:
     """Return a test field as the text of `testfield.csv`, with all digits of its numbers."""
-    numbers = (*field.points.T, np.array(field.diameters, dtype=float), *field.sigmas.T)
+    scale = np.zeros((len(field), 3)) if field.scale is None else field.scale
+    sigmas = np.hypot(field.sigmas, scale)
+    numbers = (*field.points.T, np.array(field.diameters, dtype=float), *sigmas.T)
     columns: Columns = {"target": field.names, **dict(zip(_NUMBERS, numbers, strict=True))}
     if any(field.codes) or any(kind != KINDS[0] for kind in field.kinds):
         columns["kind"] = field.kinds
     if any(field.codes):
         columns["code"] = field.codes
+    if field.scale is not None:
+        columns |= dict(zip(_SCALE, scale.T, strict=True))
     return "".join(csv_text([columns]))
 
 

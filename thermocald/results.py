@@ -232,7 +232,8 @@ class Calibration(Photographs, Result):
         """Return what `thermocald calibrate` prints."""
         if self.status == "ok":
             lines = [
-                f"calibrated from {len(self.poses)} of {self.n_photographs} photographs: sigma0 "
+                f"calibrated from {len(self.poses)} of "
+                f"{counted(self.n_photographs, 'photograph')}: sigma0 "
                 f"{self.sigma0:.2f}, redundancy {self.redundancy}"
                 + (f"; {CAUSES_OF_SIGMA0}" if self.sigma0 > 1.0 + MATERIAL else "")
             ]
@@ -246,7 +247,7 @@ class Calibration(Photographs, Result):
         else:
             lines = [f"not calibrated: {self.reason}"]
         for p in self.photographs:
-            line = f"{p.path}: {p.status}, {p.n_targets} targets"
+            line = f"{p.path}: {p.status}, {counted(p.n_targets, 'target')}"
             if p.exterior is not None:
                 line += f", {plain(p.rms_px, 'px', 2)}, at {p.place} mm"
             lines.append(line + (f": {p.reason}" if p.reason else ""))

@@ -12,6 +12,7 @@ from thermocald.cli import options as opt
 from thermocald.cli.commands import expert
 from thermocald.cli.common import progress, say, show, write_json
 from thermocald.errors import RecordingError, UsageError
+from thermocald.numbers import counted
 from thermocald.result import document_of
 
 
@@ -76,7 +77,7 @@ def import_(
         "channels": list(found.temperatures), "notes": notes,
         "camera": {**document_of(spec.sensor), "principal_distance": spec.principal_distance},
     }  # fmt: skip
-    summary = f"{out}: {len(found)} epochs; next: thermocald replay {out}"
+    summary = f"{out}: {counted(len(found), 'epoch')}; next: thermocald replay {out}"
     show(document, json, "nothing was written (--dry-run)" if dry_run else summary)
 
 

@@ -162,8 +162,8 @@ def _examine_recording(path: Path) -> dict[str, Any]:
     sort = "a doubtful" if doubts else "a valid"
     lines = [
         f"{path}: {sort} recording of camera {recording.camera.name}, series {recording.series}",
-        f"  {len(columns)} epochs, {frames} frames, {len(recording.testfield)} targets",
-        *(f"  {name}: {n} of {len(columns)} readings" for name, n in readings.items()),
+        f"  {counted(len(columns), 'epoch')}, {frames} frames, {len(recording.testfield)} targets",
+        *(f"  {name}: {n} of {counted(len(columns), 'reading')}" for name, n in readings.items()),
     ]
     if seen:
         lines.append(f"  {np.median(seen):.0f} targets an epoch (median), {min(seen)} at least")
@@ -193,7 +193,8 @@ def calibration_doubts(recording: Recording) -> list[str]:
     if not good.any():
         weak = all(a.status == "weak_geometry" for a in tried)
         by_itself = " by itself" if weak else ""
-        return [f"none of {len(tried)} epochs can be calibrated{by_itself}: {tried[0].reason}"]
+        none = f"none of {counted(len(tried), 'epoch')} can be calibrated"
+        return [f"{none}{by_itself}: {tried[0].reason}"]
     found = np.array([a.values for a in tried if a.ok])
     c, x0, y0 = np.median(found[:, :3], axis=0).tolist()
     of_camera = interior_doubts(recording.camera, c, x0, y0)

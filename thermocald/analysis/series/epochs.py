@@ -343,10 +343,10 @@ class Epochs(Result):
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
         out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]
         if still and still["epochs_that_moved"]:
-            moved, bound = still["epochs_that_moved"], f"bound {still['bound']:.0f}"
             out.append(
-                f"the camera did not stand still in {moved} epochs (chi-square "
-                f"{still['largest_chi2']:.0f}, {bound}): use --exterior per_epoch"
+                f"the camera did not stand still in {counted(still['epochs_that_moved'], 'epoch')} "
+                f"(chi-square {still['largest_chi2']:.0f}, bound {still['bound']:.0f}): "
+                "use --exterior per_epoch"
             )
         return out
 

@@ -319,8 +319,8 @@ def read_series(
         f"photographs: {len(times)}, {placed[0].width} × {placed[0].height} px, {span}",
         *notes, *logged.notes,
         f"log: {iso(logged.times[0])} to {iso(logged.times[-1])}, every {logged.step:.4g} s",
-        (f"temperature ({reference}): known for {known.sum()} of {len(known)} photographs, "
-         f"{temperatures}"),
+        (f"temperature ({reference}): known for {known.sum()} of "
+         f"{counted(len(known), 'photograph')}, {temperatures}"),
     ]  # fmt: skip
     for i in sorted({0, len(times) // 2, len(times) - 1}):
         reading = f"{at_frame[i]:.3f} °C" if known[i] else "no temperature"

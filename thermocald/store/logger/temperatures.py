@@ -123,7 +123,7 @@ def read_log(
         times, channels, held = _hold_readings(times, channels, labels)
         notes += held
     notes = [
-        f"log: {len(times)} rows, {file.description}",
+        f"log: {counted(len(times), 'row')}, {file.description}",
         f"log: time from {quoted(time_names)}; temperatures from {quoted(channels)}"
         + ("" if options.temperatures else " (guessed; set --temperature-column to change)"),
         *order_notes, *notes, *table.left_out(),

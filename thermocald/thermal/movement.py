@@ -168,7 +168,9 @@ def weight_leaps_down(fitter: HypothesisFitter, fit: Fit, W: Array) -> list[Redu
         limit = criteria.LEAP * float(np.median(leap[e.n > 0]))
         factor = np.where(leap > limit, limit / np.maximum(leap, 1e-9), 1.0)
         if np.any(factor != 1.0):
-            e = replace(e.weighted(factor), weights=e.weights * factor[:, None, None])
+            sizes = 1 if e.blocks is None else np.diff(e.blocks.first, append=len(e.weights))
+            of_epochs = np.repeat(factor, sizes)[:, None, None]
+            e = replace(e.weighted(factor), weights=e.weights * of_epochs)
         out.append(e)
     return out
 

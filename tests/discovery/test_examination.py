@@ -21,6 +21,7 @@ from thermocald.discovery.validation import compare_with_surrogates
 from thermocald.output.discovery import report_html
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.movement import find_combinations, weight_leaps_down
 from thermocald.thermal.reduce import reduce_series, reduce_together
 from thermocald.thermal.series import in_blocks
 
@@ -119,6 +120,21 @@ def test_a_gross_error_near_the_end_is_no_target_that_moved(evidence_of):
         residuals[epochs, 30] += 1.0
         groups, _ = find_displaced_targets(replace(evidence, residuals=residuals))
         assert [g.rows.tolist() for g in groups] == [[30]] * moved
+
+
+def test_a_block_that_leaps_counts_less_with_its_epochs(evidence_of):
+    """As where somebody touches the mount."""
+    (evidence,), _ = evidence_of(seed=26, epochs=72, with_m2=False)
+    blocks = in_blocks(evidence, rows=24)
+    values = blocks.values.copy()
+    values[10, 1] += 20.0  # px of x0
+    fitter = HypothesisFitter([blocks.with_values(values)])
+    (calmed,) = weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
+    share = calmed.weights.sum(axis=(1, 2)) / evidence.weights.sum(axis=(1, 2))
+    of_blocks = share.reshape(24, 3)
+    assert np.ptp(of_blocks, axis=1).max() < 1e-9
+    assert of_blocks[10, 0] < 0.1
+    assert np.median(of_blocks) == 1.0
 
 
 @pytest.mark.slow

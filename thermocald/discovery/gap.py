@@ -131,7 +131,8 @@ def measure_gap(
     excess, beyond = (bridge.excess, bridge.movement) if bridge else (0.0, 0.0)
     total = within + k * max(fit.chi2_of(series) - excess, 0.0)
     image = within + k * image_chi2(e, fit, series, beyond)
-    moved, count = _measure_moved(e, x.displaced[series], "targets" in in_model)
+    whole = e if e.blocks is None else x.unblocked[series]
+    moved, count = _measure_moved(whole, x.displaced[series], "targets" in in_model)
     total, image, free = total + moved, image + moved, free + count
     chi2 = total / free
     if x.noise_growth and "noise" in x.image_places[known:]:

@@ -23,7 +23,7 @@ from thermocald.physics.catalogue import drive, drive_matrix, driven_history
 from thermocald.physics.model import BASES, Distortion, choose_basis
 from thermocald.thermal.hypothesis import BASE, Block, Fit, Term
 from thermocald.thermal.likelihood import Weighting, prepare
-from thermocald.thermal.series import ReducedSeries, cosines, unit_directions
+from thermocald.thermal.series import Carried, ReducedSeries, cosines, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -72,24 +72,24 @@ class HypothesisFitter:
         value: T = cache[key]
         return value
 
-    def _states(self, series: int, channel: str, operator: csr_array) -> Array:
-        """Return ∂ trajectory / ∂ independent errors (E, states); equal operators share one."""
+    def _carry(self, series: int, channel: str, operator: csr_array) -> Carried:
+        """Return what readings do to a trajectory; equal operators share one."""
         operator.sort_indices()
         key = (series, channel, operator.data.tobytes(), operator.indices.tobytes())
-        return self._once("states", key, lambda: self.series[series].states(channel, operator))
+        return self._once("states", key, lambda: self.series[series].carry(channel, operator))
 
     # -- trajectories ---------------------------------------------------------------------------
 
-    def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
-        """Return the trajectory (E,) of the linear terms, and its operator (E, states)."""
+    def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Carried]:
+        """Return the trajectory (E,) of the linear terms, and what readings do to it."""
         drives = _drives(terms, series)
 
-        def compute() -> tuple[Array, Array]:
+        def compute() -> tuple[Array, Carried]:
             reduced = self.series[series]
             operator = drive_matrix(reduced.history, drives)
             assert operator is not None
-            states = self._states(series, reduced.history.reference, operator)
-            return self.drive_trajectory(terms, series), states
+            carried = self._carry(series, reduced.history.reference, operator)
+            return self.drive_trajectory(terms, series), carried
 
         key = (series, tuple((name, tuple(values.items())) for name, values in drives))
         return self._once("drive", key, compute)
@@ -101,10 +101,10 @@ class HypothesisFitter:
 
     def trajectories(
         self, term: Term, series: int, terms: Sequence[Term] = (), operators: bool = True
-    ) -> tuple[Array, list[tuple[Array, str]]]:
-        """Return a signal's trajectories (E, m), and operator (E, states) of each channel it reads.
+    ) -> tuple[Array, list[tuple[Carried, str]]]:
+        """Return a signal's trajectories (E, m), and what readings of each channel do to it.
 
-        There are no operators if there are several trajectories, if the readings' errors do not
+        The latter is missing if there are several trajectories, if the readings' errors do not
         reach the signal, or without `operators`.
         """
         effect = catalogue.get(term.effect)
@@ -119,7 +119,7 @@ class HypothesisFitter:
             operators,
         )  # fmt: skip
 
-        def compute() -> tuple[Array, list[tuple[Array, str]]]:
+        def compute() -> tuple[Array, list[tuple[Carried, str]]]:
             history = evidence.history
             before: csr_array | None = None
             if through:
@@ -127,22 +127,22 @@ class HypothesisFitter:
                 before = drive_matrix(history, chain, at_readings=True)
                 history = driven_history(history, chain)
             trajectory = evidence.averaged(effect.signal(history, **values))
-            found: list[tuple[Array, str]] = []
+            found: list[tuple[Carried, str]] = []
             if operators and trajectory.shape[1] == 1:
                 sparse = effect.sensitivity(history, **values)
                 by_channel = effect.further_sensitivities(evidence.history, **values)
                 if sparse.nnz:
                     whole = sparse if before is None else sparse @ before
                     by_channel = {effect.channel(history, **values): whole, **by_channel}
-                found = [(self._states(series, c, m), c) for c, m in by_channel.items()]
+                found = [(self._carry(series, c, m), c) for c, m in by_channel.items()]
             return trajectory, found
 
         return self._once("trajectory", key, compute, 600)
 
     def list_operators(
         self, terms: Sequence[Term], blocks: Sequence[Block], series: int
-    ) -> Iterator[tuple[Block, Array, str]]:
-        """Yield each block with the operators and channels of the readings' errors."""
+    ) -> Iterator[tuple[Block, Carried, str]]:
+        """Yield each block with what the readings of each channel do to it."""
         for block in blocks:
             if block.series not in (None, series) or block.trajectories > 1:
                 continue
@@ -150,8 +150,8 @@ class HypothesisFitter:
                 reference = self.series[series].history.reference
                 yield block, self.drive(terms, series)[1], reference
                 continue
-            for operator, channel in self.trajectories(terms[block.term], series, terms)[1]:
-                yield block, operator, channel
+            for reach, channel in self.trajectories(terms[block.term], series, terms)[1]:
+                yield block, reach, channel
 
     # -- fitting ---------------------------------------------------------------------------
 
@@ -199,16 +199,17 @@ class HypothesisFitter:
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
         """Return the weighting of a series with the covariance for some coefficients."""
-        carried: dict[int, tuple[Array, Array, str]] = {}  # each operator once, directions added
+        carried: dict[int, tuple[Array, Carried, str]] = {}  # each once, directions added
         unresolved: dict[int, tuple[Array, Array]] = {}
-        for block, operator, channel in self.list_operators(terms, blocks, series):
+        for block, reach, channel in self.list_operators(terms, blocks, series):
             (d,) = block.directions(x)
             if d.any():
-                before, *_ = carried.get(id(operator), (0.0,))
-                carried[id(operator)] = (d + before, operator, channel)
+                before, *_ = carried.get(id(reach), (0.0,))
+                carried[id(reach)] = (d + before, reach, channel)
                 unresolved[block.start] = d, self._unresolved(terms, block, series)
-        both = list(carried.values()), list(unresolved.values())
-        return prepare(self.series[series], *both, self.thermometer_factor)
+        factor = self.thermometer_factor
+        bends = [*unresolved.values(), *((d, factor * c.sd) for d, c, _ in carried.values())]
+        return prepare(self.series[series], list(carried.values()), bends, factor)
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array:
         """Return the sd (E,) of a trajectory beyond the readings' errors.
@@ -236,7 +237,8 @@ class HypothesisFitter:
         if len(delays) == len(drives):  # a memory smooths what happens between two readings
             if evidence.slope_jumps is None:
                 return nothing
-            return instrument.between(evidence.times, evidence.slope_jumps, sum(delays))
+            between = instrument.between(history.times, evidence.slope_jumps, sum(delays))
+            return evidence.averaged(between)
         before = driven_history(history, drives[:-1])
         name, values = drives[-1]
         turns = catalogue.get(name).turns(before, **values)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.thermal.series import ReducedSeries
+    from thermocald.thermal.series import Carried, ReducedSeries
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,16 +239,16 @@ class Weighting:
 
 def prepare(
     evidence: ReducedSeries,
-    carried: list[tuple[Array, Array, str]],
+    carried: list[tuple[Array, Carried, str]],
     bends: list[tuple[Array, Array]],
     thermometer_factor: float,
 ) -> Weighting:
     """Return the weighting of a series by image noise, movement, and thermometers' errors.
 
     carried: of each trajectory that a thermometer's error reaches its direction (P,), px per unit,
-    ∂ trajectory / ∂ independent errors (E, R) (`ReducedSeries.states`), and the channel; bends: of
-    each trajectory its direction (P,) and its sd (E,), in its unit, where the temperature bends
-    between two readings; thermometer_factor: multiplies the standard deviations of the readings.
+    what readings do to it, and the channel; bends: of each trajectory its direction (P,) and its sd
+    (E,), in its unit, beyond the independent errors, such as where the temperature bends between
+    two readings; thermometer_factor: multiplies the standard deviations of the readings.
     """
     from scipy.linalg import cholesky
 
@@ -277,9 +277,9 @@ def prepare(
     whole = np.concatenate(sds)
     # the readings' deviation from the smooth trajectory, propagated to the camera
     shift = np.zeros((E, P))
-    for direction, operator, channel in carried:
-        shift += np.outer(operator @ evidence.state_deviation(channel), direction)
-        errors.append((operator, places[channel], direction, sums.N @ direction))
+    for direction, reach, channel in carried:
+        shift += np.outer(reach.shift, direction)
+        errors.append((reach.states, places[channel], direction, sums.N @ direction))
     moved = np.einsum("epq,eq->ep", sums.N, shift)
     yy = sums.yy - 2 * float(np.sum(shift * sums.b)) + float(np.sum(shift * moved))
     b = sums.b - moved

@@ -261,8 +261,8 @@ def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
     )
     white = 6.0 / e.correlation
     carried = np.zeros((W.shape[1], W.shape[1]))
-    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
-        jump = np.diff(operator, 2, axis=0) * e.state_sd(channel)
+    for block, reach, channel in fitter.list_operators(fit.terms, fit.blocks, series):
+        jump = np.diff(reach.states, 2, axis=0) * e.state_sd(channel)
         share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         carried += np.mean(np.sum(jump**2, axis=1)) * np.outer(share, share)
     usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
@@ -351,11 +351,11 @@ def _measure_fast(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
     fast = waves(e.times, len(e.times) - 1)[:, _count_waves(e) :].T
     z = fast @ (_subtract_fit(fitter, fit, series) @ W)
     M = z.T @ z / len(fast)
-    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
-        carried = fast @ operator
+    for block, reach, channel in fitter.list_operators(fit.terms, fit.blocks, series):
+        carried = fast @ reach.states
         noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
         # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
-        taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
+        taken = np.mean((fast @ reach.shift) ** 2)
         left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
         along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         M -= left * np.outer(along, along)

@@ -274,7 +274,7 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
         old = e.thermometers[name]
         precision = np.einsum("p,epq,q->e", direction, e.N, direction)
         left = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(s))
-        operator, sd = fitter.drive(fit.terms, s)[1], e.state_sd(name)
+        operator, sd = fitter.drive(fit.terms, s)[1].states, e.state_sd(name)
         # normal equations of the states and one level
         A = np.column_stack([operator, np.ones(len(operator))])
         normal = A.T @ (precision[:, None] * A)

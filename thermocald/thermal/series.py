@@ -15,7 +15,7 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -98,6 +98,18 @@ class Blocks:
     pool: csr_array
     within_free: float
     first: NDArray[np.int64]
+
+
+class Carried(NamedTuple):
+    """What the readings of a thermometer do to a trajectory.
+
+    states (E, S): its derivatives by independent errors; shift (E,): what the readings' deviation
+    from a smooth trajectory adds; sd (E,): of the errors that the states of blocks do not have.
+    """
+
+    states: Array
+    shift: Array
+    sd: Array
 
 
 _OFTEN = 0.9  # share of the epochs with a target from which its offset needs no unknown
@@ -362,13 +374,18 @@ class ReducedSeries:
         every = self.source.numbers
         return every if self.blocks is None else every[self.blocks.first]
 
-    def states(self, channel: str, operator: csr_array) -> Array:
-        """Return ∂ trajectory / ∂ independent errors, dense, from ∂ trajectory / ∂ knots (E, K)."""
+    def carry(self, channel: str, operator: csr_array) -> Carried:
+        """Return what readings do to a trajectory, from ∂ trajectory / ∂ knots (E, K)."""
         instrument = self.thermometers[channel]
         result = operator @ instrument.mixing
         if self.blocks is None:
-            return np.asarray(result[:, instrument.erring].toarray())
-        return np.asarray((self.blocks.average @ result @ self.blocks.pool).toarray())
+            states = np.asarray(result[:, instrument.erring].toarray())
+            return Carried(states, states @ self.state_deviation(channel), np.zeros(len(states)))
+        result = self.blocks.average @ result
+        states = np.asarray((result @ self.blocks.pool).toarray())
+        whole = result.power(2) @ instrument.sd**2
+        unshared = whole - states**2 @ self.state_sd(channel) ** 2
+        return Carried(states, result @ instrument.deviation, np.sqrt(unshared.clip(0.0)))
 
     def state_sd(self, channel: str) -> Array:
         """Return the standard deviations of the independent errors, K."""
@@ -551,5 +568,4 @@ def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
             hidden, patterns=np.add.reduceat(hidden.patterns, first, axis=1),
             right=np.add.reduceat(hidden.right, first, axis=1),
         ),
-        slope_jumps=None,
     )  # fmt: skip

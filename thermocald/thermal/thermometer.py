@@ -102,8 +102,11 @@ class Thermometer:
         width = np.diff(t)[i]
         share = np.clip((times - late - t[i]) / width, 0.0, 1.0)
         known = 0.05 * size[i] * width * np.abs(np.sin(2.0 * np.pi * share))
-        near = np.abs(times[:, None] - times[None]) <= np.median(width)
-        hidden = 0.125 * width * np.max(np.where(near, seen[None], 0.0), axis=1)
+        reach = np.median(width)
+        first = np.searchsorted(times, times - reach)
+        last = np.searchsorted(times, times + reach, side="right")
+        windows = np.ravel([first, last], order="F")
+        hidden = 0.125 * width * np.maximum.reduceat(np.append(seen, 0.0), windows)[::2]
         return np.asarray(np.where(sharp[i], known, hidden))
 
     def slope_jump(self, times: Array) -> Array:

@@ -371,7 +371,8 @@ class ThermalCamera(Result):
             values.append(found)
             covariance.append(Q)
         Q = np.concatenate(covariance)
-        Q[:, range(10), range(10)] += drift
+        of_each = Q[:, range(10), range(10)]  # of a difference from itself: 0 but for rounding
+        Q[:, range(10), range(10)] = np.maximum(of_each, 0.0) + drift
         return Along(
             self.model.sensor, instants, history.temperature(), np.concatenate(values), Q, outside,
             self.model.camera,

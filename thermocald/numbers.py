@@ -132,14 +132,17 @@ def typeset_powers(text: str) -> str:
 
 
 def with_sd(value: float, sd: float, unit: str = "") -> str:
-    """Write `6.959 ± 0.028 mm`, with a power of ten outside 0.001 to 10000; NaN as a dash."""
+    """Write `6.959 ± 0.028 mm`; NaN as a dash.
+
+    With a power of ten below 0.001, and from 10000 if whole numbers would have idle digits.
+    """
     if not math.isfinite(value):
         return "–"
     if not math.isfinite(sd) or sd <= 0:
         return plain(value, unit)
     largest = max(abs(value), sd)
     exponent = math.floor(math.log10(largest))
-    scale = 0 if -3 <= exponent < 4 else exponent
+    scale = 0 if exponent >= -3 and (exponent < 4 or sd < 100) else exponent
     v, s = value / 10**scale, sd / 10**scale
     decimals = max(0, 1 - math.floor(math.log10(s)))
     body = f"{v:z.{decimals}f} ± {s:.{decimals}f}".replace("-", _MINUS)

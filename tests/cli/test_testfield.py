@@ -76,8 +76,9 @@ def test_survey_writes_the_field_and_everything_about_it(sheet, tmp_path):
     # the ruler's error is common to all targets: a camera's calibration reads the shape's
     stated = np.array([t["sd_X"] for t in sorted(told["targets"], key=lambda t: t["target"])])
     assert surveyed.scale is not None
-    total = np.hypot(surveyed.sigmas, surveyed.scale)[np.argsort(surveyed.names), 0]
-    assert total == pytest.approx(stated, rel=0.03)
+    order = np.argsort(surveyed.names)
+    assert surveyed.sigmas[order, 0] == pytest.approx(stated, rel=0.03)
+    assert surveyed.shape_sigmas.mean() < surveyed.sigmas.mean()
     assert (len(told["targets"]), len(told["stations"])) == (len(surveyed), 8)
     first = told["targets"][0]
     assert np.sqrt(np.diag(first["covariance"])) == pytest.approx(

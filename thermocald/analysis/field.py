@@ -97,7 +97,7 @@ class FieldCheck:
         Proposals that reduce no standard deviation by a seventh are left out. That a field is one
         plane comes first: targets in front of it cannot be printed on a sheet.
         """
-        points, sigmas = self.field.points[self.visible], self.field.sigmas[self.visible]
+        points, sigmas = self.field.points[self.visible], self.field.shape_sigmas[self.visible]
         typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
         now, pitch = self.precision["epoch"], self.camera.sensor.pixel_pitch
         proposals: list[tuple[float, str]] = []
@@ -262,7 +262,7 @@ def check_field(
         raise GeometryError(
             f"{len(rows)} of {len(field)} targets are visible from there: {'; '.join(reasons)}"
         )
-    points, sigmas = field.points[rows], field.sigmas[rows]
+    points, sigmas = field.points[rows], field.shape_sigmas[rows]
     image = camera.project(station, points)
     # the reasons for which `adjust` would give an image of these points no result
     values = np.concatenate([camera.interior.as_array(), station.as_array()])
@@ -407,7 +407,7 @@ def _remarks(check: FieldCheck) -> list[str]:
         notes.append(f"{outside} targets are outside of the image: step back, or look elsewhere")
     level, epoch = check.precision["level"][:3], check.precision["epoch"][:3]
     if np.all(np.isfinite(level)) and np.any(level > 2 * epoch):
-        sd = np.median(check.field.sigmas[check.visible])
+        sd = np.median(check.field.shape_sigmas[check.visible])
         notes.append(
             f"the coordinates of the targets, ± {sd:.2g} mm, limit the precision of one image (not "
             "that of changes in a series): survey the field (thermocald testfield survey), or a "

@@ -158,7 +158,8 @@ def surveyed_field(network: Network, template: TestField) -> TestField:
     order = np.argsort([template.index[name] for name in network.names])
     part = template.subset([template.index[network.names[i]] for i in order])
     shape, scale = network.shape_and_scale()
-    return replace(part, points=network.points[order], sigmas=shape[order], scale=scale[order])
+    sigmas = np.hypot(shape, scale)[order]
+    return replace(part, points=network.points[order], sigmas=sigmas, scale=scale[order])
 
 
 _PASSES = 2

@@ -58,7 +58,7 @@ class FieldErrors:
     """
 
     def __init__(self, sensor: Sensor, testfield: TestField) -> None:
-        self.variances: Array = np.square(testfield.sigmas).ravel()
+        self.variances: Array = np.square(testfield.shape_sigmas).ravel()
         self.level = 1.0
         self._sensor = sensor
         self._field = testfield
@@ -82,7 +82,7 @@ class FieldErrors:
         at = self._linearised(adjustment.values)
         A, B = at.A[rows], np.sqrt(field_variance) * at.B[rows]
         image = as_matrices(point_covariances(used, None, None))
-        total = as_matrices(point_covariances(used, B, self._field.sigmas[rows] ** 2))
+        total = as_matrices(point_covariances(used, B, self._field.shape_sigmas[rows] ** 2))
         A = A[:, :, free]
         WA = np.linalg.solve(total, A)
         G = np.einsum("uv,niv->nui", scaled_inverse(np.einsum("niu,niv->uv", A, WA)), WA)

@@ -140,7 +140,7 @@ def estimate_level(
         eops = [e + d for e, d in zip(eops, step[n:].reshape(-1, 6), strict=True)]
         if step @ M @ step < 1e-4:  # a hundredth of a standard deviation
             break
-    moved = inverse[:n] @ (lever * field.sigmas.ravel())
+    moved = inverse[:n] @ (lever * field.shape_sigmas.ravel())
     of_field = moved @ moved.T
     if interior:
         stated = series[0].source.interior or replace(models[0].interior, C1=0.0, C2=0.0)

@@ -137,7 +137,7 @@ class Problem:
             rows = (vectors / np.sqrt(np.maximum(share, _SINGULAR))) / scale[:, None]
             weight[np.ix_(some, some)] = rows @ rows.T
         targets = observations.targets
-        of_targets = field.sigmas[targets] ** 2 if field.sigmas.any() else None
+        of_targets = field.shape_sigmas[targets] ** 2 if field.sigmas.any() else None
         places, value = field.points[targets], values[unknowns]
         return cls(sensor, places, observations, of_targets, unknowns, weight, value)
 

@@ -43,8 +43,7 @@ class TestField:
 
     names: n unique strings; points (n, 3) mm; sigmas (n, 3) mm; diameters (n,) mm, NaN for targets
     without one; kinds, codes: n strings as defined in CONVENTIONS §3; a code may be empty; scale
-    (n, 3) mm: what one standard deviation of the field's scale changes, None if unknown. The sigmas
-    are without it: the scale is common to all targets, and does not affect a camera.
+    (n, 3) mm: the part of the sigmas that is due to the field's scale, with signs, or None.
     """
 
     __test__ = False  # pytest would collect a class of this name
@@ -122,6 +121,12 @@ class TestField:
     def index(self) -> dict[str, int]:
         """The row of each target by its name."""
         return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def shape_sigmas(self) -> Array:
+        """Standard deviations (n, 3) mm without the scale's: it does not affect a camera."""
+        scale = 0.0 if self.scale is None else self.scale
+        return np.sqrt(np.maximum(self.sigmas**2 - np.square(scale), 0.0))
 
     @cached_property
     def circles(self) -> NDArray[np.bool_]:

@@ -107,7 +107,7 @@ def adjust_common_interior(
     seen = np.unique(np.concatenate([o.targets for o in photographs]))
     rays = ImageRays.collect(photographs)
     rays = replace(rays, target=np.searchsorted(seen, rays.target))
-    places, sigmas = testfield.points[seen], testfield.sigmas[seen]
+    places, sigmas = testfield.points[seen], testfield.shape_sigmas[seen]
     uncertain = (sigmas > 0).any(axis=1)
     weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
     known = KnownTargets(places, weights, uncertain)

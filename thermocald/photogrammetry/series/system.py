@@ -124,7 +124,7 @@ def _add_blocks(matrix: Array, blocks: Array) -> None:
 
 def offset_weights(field: TestField, at: Partials) -> Array:
     """Return the offsets' weights (T, 3) px⁻² from the sigmas of the object coordinates."""
-    variance = field.sigmas**2
+    variance = field.shape_sigmas**2
     tiny = 1e-12  # px²: a target without sigma has no offset
     xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
     yy = (at.B[:, 1] ** 2 * variance).sum(axis=1) + tiny

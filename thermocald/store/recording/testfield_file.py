@@ -127,12 +127,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
         larger = abs(found[share]) > found[share.replace("scale", "s")]
         table.check(share, larger, "must not exceed the standard deviation of which it is a share")
     points, sigmas = (np.array([found[s + axis] for axis in "XYZ"]).T for s in ("", "s"))
-    diameters = found["diameter"].tolist()
-    if not shares:
-        return TestField.build(names, points, sigmas, diameters, kinds, codes)
-    scale = np.array([found[name] for name in shares]).T
-    shape = np.sqrt(sigmas**2 - scale**2)
-    return replace(TestField.build(names, points, shape, diameters, kinds, codes), scale=scale)
+    field = TestField.build(names, points, sigmas, found["diameter"].tolist(), kinds, codes)
+    return replace(field, scale=np.array([found[s] for s in shares]).T) if shares else field
 
 
 def require_millimetres(
@@ -158,16 +154,14 @@ def require_millimetres(
 
 def testfield_csv(field: TestField) -> str:
     """Return a test field as the text of `testfield.csv`, with all digits of its numbers."""
-    scale = np.zeros((len(field), 3)) if field.scale is None else field.scale
-    sigmas = np.hypot(field.sigmas, scale)
-    numbers = (*field.points.T, np.array(field.diameters, dtype=float), *sigmas.T)
+    numbers = (*field.points.T, np.array(field.diameters, dtype=float), *field.sigmas.T)
     columns: Columns = {"target": field.names, **dict(zip(_NUMBERS, numbers, strict=True))}
     if any(field.codes) or any(kind != KINDS[0] for kind in field.kinds):
         columns["kind"] = field.kinds
     if any(field.codes):
         columns["code"] = field.codes
     if field.scale is not None:
-        columns |= dict(zip(_SCALE, scale.T, strict=True))
+        columns |= dict(zip(_SCALE, field.scale.T, strict=True))
     return "".join(csv_text([columns]))
 
 

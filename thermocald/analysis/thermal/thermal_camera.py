@@ -263,7 +263,7 @@ class ThermalCamera(Result):
                 f"{{{missing[0]!r}: …}}"
             )
         model, names = self.model, self.parameters
-        table, knees = steady_table(model, names, channels)
+        table, knees = steady_table(model, names, channels) if channels else self._table
         dT = T - model.T0
         basis = [1.0, dT, dT * dT]
         for knee in knees:
@@ -271,6 +271,10 @@ class ThermalCamera(Result):
         columns = table @ np.array(basis) + formula_columns(model, names, T, channels)
         value, J = columns[:, 0], columns[:, 1:]
         return model.carried(value), model.carried_derivatives(value, J, names)
+
+    @cached_property
+    def _table(self) -> tuple[Array, list[float]]:
+        return steady_table(self.model, self.parameters, {})
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

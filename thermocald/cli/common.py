@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,9 +35,11 @@ def say(text: str) -> None:
     may contain and a terminal would obey, are shown as codes.
     """
     text = re.sub(r"\S+", lambda word: files.shown(word[0]), printable(without_secrets(text)))
-    with suppress(BrokenPipeError):  # nobody reads it, which harms no result
+    try:
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
+    except BrokenPipeError:  # nobody reads it, which harms no result; nor what is left at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def printable(text: str) -> str:

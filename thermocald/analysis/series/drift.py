@@ -60,7 +60,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """
     found, ok = [], table.ok
     time = table.frame_time[ok]
-    slow = table.slow_between_ends
+    slow = np.diagonal(table.slow_between_ends)
     whole = table.adjustment if table.sampled is None else None
     # an epoch in which the mount was touched is as uncertain as many others together
     still = ~np.isin(np.flatnonzero(ok), whole.movement.touched if whole else ())

@@ -149,14 +149,15 @@ class Epochs(Result):
 
     @property
     def slow_between_ends(self) -> Array:
-        """The variances (16,) of last minus first by which slow errors exceed independent ones.
+        """The covariance (16, 16) of last minus first by which slow errors exceed independent ones.
 
         They have opposite signs in the first and the last epoch.
         """
-        course, variances = self.slow_errors
+        slow = () if self.adjustment is None else self.adjustment.slow
+        changes = np.reshape([own for _, own in slow], (-1, 16, 16))
         ends = np.flatnonzero(self.ok)[[0, -1]] if self.ok.any() else [0, 0]
-        first, last = course[:, ends].T
-        return np.asarray(-2.0 * (first * last) @ variances)
+        first, last = self.slow_errors[0][:, ends].T
+        return np.tensordot(-2.0 * first * last, changes, axes=1)
 
     @property
     def time(self) -> NDArray[np.datetime64]:

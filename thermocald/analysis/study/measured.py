@@ -204,11 +204,6 @@ def measured_series(
     choice, moved = "" if adjustment is None else adjustment.choice, count_moved(table.stillness)[0]
     if moved:
         choice += f"; but the camera did not stand still in {counted(moved, 'epoch')}"
-    slow = np.zeros((10, 10))
-    if adjustment is not None:  # errors of a course have opposite signs in the first and last epoch
-        ends = table.slow_errors[0][:, np.flatnonzero(table.ok)[[0, -1]]]
-        for (_, changes), (first, last) in zip(adjustment.slow, ends, strict=True):
-            slow -= 2.0 * first * last * changes[:10, :10]
     time_s, thermometers = table.frame_time[ok], []
     for name, channel in source.head.channels.items():
         read, readings = source.columns.readings_of(name)
@@ -224,6 +219,6 @@ def measured_series(
         correlations(covariances), exterior, without_result, float(time_s[0]),
         choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
-        slow=slow,
+        slow=table.slow_between_ends[:10, :10],
         c_known_to=float(np.nan_to_num(table.level_sd[0]) / np.median(table.values[ok, 0])),
     )  # fmt: skip

@@ -304,8 +304,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     def construct_whole(self, node: yaml.ScalarNode) -> int:
         if re.fullmatch(r"[+-]?0[0-9_]+", node.value):
             raise yaml.constructor.ConstructorError(
-                None, None, f"{node.value} is octal in YAML: write no 0 before it, or quote a text",
-                node.start_mark,
+                None, None, f"{node.value} is octal in YAML: write no 0 before it, a point for a "
+                "decimal comma, or quote a text", node.start_mark,
             )  # fmt: skip
         return int(self.construct_yaml_int(node))
 
@@ -341,6 +341,13 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     except (OSError, ValueError) as cause:
         what = "is not UTF-8 text" if isinstance(cause, UnicodeDecodeError) else cause
         raise error(f"{shown(path)}: cannot be read: {getattr(cause, 'strerror', what)}") from cause
+    return parse_yaml(text, path, error)
+
+
+def parse_yaml(
+    text: str, path: Path | str, error: type[ThermocaldError] = ConfigurationError
+) -> dict[str, Any]:
+    """Return the mapping in a YAML text; path: named by the errors, which are as in `read_yaml`."""
     try:
         if _is_too_deep(text):
             raise error(f"{path}: is nested deeper than {_DEEPEST} levels")

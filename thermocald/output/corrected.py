@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -241,7 +242,7 @@ class Correction(Result):
 
 
 def _require_other(written: Path, source: Path) -> None:
-    if written.exists() and source.exists() and written.samefile(source):
+    if os.path.exists(written) and os.path.exists(source) and written.samefile(source):
         raise UsageError(f"{written}: would be overwritten; give another --out")
 
 

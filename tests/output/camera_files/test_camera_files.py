@@ -223,6 +223,22 @@ def test_rational_model_is_imported_by_a_fit_that_states_its_residual(tmp_path):
     assert 0 < back.rms_px < back.largest_px < 1.0
 
 
+@pytest.mark.parametrize("suffix", ["xml", "json"])
+def test_all_files_of_opencv_are_read(tmp_path, suffix):
+    camera_files.write(_camera(), tmp_path / "a.yaml", "opencv", _covariance())
+    given = cv2.FileStorage(str(tmp_path / "a.yaml"), cv2.FILE_STORAGE_READ)
+    out = cv2.FileStorage(str(tmp_path / f"a.{suffix}"), cv2.FILE_STORAGE_WRITE)
+    out.write("calibration_time", "Mon")
+    for name in ("image_width", "image_height"):
+        out.write(name, int(given.getNode(name).real()))
+    for name in ("camera_matrix", "distortion_coefficients", "intrinsics_covariance"):
+        out.write(name, given.getNode(name).mat())
+    out.release()
+    back = camera_files.read(tmp_path / f"a.{suffix}", pixel_pitch=SENSOR.pixel_pitch)
+    assert back.model.interior.as_array() == pytest.approx(PLAIN.as_array(), rel=1e-9, abs=1e-13)
+    assert back.covariance is not None
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
@@ -343,7 +359,15 @@ def _own(**changes):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "not valid YAML"),
+        ("%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "its YAML, line 4"),
+        ("%YAML:1.0\n---\ncamera_matrix: [0,05]\n", "line 3, column 19: 05 .* for a decimal comma"),
+        ("cam0: {}\ncamera_model: x\ncam0: {}\n", "its YAML, line 3, column 1: key 'cam0' is dup"),
+        ("<opencv_storage><a/><camera_matrix/><a/></opencv_storage>", "<a> is duplicated"),
+        ("<calibration><f>944</f><cx>0</cx><f>950</f></calibration>", "<f> is duplicated"),
+        ("<calibration><f>944</f><skew>0.1</skew></calibration>", "<skew> cannot be read: only f"),
+        ("{'lensmodel': 1, 'imagersize': 1, 'lensmodel': 1}", "a key is duplicated"),
+        (_own(interior={"c": 0.1, "x0": True}), "interior.x0 is True, not a number"),
+        (_own().replace('"c"', '"c": 0.2, "c"'), "key 'c' is duplicated"),
         ("hello: 1\n", "not a camera file of any"),
         ("image_width: 10\ndistortion_model: equidistant\n", "equidistant"),
         ("cam0:\n  camera_model: omni\n", "omni"),
@@ -372,8 +396,9 @@ def _own(**changes):
         ("image_width: 10\ndistortion_model: []\n", "distortion_model"),
         ("{'lensmodel': [], 'imagersize': 1}", "lensmodel"),
         ("{[]: 'lensmodel imagersize'}", "Python's notation"),
-        ("%YAML:1.0\n---\ncamera_matrix: !!int ''\n", "not valid YAML"),
-        ("%YAML:1.0\n---\ncamera_matrix: !!timestamp x\n", "not valid YAML"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!int ''\n", "holds what is no YAML"),
+        ("""%YAML:1.0\n---\ncamera_matrix: [944, 0, 0, 0, 944, 0, 635, 359, 1]
+distortion_coefficients: []\n""", "row by row"),
         ("1 PINHOLE 100 100 -90 90 50 50\n", "principal distance of -90"),
         ("1 RADIAL 4000 3000 3500 2000 1500 -3 0\n", "folds back"),
         ("1 PINHOLE 100 0 90 90 50 50\n", "100 × 0"),
@@ -388,7 +413,7 @@ def _own(**changes):
          </calibration>""", r"\(1274, 360\) px lies outside"),
         ("""%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720
 camera_matrix: [944., 0., 635.5, 0., 944., 359.5, 0., 0., 1.]
-distortion_coefficients: {rows: 1, cols: 4, data: [-0,05, 0.1, 0.001, 0.0005]}
+distortion_coefficients: {rows: 1, cols: 4, data: [-0,5, 0.1, 0.001, 0.0005]}
 """, "has 5 numbers, not 1 × 4: is a comma wrong"),
     ],
 )  # fmt: skip

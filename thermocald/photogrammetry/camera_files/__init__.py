@@ -216,7 +216,7 @@ def _read_text(path: Path, format_: str | None = None) -> tuple[str, Format]:
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise ConfigurationError(f"{path}: too large for a camera file")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
     except UnicodeDecodeError:

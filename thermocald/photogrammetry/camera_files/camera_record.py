@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.files import QuantityReader
+from thermocald.files import QuantityReader, parse_yaml
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraSpec, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
 from thermocald.photogrammetry.linalg import unit_diagonal
@@ -28,18 +28,8 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 _T = TypeVar("_T")
-
-
-def yaml_mapping(text: str) -> dict[Any, Any]:
-    """Return the mapping in a YAML text; ConfigurationError if it is not YAML or not a mapping."""
-    try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, AttributeError, LookupError, RecursionError) as cause:
-        # the last four by PyYAML itself, such as IndexError for `!!int ''`
-        raise ConfigurationError(f"not valid YAML: {str(cause).splitlines()[0]}") from None
-    if not isinstance(document, dict):
-        raise ConfigurationError("the file has no keys")
-    return document
+ITS_YAML = "its YAML"
+"""Begins errors of a text, before which the file is named."""
 
 
 def yaml_text(document: dict[str, Any]) -> str:
@@ -50,7 +40,7 @@ def yaml_text(document: dict[str, Any]) -> str:
 def number(value: Any, what: str) -> float:
     """Return a finite number; `what` names it in the error."""
     try:
-        result = float(value)
+        result = float("" if isinstance(value, bool) else value)
     except (TypeError, ValueError):
         raise ConfigurationError(f"{what} is {value!r}, not a number") from None
     except OverflowError:
@@ -203,9 +193,17 @@ def _encode_own(record: CameraRecord) -> str:
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; ConfigurationError for a key that is duplicated."""
+    keys = [key for key, _ in pairs]
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise ConfigurationError(f"key {twice[0]!r} is duplicated")
+    return dict(pairs)
+
+
 def _decode_own(text: str) -> CameraRecord:
     try:
-        document = json.loads(text)
+        document = json.loads(text, object_pairs_hook=_unique)
     except (json.JSONDecodeError, RecursionError) as cause:
         raise ConfigurationError(f"not valid JSON: {cause}") from None
     if not isinstance(document, dict) or document.get("format") != _VERSION:
@@ -246,7 +244,7 @@ def _encode_yaml(record: CameraRecord) -> str:
 
 
 def _decode_yaml(text: str) -> CameraRecord:
-    camera = CameraSpec.read(QuantityReader("the camera", yaml_mapping(text)))
+    camera = CameraSpec.read(QuantityReader("the camera", parse_yaml(text, ITS_YAML)))
     if camera.interior is None:
         raise ConfigurationError("the camera has no interior orientation")
     s, values = camera.sensor, camera.interior.as_array()

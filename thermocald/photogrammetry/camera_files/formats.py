@@ -1,6 +1,6 @@
 """Camera files of OpenCV, ROS, Kalibr, mrcal, COLMAP, AICON, and Agisoft Metashape.
 
-OpenCV: YAML as cv2.FileStorage reads it and `calibration` in OpenCV's samples writes it, with
+OpenCV: YAML (read also: XML, JSON) as cv2.FileStorage and `calibration` in OpenCV's samples, with
 camera_matrix (3, 3), distortion_coefficients (1, 4 … 12) in OpenCV's order, image_width,
 image_height. A covariance goes into nodes of our own, which OpenCV's readers ignore:
 intrinsics_covariance in the order fx fy cx cy k1 k2 p1 p2 k3, and std_deviation_intrinsics.
@@ -44,15 +44,16 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from thermocald.errors import ConfigurationError
+from thermocald.files import parse_yaml
 from thermocald.photogrammetry.camera.conversions import METASHAPE as METASHAPE_FRAME
 from thermocald.photogrammetry.camera.conversions import Family, aicon, measured_point, opencv
 from thermocald.photogrammetry.camera_files.camera_record import (
+    ITS_YAML,
     CameraRecord,
     Format,
     among,
     number,
     numbers,
-    yaml_mapping,
     yaml_text,
 )
 
@@ -82,8 +83,12 @@ def _encode_opencv(record: CameraRecord) -> str:
 
 def _decode_opencv(text: str) -> CameraRecord:
     # not with cv2.FileStorage, which crashes the process if a file is damaged (OpenCV 5.0.0)
-    plain = re.sub("!!opencv-(nd-)?matrix", "", text.partition("\n")[2])  # nd: OpenCV 5
-    return _of_matrices(yaml_mapping(plain), (0, 4, 5, 8, 12, 14))
+    if text.startswith("<"):
+        nodes = _require_unique(_xml_root(text))
+        document = {n.tag: n.findtext("data", "").split() or n.text for n in nodes}
+    else:  # JSON is YAML; nd: OpenCV 5
+        document = parse_yaml(re.sub("^%YAML.*|!!opencv-(nd-)?matrix", "", text), ITS_YAML)
+    return _of_matrices(document, (0, 4, 5, 8, 12, 14))
 
 
 def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRecord:
@@ -105,8 +110,10 @@ def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRec
     K, d = matrix("camera_matrix", (9,)), matrix("distortion_coefficients", counts)
     if np.any(d[12:]):
         raise ConfigurationError("a tilted sensor (tau) has no counterpart in this model")
-    if K[1] != 0:
-        raise ConfigurationError("camera_matrix has a skew, which OpenCV itself ignores")
+    if np.any(K[[1, 3, 6, 7, 8]] != (0, 0, 0, 0, 1)):  # MATLAB's is transposed
+        raise ConfigurationError(
+            "camera_matrix is not fx 0 cx, 0 fy cy, 0 0 1, row by row: OpenCV itself ignores a skew"
+        )
     values = np.concatenate([K[[0, 4, 2, 5]], d[:12]])
     covariance = None
     if "intrinsics_covariance" in document:
@@ -118,13 +125,31 @@ def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRec
 
 
 OPENCV = Format(
-    "opencv", ".yaml", "OpenCV FileStorage YAML", lambda _: opencv(5),
+    "opencv", ".yaml", "OpenCV FileStorage", lambda _: opencv(5),
     _encode_opencv, _decode_opencv,
-    lambda text: text.startswith("%YAML") and "camera_matrix" in text,
+    lambda text: "camera_matrix" in text
+    and (text.startswith("%YAML") or "opencv_storage" in text or '"opencv-matrix"' in text),
 )  # fmt: skip
 
 
 _ROS_COUNTS = {"plumb_bob": 5, "rational_polynomial": 8}
+
+
+def _xml_root(text: str) -> ET.Element:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ConfigurationError("a DOCTYPE and entities are not read: delete them")
+    try:
+        return ET.fromstring(text)
+    except ET.ParseError as cause:
+        raise ConfigurationError(f"not valid XML: {cause}") from None
+
+
+def _require_unique(element: ET.Element) -> ET.Element:
+    """Return an element of XML. Raises ConfigurationError if one of its tags is duplicated."""
+    tags = [child.tag for child in element]
+    if twice := [tag for tag in tags if tags.count(tag) > 1]:
+        raise ConfigurationError(f"<{twice[0]}> is duplicated")
+    return element
 
 
 def _ros_matrix(values: Any, rows: int) -> dict[str, Any]:
@@ -149,7 +174,7 @@ def _encode_ros(record: CameraRecord) -> str:
 
 
 def _decode_ros(text: str) -> CameraRecord:
-    document = yaml_mapping(text)
+    document = parse_yaml(text, ITS_YAML)
     count = among(_ROS_COUNTS, document.get("distortion_model"), "distortion_model")
     return _of_matrices(document, (count,))
 
@@ -176,7 +201,7 @@ def _encode_kalibr(record: CameraRecord) -> str:
 
 
 def _decode_kalibr(text: str) -> CameraRecord:
-    document = yaml_mapping(text)
+    document = parse_yaml(text, ITS_YAML)
     camera = document.get("cam0")
     if not isinstance(camera, dict):
         raise ConfigurationError("not a camchain: cam0 is missing")
@@ -227,11 +252,14 @@ def _encode_mrcal(record: CameraRecord) -> str:
 
 def _decode_mrcal(text: str) -> CameraRecord:
     try:
-        document = ast.literal_eval(text.strip())
+        tree = ast.parse(text.strip(), mode="eval")
+        document = ast.literal_eval(tree)
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         raise ConfigurationError("not a dictionary in Python's notation") from None
-    if not isinstance(document, dict):
+    if not isinstance(tree.body, ast.Dict):
         raise ConfigurationError("not a dictionary")
+    if len(document) < len(tree.body.keys):
+        raise ConfigurationError("a key is duplicated")
     count = among(_MRCAL_COUNTS, document.get("lensmodel"), "lensmodel")
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
     size = numbers(document.get("imagersize"), "imagersize", (2,))
@@ -426,12 +454,7 @@ def _encode_metashape(record: CameraRecord) -> str:
 
 
 def _decode_metashape(text: str) -> CameraRecord:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ConfigurationError("a DOCTYPE and entities are not read: delete them")
-    try:
-        root = ET.fromstring(text)
-    except ET.ParseError as cause:
-        raise ConfigurationError(f"not valid XML: {cause}") from None
+    root = _xml_root(text)
     found = [root] if root.tag == "calibration" else root.findall(".//sensor/calibration")
     found = [c for c in found if c.get("class") != "initial"]
     if len(found) != 1:
@@ -449,9 +472,11 @@ def _decode_metashape(text: str) -> CameraRecord:
         for side in ("width", "height")
     ]
     values = np.array([number(calibration.findtext(tag, "0"), f"<{tag}>") for tag in _TAGS])
-    for tag in ("p3", "p4"):
-        if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
-            raise ConfigurationError(f"<{tag}> has no counterpart in this model")
+    for tag, given in ((child.tag, child.text) for child in _require_unique(calibration)):
+        if tag not in ("projection", "resolution", "width", "height", "date", *_TAGS) and (
+            number(given or 0, f"<{tag}>") != 0  # p3, p4, PhotoScan's skew
+        ):
+            raise ConfigurationError(f"<{tag}> cannot be read: only {', '.join(_TAGS)} can")
     pixels = number(size[0], "width"), number(size[1], "height")
     covariance = None
     names = root.findtext(".//sensor/covariance/params", "").split()
@@ -471,5 +496,5 @@ def _decode_metashape(text: str) -> CameraRecord:
 METASHAPE = Format(
     "metashape", ".xml", "Agisoft Metashape calibration XML", lambda _: METASHAPE_FRAME,
     _encode_metashape, _decode_metashape,
-    lambda text: "<calibration" in text,
+    lambda text: re.search(r"<calibration[\s>/]", text) is not None,
 )  # fmt: skip

@@ -269,6 +269,18 @@ def test_control_points_that_can_hardly_be_are_doubted(gauge, change, words):
     assert words in measured(gauge).stdout
 
 
+def test_points_on_one_plane_that_fit_mirrored_put_the_camera_under_water():
+    """With X and Y exchanged places were 15 sds off, from a nadir without a doubt."""
+    world, exchanged = World(1), [1, 0, 2]
+    world.points[:, 2] = 1500.0
+    surveyed = world.points + world.rng.normal(0, SURVEY_MM, world.points.shape)
+    world.field = replace(world.field, points=surveyed)
+    assert not places(world, world.seen(20.0), stones(world)).doubts
+    world.field = replace(world.field, points=surveyed[:, exchanged])
+    (doubt,) = places(world, world.seen(20.0), stones(world)).doubts
+    assert "under water in this pose: are X and Y" in doubt
+
+
 def test_what_is_doubtful_in_the_log_is_told_and_a_row_in_its_gap_is_left_out(gauge):
     """The thermometer failed for an hour; once, the whole day was refused."""
     log = read_rows(gauge / "log.csv")

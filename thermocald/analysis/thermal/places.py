@@ -352,10 +352,17 @@ def _warn_of_points_beside(
 def _doubt_pose(
     control: ControlPoints, camera: Camera, pose: Adjustment, surface: Plane | Line | Profile
 ) -> tuple[str, ...]:
-    """Return the doubts of the control points, and one of a camera that hangs upside down."""
+    """Return the doubts of the control points, and one of a camera upside down or under water."""
     doubts = control.find_doubts(camera, pose)
+    eop = pose.values[EOP]
+    places = surface.points if isinstance(surface, Profile) else surface.point
     vertical = not isinstance(surface, Plane) or surface.normal.tolist() == [0.0, 0.0, 1.0]
-    if vertical and rotation(pose.values[EOP][:3])[2, 1] < _UPSIDE_DOWN:
+    if vertical and eop[5] < places[..., 2].min():  # points on one plane fit mirrored at it, too
+        doubts.append(
+            "the camera is under water in this pose: are X and Y, or x and y, exchanged, or is a "
+            "sign wrong?"
+        )
+    elif vertical and rotation(eop[:3])[2, 1] < _UPSIDE_DOWN:
         doubts.append(
             "the camera hangs upside down in this pose: does it, or were x, y of the control "
             "points read in an image turned by 180°?"

@@ -354,6 +354,13 @@ def claimed(world: World, share: float) -> World:
     return world
 
 
+@pytest.fixture
+def unexplained(monkeypatch):
+    """Control points without a pose are refused without a search for the mistake."""
+    monkeypatch.setattr(ControlPoints, "_remedy", lambda *_: "")
+
+
+@pytest.mark.usefixtures("unexplained")
 def test_a_lens_that_is_not_the_model_s_is_doubted():
     """A specimen with a c smaller by 1.5 %: places were 2 to 5 sds off without a word."""
     doubted = {0.0: 0, 0.045: 0}
@@ -373,14 +380,14 @@ def test_a_lens_that_is_not_the_model_s_is_doubted():
 @pytest.mark.parametrize(
     ("world", "order", "scale", "words"),
     [
-        (claimed(World(5), 1 / 6), None, 1.0, "errors are .* times the standard deviations given"),
+        (claimed(World(5, n=8), 1 / 6), None, 1.0, "errors are .* times the standard deviations"),
         (World(0, n=6), [1, 0, 2, 3, 4, 5], 1.0, "with g0 and g1 exchanged they fit"),
         (moved(World(0, n=5), 2, (0, 0, 1500)), None, 1.0, "without g2 they fit"),
         # one outside the image: in ten of 24 such gauges, a good point or the lens was accused
         *((moved(few(seed, 5), 1, (7_000, 0, 0), True), None, 1.0,
            r"px; correct the click or leave it out$") for seed in (2, 3, 5)),
         # two points that were left out anyway were once said to be exchanged
-        *((World(1, n=10), None, f, "is the model of this camera and lens") for f in (0.8, 1.06)),
+        (World(1, n=10), None, 1.06, "is the model of this camera and lens"),
         # OpenCV found no pose for one of the trials that look for the mistake
         (few(376, 5, 500.0), None, 1.0, "give no pose"),
     ],
@@ -408,6 +415,7 @@ def test_a_poor_thermometer_has_its_share_at_every_time():
     assert at_each == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.usefixtures("unexplained")
 def test_places_that_a_moved_control_point_falsifies_are_doubted():
     """Of five one has moved by 50 mm, and the others do not show it: once 3 of 8 were doubted."""
     sure, false = [], 0

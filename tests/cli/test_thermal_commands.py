@@ -114,7 +114,8 @@ def test_a_series_in_fahrenheit_is_doubted(misfits, tmp_path):
 def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
     """At the start and in the heat, binned by 8; one that is unreadable has its line.
 
-    So has one of another folder that would replace a corrected image of its name.
+    So has one of another folder that would replace a corrected image of its name, one without
+    an ending and one with NUL in its name, which ended in tracebacks.
     """
     grey = np.random.default_rng(1).integers(0, 255, (308, 410), np.uint8)
     for name in "ab":
@@ -122,8 +123,10 @@ def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
         save_photograph(tmp_path / f"{name}.{kind}", tags, grey)
     (tmp_path / f"c.{kind}").write_bytes(b"no picture")
     shutil.copytree(tmp_path, tmp_path / "more")
+    shutil.copy(tmp_path / f"a.{kind}", tmp_path / "bare")
     listed = ((0, "a"), (40, "c"), (45, "b"), (46, "more/b"))
     rows = [f"{times_of(misfits)[k]:.2f},{n}.{kind}" for k, n in listed]
+    rows += [f"{times_of(misfits)[47]:.2f},{name}" for name in ("bare", "a\0")]
     (tmp_path / "i.csv").write_text("\n".join(["time,image", *rows, ""]))
 
     def correct(out, size="410x308"):
@@ -133,7 +136,7 @@ def test_images_are_corrected_and_keep_what_exif_says(misfits, tmp_path, kind):
         )  # fmt: skip
 
     result = correct(tmp_path / "out")
-    assert "2 of 4 rows were not corrected: lines 3, 5" in str(result.exception)
+    assert "4 of 6 rows were not corrected: lines 3, 5, 6, 7" in str(result.exception)
     told = json.loads(result.stdout)
     assert told["refused"][1]["reason"].endswith(f"b.{kind} is the corrected image of line 4")
     assert "is not an image" in told["refused"][0]["reason"]
@@ -164,7 +167,8 @@ def test_rows_of_standard_input_are_corrected_as_they_come(misfits):
         process.stdin.write(f"time,x,y,who\n{first:.2f},500,400,a\n")
         answers = [process.stdout.readline(), process.stdout.readline()]
         for row in ("soon,500,400,b", f"{second:.2f},9999,400,c", f"{second:.2f},5",
-                    f"{last + 9e4:.2f},500,400,d", "2026-06-14T12:00:30,500,400,z",
+                    f"{last + 9e4:.2f},500,400,d", f'{second:.2f},500,400,"12 inch',
+                    "2026-06-14T12:00:30,500,400,z",
                     f"{second:.2f},600,400,e"):  # fmt: skip
             process.stdin.write(row + "\n")
         answers.append(process.stdout.readline())
@@ -175,7 +179,8 @@ def test_rows_of_standard_input_are_corrected_as_they_come(misfits):
     assert answers[0].startswith("time,x,y,who,dx,dy,sd_x")
     assert [answer.split(",")[3] for answer in answers[1:]] == ["a", "e"]
     for line, reason in ((3, "'soon' is not a time"), (4, "lies outside"), (5, "has 2 fields"),
-                         (6, "outside the temperature log"), (7, "no time zone: add")):  # fmt: skip
+                         (6, "outside the temperature log"), (7, "a quote that is not closed"),
+                         (8, "no time zone: add")):  # fmt: skip
         assert f"line {line}: not corrected: " in told
         assert reason in told
-    assert "5 of 7 rows were not corrected: lines 3, 4, 5, 6, 7" in told
+    assert "6 of 8 rows were not corrected: lines 3, 4, 5, 6, 7, 8" in told

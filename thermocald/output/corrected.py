@@ -140,6 +140,8 @@ class Correction(Result):
                 source = self.path.parent / row["image"]
                 written = out / row["image"].rsplit("/", 1)[-1]
                 try:
+                    if "\0" in row["image"]:
+                        raise ImageError("its image's name holds a NUL character")
                     if (first := lines.setdefault(written, line)) != line:
                         raise ImageError(f"{written} is the corrected image of line {first}")
                     _write_corrected(source, written, maps, values)
@@ -258,8 +260,9 @@ def _write_corrected(source: Path, written: Path, maps: Maps, values: Array) -> 
             f"{width}×{height}; give --size if it is binned"
         )
     corrected = maps.resample(image, values)
-    encoded, data = cv2.imencode(written.suffix, corrected)
-    if not encoded:
-        raise ImageError(f"{written}: its format cannot be written")
+    try:
+        _, data = cv2.imencode(written.suffix, corrected)
+    except cv2.error:  # the name has another ending, or none
+        raise ImageError(f"{written}: an image of such a name cannot be written") from None
     with new_file(written) as partial:
         partial.write_bytes(with_metadata(data.tobytes(), source.read_bytes()))

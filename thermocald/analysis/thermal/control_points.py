@@ -167,10 +167,11 @@ class ControlPoints:
             )
         elif pose.ok:
             return pose
+        if pose.ok:
+            raise DataError(f"{why}; correct the click or leave it out")
         # one that fits nevertheless shows no other mistake
         fits = pose.status in ("ambiguous_pose", "weak_geometry")
-        remedy = "" if fits else self._remedy(camera)
-        raise DataError(why + ("; correct the click or leave it out" if pose.ok else remedy))
+        raise DataError(why if fits else why + self._remedy(camera))
 
     def find_doubts(self, camera: Camera, pose: Adjustment) -> list[str]:
         """Return what is doubtful in a pose although the control points fit, a sentence each."""

@@ -32,6 +32,7 @@ from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.thermal_camera import steady_camera
 from thermocald.arrays import eight_bit, full_scale
 from thermocald.errors import DataError, ImageError
+from thermocald.numbers import listed
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     EOP_NAMES,
@@ -189,6 +190,7 @@ class FrameCorrector:
 
 
 STANDARD_INPUT = Path("-")
+_HEAD = 100_000  # characters of a header
 _CHUNK = 1 << 22  # bytes read at once: a year of rows need not fit into memory
 
 
@@ -234,13 +236,15 @@ def row_blocks(
     zoned = False
     for lines in _lines(path):
         if not header:
-            header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+            names = next(csv.reader([text[:_HEAD] for text in lines[:1]]), [])
+            header = [name.strip() for name in names]
             lines, line = lines[1:], 1
             for name in ("time", *columns):
                 if name not in header:
                     hint = "; separate the columns with commas and write decimals with a point"
+                    there = listed([n[:40] for n in header], 20)
                     raise DataError(
-                        f"{path}: there is no column {name!r}; there are {', '.join(header)}"
+                        f"{path}: there is no column {name!r}; there are {there}"
                         + (hint if len(header) == 1 else "")
                     )
         if lines:
@@ -338,7 +342,7 @@ def _lines(path: Path) -> Iterator[list[str]]:
                 if mark:
                     yield whole.decode("utf-8-sig", errors).splitlines()
             if rest:
-                yield [rest.decode("utf-8-sig", errors)]
+                yield rest.decode("utf-8-sig", errors).splitlines()
     except (OSError, UnicodeDecodeError) as cause:
         what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
         raise DataError(f"{path}: cannot be read: {what}") from cause
@@ -351,8 +355,12 @@ def _block(
     """Return a block; zoned: whether times before it had a zone."""
     kept: list[tuple[int, dict[str, str], float | datetime, list[float]]] = []
     refused: list[tuple[int, str]] = []
-    reader = csv.reader(lines)
-    numbered = [(line + reader.line_num, row) for row in reader if row]
+    numbered = []
+    for number, text in enumerate(lines, line + 1):  # an open quote must not swallow rows
+        try:
+            numbered += [(number, row) for row in csv.reader([text], strict=True) if row]
+        except csv.Error:
+            refused.append((number, "has a quote that is not closed, or a field without end"))
     if order is None:
         place = header.index("time")
         texts = [row[place].strip() for _, row in numbered if len(row) == len(header)]
@@ -402,7 +410,8 @@ def _number(column: str, text: str) -> float:
     value = math.nan
     with suppress(ValueError):
         value = float(text)
-    if not math.isfinite(value):
+    # float() accepts 2_5.0 and digits of any script
+    if not math.isfinite(value) or "_" in text or not text.isascii():
         raise ValueError(f"column {column}: {text!r} is not a number")
     if column in ("sx", "sy") and value <= 0:
         raise ValueError(f"column {column}: a standard deviation must be above 0")

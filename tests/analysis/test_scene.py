@@ -193,6 +193,23 @@ def followed(folder, images, warmth):
     return follow_scene(camera(), TemperatureLog(times, {"housing": np.array(warmth)}), frames)
 
 
+def test_features_in_few_places_give_no_movement_with_small_sds():
+    """Of one or two places, errors were 7 to 20 sds: a still camera "was moved" in 97 of 100."""
+    rng, corner, known = np.random.default_rng(34), np.arange(16), camera().at(20.0)
+    ratio = []
+    for places, features in (*[(2, 8)] * 3, *[(20, 2)] * 60):
+        at = rng.choice(8 * 6, places, replace=False)
+        near = np.array([rng.choice(corner, features, replace=False) for _ in at])
+        x, y = 44 + 42 * (at[:, None] % 8) + 10 * (near % 4), 44 + 42 * (at[:, None] // 8)
+        points = np.stack([x, y + 10 * (near // 4)], axis=-1).astype(float)
+        moved = 0.04 * (rng.normal(size=points.shape) + rng.normal(size=(places, 1, 2)))
+        found = estimate_movement(known, known, points.reshape(-1, 2), moved.reshape(-1, 2))
+        assert (found is None) == (places == 2)
+        if found:
+            ratio.append(found[0] / np.sqrt(found[1].diagonal()))
+    assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.1, abs=0.25)
+
+
 def test_a_movement_is_reported_with_its_frame(tmp_path):
     bank, turned = Bank(11), np.array([3e-4, -4e-4, 0.0])
     warmth = [20.0, 24.0, 28.0, 30.0, 32.0]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, TestFieldError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.field.testfield import KINDS, Observations, TestField
 from thermocald.store.recording.table import Table
@@ -368,7 +369,7 @@ def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
 def _from_features(document: dict[str, Any], where: str) -> ControlPoints:
     names, rows, sigmas, image, clicked, missing = [], [], [], [], [], 0
     for i, feature in enumerate(document["features"]):
-        if feature["geometry"]["type"] != "Point":
+        if (feature["geometry"] or {}).get("type") != "Point":  # null: a point without a place
             continue
         properties = {k: v for k, v in (feature.get("properties") or {}).items() if v is not None}
         asked = {wanted: properties[n] for wanted, n in _find_names(properties).items()}
@@ -389,6 +390,7 @@ def _from_features(document: dict[str, Any], where: str) -> ControlPoints:
                 f"{where}: the coordinates look like degrees; write them in metres: UTM, or a "
                 "national grid"
             )
-    assumed = f"{where}: {missing} points without standard deviations: {_SURVEYED_MM:g} mm assumed"
+    without = counted(missing, "point")
+    assumed = f"{where}: {without} without standard deviations: {_SURVEYED_MM:g} mm assumed"
     seen = np.array(image).reshape(-1, 2), np.array(clicked).reshape(-1, 2)
     return ControlPoints.build(names, points, sigmas, "m", where, seen, assumed if missing else "")

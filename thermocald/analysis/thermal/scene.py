@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 _MOST_FEATURES = 600
-_FEWEST = 12  # features with a common movement
+_FEWEST = 12  # features with a common movement, and places where they are
 _APART_PX = 12
 _WINDOW_PX = 21
 _BACK_PX = 0.3  # largest difference after tracking forwards and back
@@ -156,12 +156,15 @@ def estimate_movement(
         x = np.linalg.solve(N, np.einsum("nci,n,nc->i", A, weight, left))
     r = left - A @ x
     inverse = np.linalg.inv(N)
-    # windows overlap: the errors of neighbouring features are correlated
+    # windows overlap: errors of neighbouring features are correlated; a cell at a time is left out
     cells = np.unique(points // (2 * _WINDOW_PX), axis=0, return_inverse=True)[1].ravel()
-    score = np.zeros((cells.max() + 1, 4))
+    if np.unique(cells[weight > 0]).size < _FEWEST:
+        return None
+    score, own = np.zeros((cells.max() + 1, 4)), np.zeros((cells.max() + 1, 4, 4))
     np.add.at(score, cells, np.einsum("nci,n,nc->ni", A, weight, r))
-    groups = np.unique(cells[weight > 0]).size
-    covariance = inverse @ (score.T @ score) @ inverse * groups / max(groups - 2, 1)
+    np.add.at(own, cells, np.einsum("nci,n,ncj->nij", A, weight, A))
+    score = np.linalg.solve(np.eye(4) - own @ inverse, score[..., None])[..., 0]
+    covariance = inverse @ (score.T @ score) @ inverse
     covariance += _LOCKED_PX**2 * np.eye(4)
     whole = covariance / np.outer(scale, scale)
     return x / scale, whole, _LOCKED_PX / scale, weight > 0

@@ -136,6 +136,13 @@ def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
     assert far.interior is None
     assert "-5 to 45 °C" in far.reason
     assert [kind for kind, _ in events] == ["outside_range", "predicted"]
+    gauge = GaugeCalibrator(thermal_camera())
+    gauge.predictor.take(START, {"h": 20.0})
+    now = gauge.predictor.at(START)
+    heated = replace(now, camera=replace(now.camera, extrapolated=3.0))
+    gauge.predictor.at = lambda _: heated
+    other = gauge.calibrate(read([20.0])[0]).adjustment
+    assert (other.status, "another thermometer is 3.0 K" in other.reason) == ("outside_range", True)
 
 
 def test_the_covariance_grows_while_a_thermometer_is_lost():
@@ -260,6 +267,11 @@ def test_the_last_pose_is_kept_with_growing_covariance_while_points_are_hidden()
     assert grown == pytest.approx(np.deg2rad(0.01) * np.sqrt(0.5), rel=1e-6)
     assert [kind for kind, _ in events] == ["last_pose", "resected"]
     assert "control points are seen" in events[0][1]
+    # processed late, it is as long before the last pose as the fifth is after the second
+    late = gauge.calibrate(replace(world.epoch(3, 25.0, [], 600.0), number=3)).adjustment
+    assert np.sqrt(late.sd[10] ** 2 - results[5].adjustment.sd[10] ** 2) == pytest.approx(
+        np.deg2rad(0.01) * np.sqrt(0.5), rel=1e-6
+    )
 
 
 def test_places_from_the_last_pose_have_true_sds():

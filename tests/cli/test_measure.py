@@ -197,6 +197,7 @@ def test_what_is_printed(gauge):
     assert "doubtful" not in done.stdout
     document = json.loads((gauge / "places.json").read_text())
     assert (document["pose"]["unchecked"], document["refused"]) == ([], [])
+    assert {place["time"] for place in document["places"]} == {AFTERNOON}
     assert "heights" not in done.stderr
     (gauge / "water.yaml").write_text("level: 92.4\nsd: 0.005\n")
     assert "water.yaml: is 47 m away from control points" in measured(gauge).stderr
@@ -410,6 +411,7 @@ def test_a_poor_thermometer_has_its_share_at_every_time():
         image = np.concatenate([stones(world, T, NOISE_PX) for T in warmth])
         shown = world.rng.normal(warmth, 3.0)
         found = places(world, seen, image, shown=shown, times=MORNING + hours, noise_K=3.0)
+        assert "0 2023-11-14 22:13:20  " in str(found)  # the other three are of the next day
         ratio.append(((found.points - np.tile(PLACES, (2, 1))) / np.maximum(found.sd, 1e-9))[:, :2])
     at_each = np.sqrt(np.mean(np.square(ratio).reshape(-1, 2, 6), axis=(0, 2)))
     assert at_each == pytest.approx(1.0, abs=0.2)

@@ -226,6 +226,8 @@ class GaugeCalibrator(EpochCalibrator):
             "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": beyond,
         }  # fmt: skip
         outside = self.thermal.validity.place(T) if beyond else ""
+        if beyond and not self.thermal.validity.beyond(T):
+            outside = f"another thermometer is {beyond:.1f} K outside the range of the fit"
         if self.thermal.validity.is_far(T):
             bad = failed("outside_range", f"{outside}: nothing is predicted there", measured)
             return CalibratedEpoch(epoch, bad, extra)
@@ -314,8 +316,7 @@ class GaugeCalibrator(EpochCalibrator):
         last = self.pose
         if last is None:
             return self._unposed("predicted", f"no pose so far: {why}", now)
-        hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
-        still = f"; the mount may have moved for {hours:.2f} h"
+        still = f"; the mount may have moved for {_hours_between(last, epoch):.2f} h"
         if self._mount is None:
             still = "; the mount is taken not to have moved since, as its movement is not known"
         since = self._since(last, now, epoch)
@@ -333,10 +334,10 @@ class GaugeCalibrator(EpochCalibrator):
 
     def _since(self, last: Pose, now: PredictedCamera, epoch: Epoch) -> Array:
         """Return the covariance (16, 16) of what may have changed since the last pose."""
-        hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
         since = np.zeros((16, 16))
         since[IOP, IOP] = self._change(last.predicted, now)
-        since[range(10, 13), range(10, 13)] = math.radians(self._mount or 0.0) ** 2 * hours
+        walk = math.radians(self._mount or 0.0) ** 2 * _hours_between(last, epoch)
+        since[range(10, 13), range(10, 13)] = walk
         return since
 
     def _share_elsewhere(
@@ -467,6 +468,10 @@ def plan_gauge(
             )
     gauge = GaugeCalibrator(thermal, given.field, finder, mount_sd_deg, snooping_alpha)
     return gauge, given.origin.tolist()
+
+
+def _hours_between(last: Pose, epoch: Epoch) -> float:
+    return abs(epoch.frame_time - last.time) / 3600.0  # an epoch that is processed late is earlier
 
 
 def _matching(seen: Observations) -> Array:

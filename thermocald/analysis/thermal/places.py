@@ -191,7 +191,7 @@ class Places(Result):
         shifts = self.shift_mm
         places = [
             {
-                "name": name, "temperature": self.temperatures[k],
+                "name": name, "time": self.times[k], "temperature": self.temperatures[k],
                 **with_sds("XYZ", self.points[k], self.sd[k]),
                 "without_correction": dict(zip("XYZ", self.without[k], strict=True)),
                 "correction_mm": shifts[k],
@@ -242,7 +242,8 @@ class Places(Result):
         names = list(self.names)
         if np.ptp(self.times):
             moments = [datetime.fromtimestamp(time, UTC) for time in self.times]
-            names = [f"{n} {moment:%H:%M:%S}" for n, moment in zip(names, moments, strict=True)]
+            form = "%H:%M:%S" if len({m.date() for m in moments}) == 1 else "%Y-%m-%d %H:%M:%S"
+            names = [f"{n} {moment:{form}}" for n, moment in zip(names, moments, strict=True)]
         wide = max(map(len, names), default=4)
         at = ", ".join(
             f"{v:.{digits}f} ± {sd / UNITS[self.unit]:.{digits}f}"

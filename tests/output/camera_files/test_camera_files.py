@@ -282,7 +282,8 @@ def test_balanced_terms_at_the_measured_point_are_imported(tmp_path, r0):
     """The two conventions of CONVENTIONS §2 that are accepted on import, in one file."""
     v = {"Ck": -8.2 if r0 else 8.2, "Xh": 0.03, "Yh": -0.02, "A1": -1.2e-3, "A2": 2e-5,
          "R0": r0, "A3": 0.0, "B1": 2e-5, "B2": -1e-5, "C1": 1e-4, "C2": -5e-5,
-         "sensor_width_mm": 8.0, "sensor_height_mm": 6.0, "pixels_x": 2000, "pixels_y": 1500}  # fmt: skip
+         "sensor_width_mm": 8.0, "sensor_height_mm": 6.0, "pixels_x": 2000,
+         "pixels_y": 1500}  # fmt: skip
     path = tmp_path / "camera.ior"
     path.write_text("camera x\n" + "".join(f"{k} {value}\n" for k, value in v.items()))
     back = camera_files.read(path)

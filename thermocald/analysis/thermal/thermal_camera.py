@@ -51,6 +51,7 @@ from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
 from thermocald.result import Result, jsonable
+from thermocald.thermal.thermometer import USUAL_THERMOMETER_SD
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +62,6 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
-USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _NEEDED = 6  # readings that the present effects follow from, besides two of each channel
 _CHUNK = 20_000  # times predicted at once

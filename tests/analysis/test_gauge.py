@@ -191,6 +191,23 @@ def test_a_delayed_epoch_has_the_camera_of_its_time():
     assert in_gap.sd[1] > 2 * late.sd[1]
 
 
+@pytest.mark.parametrize("between", [0.0, 4.0])
+@pytest.mark.parametrize("effect", ["thermal_lag", "time_offset"])
+def test_the_noise_of_readings_is_that_along_the_log(effect, between):
+    """Followed reading by reading, it is the same as by the effects' operators."""
+    values = {"thermal_lag": {"tau": 45.0}, "time_offset": {"d": 23.0}}[effect]
+    model = replace(thermal_camera().model, effects=(ModelEffect(effect, values, {}),))
+    camera = ThermalCamera(model)
+    predictor, times = Predictor(camera), 10.0 * np.arange(40)
+    for time in times:
+        predictor.take(time, {"temperature": 20.0})
+    last = times[-1] - (20.0 + between if between else 0.0)
+    sds = (0.0, camera.reading_sd)
+    a, b = (camera.along(times, 20.0 + 0.0 * times, [last], temperature_sd=sd) for sd in sds)
+    found, wanted = predictor.at(last).noise, (b.covariance - a.covariance)[0]
+    np.testing.assert_allclose(found[:3, :3], wanted[:3, :3], rtol=1e-4)
+
+
 def unknown(predictor: Predictor, begin: float, T: float, *rows: int) -> list[float]:
     """Return the effects of the unknown past, px, at some of 750 readings of a temperature."""
     found = []

@@ -18,7 +18,6 @@ from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.gauge import GaugeCalibrator
-from thermocald.analysis.thermal.modelled_camera import ExtrapolationWarning
 from thermocald.analysis.thermal.predictor import Predictor
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.epoch import Epoch
@@ -141,9 +140,9 @@ def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
     model = replace(thermal_camera().model, effects=(square,))
     predictor = Predictor(ThermalCamera(model))  # by the drift of all effects, not the rates alone
     predictor.take(0.0, {"temperature": 55.0})
-    with pytest.warns(ExtrapolationWarning):
-        wanted = predictor.thermal.at(55.0, predictor.thermal.reading_sd)
-    assert predictor.at(1.0).camera.sd == pytest.approx(wanted.sd, rel=1e-3)
+    slope = RATES["c"] + 2 * 3e-5 * 35.0
+    wanted = slope**2 * (10.0**2 + predictor.thermal.reading_sd**2)
+    assert predictor.at(1.0).noise[0, 0] == pytest.approx(wanted, rel=1e-3)
 
 
 def test_the_covariance_grows_while_a_thermometer_is_lost():

@@ -384,8 +384,8 @@ def surveyed_badly_from_near(seed: int):
         # 15 of 100 had none: a start of three points fits the others no better than the survey
         (surveyed_badly_from_near, (), 30, 27),
         # one or two points left 13 and 15 of 60 false poses: their survey's errors hid a knock
-        *((in_fog, (n, True), 40, 0) for n in (1, 2, 3)),
-        *((in_fog, (n, False), 40, 40) for n in (1, 2, 3)),
+        *((in_fog, (n, True), 20, 0) for n in (1, 2, 3)),
+        *((in_fog, (n, False), 20, 20) for n in (1, 2, 3)),
     ],
 )
 def test_there_is_a_true_pose_or_none(calibrated, options, seeds, at_least):

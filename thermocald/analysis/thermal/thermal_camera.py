@@ -507,6 +507,7 @@ class LiveCamera:
     def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
         """Take a reading and return the camera now, equal to `along` over the history so far.
 
+        Its covariance is the model's, without the noise of readings, as that of `along` by default.
         time: s or datetime64, later than the last; temperature: °C, or {channel: °C} with the
         reference first; for NaN (a failed reading) the channel's last reading is used, for at most
         ten intervals between readings, then DataError is raised. Raises UsageError if the time is

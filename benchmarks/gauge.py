@@ -6,7 +6,7 @@ resection. The goal is 1.2 times the processor time of a tracked frame, with adj
 field of about 150 targets in a JPEG of similar size. Without decoding (some camera drivers give
 grey values) a cross costs more than a target: it is searched anew in each frame, and its patch may
 rotate and stretch. Memory is that of `thermocald run` with the service's settings, twelve crosses,
-a store and a log: at most 105 MB resident between two frames, the median of two seconds after 200
+a store and a log: at most 90 MB resident between two frames, the median of two seconds after 200
 ticks; an 8 MP frame takes 10 MB more for the 40 ms of its measurement.
 """
 
@@ -45,7 +45,7 @@ from thermocald.store.recording.head import CameraSpec, Channel, Head
 GOAL = 1.2
 # Runs on two machines gave 1.14 to 1.21 for JPEGs; for grey values see above
 TICK_BOUND = {True: 1.25, False: 4.0}  # JPEG, grey values
-MEMORY_BOUND_MB = 105.0
+MEMORY_BOUND_MB = 90.0
 ROUNDS = 30
 PERIOD_S = 0.25
 CROSSES = 12

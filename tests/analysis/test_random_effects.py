@@ -56,3 +56,6 @@ def test_unknown_values_come_from_the_type():
     assert new.covariance == pytest.approx(people.prior)
     exact = people.posterior(MEAN, np.diag(1e12 / SD**2))
     assert exact.values == pytest.approx(MEAN, abs=1e-6)
+    equal = population(np.array([MEAN] * 3), np.zeros((3, 4, 4)))  # was a ValueError
+    same = equal.posterior(MEAN, np.eye(4)).interval(np.eye(4)[0])
+    assert same == pytest.approx((MEAN[0],) * 3, abs=1e-12)

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 import thermocald as tc
 from benchmarks import audit_thermal
@@ -19,9 +20,11 @@ from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError
 from thermocald.physics.model import ModelEffect
+from thermocald.store.recording.reader import open_recording
 from thermocald.thermal.fit import choose_distortion
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import epochs_input
+from thermocald.thermal.thermometer import USUAL_THERMOMETER_SD, estimate_reading_noise
 
 LAG = ModelEffect("thermal_lag", {"tau": 70.0})
 START = ModelEffect("thermal_lag", {"tau": 10.0})
@@ -300,3 +303,19 @@ def test_a_lamp_switched_between_two_readings_is_no_delay():
     for seed in (1, 5):  # otherwise 2 s
         f = fitted(read_apart(simulated(seed, listed=()), 0.0, 30.0), DELAY)
         assert abs(f.model.effects[0].values["d"]) < 0.6  # s
+
+
+@pytest.mark.parametrize("epochs", [6, 12])
+def test_few_readings_hardly_show_their_own_noise(tmp_path, epochs):
+    """Their resolution was taken for it, and rates of four epochs were up to 18 sds off."""
+    tc.simulate("nexus5-cold", seed=1, epochs=epochs, out=tmp_path)
+    head = tmp_path / "recording.yaml"
+    head.write_text(head.read_text().replace("resolution: 0.0625", "resolution: 0.01"))
+    wanted = USUAL_THERMOMETER_SD
+    if epochs == 12:  # Student's t, from nine third differences that are correlated
+        read = open_recording(tmp_path).columns.readings_of("temperature")
+        shown = estimate_reading_noise(*read, 0.01)
+        wanted = shown * stdtrit(9 / 2.3, 0.975) / 1.96
+    assert tc.fit(tc.open(tmp_path)).model.fitted_on[0]["thermometer_sd_K"] == pytest.approx(
+        wanted, rel=1e-3
+    )

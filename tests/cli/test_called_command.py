@@ -29,6 +29,11 @@ import thermocald as tc, thermocald.daemon.plan
 import thermocald.analysis.thermal.gauge, thermocald.analysis.thermal.correction
 import thermocald.analysis.online.running_series, thermocald.analysis.series.adjusted
 tc.load_camera
+from tests.analysis.test_gauge import TAU, thermal_camera
+from thermocald.analysis.thermal.predictor import Predictor
+predictor = Predictor(thermal_camera(TAU))
+predictor.take(0.0, {"temperature": 20.0})
+predictor.at(1.0)
 print("==", *sys.modules)
 """
 
@@ -36,8 +41,8 @@ print("==", *sys.modules)
 def test_only_what_a_command_needs_is_imported_and_the_list_cuts_no_line_off():
     """The panels are in order of use; every line fits into 80 columns. NumPy is for commands that
     calculate. OpenCV, SciPy and Matplotlib are half of the page's memory and of a command's start;
-    SciPy's optimiser is 20 MB, and a camera as it is predicted, at a gauge, and in its series is
-    without.
+    SciPy's optimiser is 20 MB, its sparse matrices are 12, and a camera as it is predicted, at a
+    gauge, and in its series is without.
     """
     words = "--help\n-v run --help\nsession start --help\nstatus --store absent.db\n"
     done = subprocess.run(
@@ -51,7 +56,8 @@ def test_only_what_a_command_needs_is_imported_and_the_list_cuts_no_line_off():
     assert [i & modules for i in imported] == [set(), {run}, {run, session}, {run, session}]
     assert "numpy" not in imported[-1]
     assert not page & {"cv2", "matplotlib", "plotly", "scipy"}
-    assert not camera & {f"scipy.{n}" for n in ("optimize", "stats", "spatial", "integrate")}
+    heavy = ("optimize", "stats", "spatial", "integrate", "sparse")
+    assert not camera & {f"scipy.{n}" for n in heavy}
     lines = lines[: next(i for i, line in enumerate(lines) if line.startswith("=="))]
     assert max(map(len, lines)) <= 80
     assert [line[:-1] for line in lines if line.rstrip(":") in PANELS] == list(PANELS)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index, Mask
 
+USUAL_THERMOMETER_SD = 0.05  # K, if it cannot be estimated
 # a normal distribution without what is beyond k sigma, and its sd, √(1 - 2 k φ(k) / (2 Φ(k) - 1))
 CLIPPED_AT, CLIPPED_SD = 2.2, 0.9162
 _SMOOTHING = np.logspace(-1, 5, 19)
@@ -205,13 +206,14 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
 
     It is computed from third divided differences, as thermometers are not read at even intervals,
     clipped iteratively at 2.2 sigma, so that a switched lamp, which affects four of them, does not
-    count as noise. It is at least the error due to the resolution.
+    count as noise. It is at least the error due to the resolution. Fewer than eight readings do not
+    show it, and a typical value is returned.
     """
     there = np.isfinite(readings) & np.isfinite(times)
     t, values = times[there], readings[there]
     floor = find_step(values, resolution) / np.sqrt(12.0)
     if len(values) < 8:
-        return max(float(floor), 1e-6)
+        return max(float(floor), USUAL_THERMOMETER_SD)
     d = _third_differences(t, values)
     # with few readings, two kinks affect four in ten, which clipping alone would never remove
     spread = mad_sd(d)

@@ -60,13 +60,13 @@ class Shrunk:
             middles[i] = direction @ (people.mean + covariance @ self.push)
             variances[i] = direction @ (covariance + self.correlations) @ direction
         value = float(direction @ self.values)
-        sds = np.sqrt(np.maximum(variances, 1e-300))
+        sds, off = np.sqrt(np.maximum(variances, 1e-300)), value - middles
 
         def excess(half: float) -> float:
-            low, high = ((value + end - middles) / sds for end in (-half, half))
+            low, high = ((off + end) / sds for end in (-half, half))
             return float(np.mean(ndtr(high) - ndtr(low))) - _LEVEL
 
-        furthest = float(np.max(np.abs(value - middles) + 40 * sds))
+        furthest = float(np.max(2 * np.abs(off) + 40 * sds))
         half = float(brentq(excess, 0.0, furthest, xtol=1e-9 * furthest))
         return value, value - half, value + half
 

@@ -37,7 +37,8 @@ def describe_small_misfit(document: Mapping[str, Any]) -> str:
         return ""
     return (
         f"smooth trajectories of {left:.3f} px ({sigmas:.0f} standard deviations), small beside "
-        "the noise; the standard deviations include them"
+        "the noise; the standard deviations of predicted image points include them, but single "
+        "rates may be wrong by several of theirs"
     )
 
 

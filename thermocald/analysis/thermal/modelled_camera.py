@@ -265,18 +265,20 @@ def reading_operators(model: ThermalModel, history: History) -> Operators:
 
 
 def shared_errors(
-    operators: Operators, bases: Sequence[Array]
+    operators: Operators, bases: Sequence[Array] | None = None
 ) -> Iterator[tuple[str, Array, Array, Array]]:
     """Yield a channel, the share (E,) of its readings' variance, and two weights (22,).
 
     The outer product of the weights times the share is a term of the covariance; bases (R,): the
     rows of the state relative to which the operators are taken. Thermometers are independent.
     """
-    for (c, a, S), s in zip(operators, bases, strict=True):
-        for (d, b, R), r in zip(operators, bases, strict=True):
+    for i, (c, a, S) in enumerate(operators):
+        for k, (d, b, R) in enumerate(operators):
             if a == b and S.nnz and R.nnz:
                 shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
-                yield a, shared - S @ r - R @ s + s @ r, c, d
+                if bases:
+                    shared = shared - S @ bases[k] - R @ bases[i] + bases[i] @ bases[k]
+                yield a, shared, c, d
 
 
 def reading_covariance(
@@ -288,11 +290,32 @@ def reading_covariance(
     """
     operators = reading_operators(model, history)
     found = np.zeros((len(history.times), 10, 10))
-    none = [np.zeros(len(history.reading_times))] * len(operators)
-    for channel, shared, c, d in shared_errors(operators, bases or none):
+    for channel, shared, c, d in shared_errors(operators, bases):
         variance = (sd * relative_noise(model, channel)) ** 2
         found += variance * shared[:, None, None] * np.outer(c[IOP], d[IOP])
     return found
+
+
+def latest_noise(model: ThermalModel, history: History, sd: float) -> Array:
+    """Return the covariance (10, 10) of the camera at a history's only time, by the readings.
+
+    As `reading_covariance`; lags and delays are followed without sparse matrices, whose library
+    takes 12 MB of a daemon. All readings are finite, and begin before the time and end after it.
+    """
+    kinds = [(catalogue.get(e.name), e.values) for e in model.effects]
+    if not all(kind.delay and float(values[kind.delay]) > 0 for kind, values in kinds):
+        return np.asarray(reading_covariance(model, history, sd)[0])
+    (now,), times = history.times, history.reading_times
+    rows = np.eye(len(times))
+    k = int(np.searchsorted(times, now))
+    if k:
+        share = (now - times[k - 1]) / (times[k] - times[k - 1])
+        rows[k] = (1.0 - share) * rows[k - 1] + share * rows[k]
+    for follow in model.followers():
+        for t, row in zip([*times[:k], now], rows, strict=False):
+            row[:] = follow(t, row.copy())
+    rates = effect_weights(model, "")[IOP]
+    return np.asarray(sd**2 * (rows[k] @ rows[k]) * np.outer(rates, rates))
 
 
 def relative_noise(model: ThermalModel, channel: str) -> float:

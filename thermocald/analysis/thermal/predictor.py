@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import directions, image_grid
-from thermocald.analysis.thermal.modelled_camera import reading_covariance
+from thermocald.analysis.thermal.modelled_camera import latest_noise
 from thermocald.photogrammetry.camera.camera_model import IOP, partials
 from thermocald.physics.history import History
 from thermocald.store.recording.reader import TemperatureLog
@@ -128,11 +128,12 @@ class Predictor:
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         aged = self._change(age) if age > LONGEST_GAP_S else 0.0
-        beyond = float(self.thermal.validity.beyond(T))
+        others = {n: np.array([self._recent[-1][1][n]]) for n in self._channels}
+        (beyond,), (drift,) = self.thermal._beyond(np.array([T]), others, None)
         noise = self._noise(min(time, read)) + math.hypot(aged, jump) ** 2 * np.outer(rates, rates)
-        noise += np.diag((rates * beyond) ** 2)
+        noise += np.diag(drift)
         covariance = camera.covariance + np.outer(unknown, unknown) + noise
-        now = replace(camera, covariance=covariance, extrapolated=beyond)
+        now = replace(camera, covariance=covariance, extrapolated=float(beyond))
         by = partials(camera.sensor, camera.values, np.zeros(6), self._across)[1][..., IOP]
         largest = float(np.linalg.norm(by @ unknown, axis=1).max())
         return PredictedCamera(now, age, noise, unknown, largest, jump)
@@ -145,8 +146,7 @@ class Predictor:
         history = History(
             np.array([time - times[0]]), times - times[0], readings, reference, model.T0
         )
-        noise: Array = reading_covariance(model, history, self.thermal.reading_sd)[0]
-        return noise
+        return latest_noise(model, history, self.thermal.reading_sd)
 
     def _log(self, first: int, end: int | None) -> tuple[Array, dict[str, Array]]:
         """Return the times (n,) s and the readings {channel: (n,) °C} of some of the last."""

@@ -46,11 +46,12 @@ from thermocald.analysis.thermal.modelled_camera import (
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND, draw_figure
 from thermocald.names import checked
-from thermocald.photogrammetry.camera.camera_model import IOP, Sensor
+from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.formula import GivenFormula, is_formula
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
 from thermocald.result import Result, jsonable
+from thermocald.thermal.thermometer import USUAL_THERMOMETER_SD
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +62,6 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
-USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
 _LARGEST_GAP = 10.0  # in which a live camera uses the last reading, as a log does
 _NEEDED = 6  # readings that the present effects follow from, besides two of each channel
 _CHUNK = 20_000  # times predicted at once
@@ -386,29 +386,33 @@ class ThermalCamera(Result):
         return predict_orientations(self.model, self.parameters, history, self.model.drive(history))
 
     def _beyond(
-        self, T: Array, others: Mapping[str, Array], extrapolate: bool
+        self, T: Array, others: Mapping[str, Array], extrapolate: bool | None
     ) -> tuple[Array, Array]:
         """Return how far outside (E,) K thermometers are, and the drift's variance (E, 10) there.
 
-        T (E,) °C: of the reference; others {name: (E,) °C}. The drift is that of the steady camera
-        where a thermometer is furthest outside.
+        T (E,) °C: of the reference; others {name: (E,) °C}; extrapolate: None to accept and warn of
+        nothing. The drift is that of the steady camera where a thermometer is furthest outside.
         """
-        beyond = {"": self.validity.check(T, extrapolate)}
-        for name in self.channels:
-            if name in others and name in self.model.validity:
-                of_fit = Validity(*self.model.validity[name], name)
-                beyond[name] = of_fit.check(others[name], extrapolate)
+        reference, given = next(iter(self.model.validity), "temperature"), self.model.validity
+        limits = {n: Validity(*given[n], n) for n in self.channels if n in others and n in given}
+        read, beyond = {**others, reference: T}, {}
+        for name, of in {reference: self.validity, **limits}.items():
+            there = read[name]
+            beyond[name] = of.beyond(there) if extrapolate is None else of.check(there, extrapolate)
         outside: Array = np.stack(list(beyond.values())).max(axis=0)
         variance = np.zeros((len(T), 10))
         if outside.any():
-            k = int(outside.argmax())
-            there = constant_history(self.model, T[k], {n: float(o[k]) for n, o in others.items()})
-            slopes = {name: np.zeros(10) for name in beyond}
-            for weights, channel, S in reading_operators(self.model, there):
-                if (name := "" if channel == there.reference else channel) in slopes:
-                    slopes[name] += weights[IOP] * S.sum()
-            variance += (slopes.pop("") * beyond.pop("")[:, None]) ** 2
-            variance += sum(np.abs(beyond[n][:, None] * slopes[n]) for n in beyond) ** 2
+            worst, step = {n: float(x[outside.argmax()]) for n, x in read.items()}, 1e-3
+
+            def camera(at: dict[str, float]) -> Array:
+                history = constant_history(self.model, at[reference], at)
+                return predict_orientations(self.model, (), history, self.model.drive(history))[0]
+
+            drifts = [
+                far[:, None] * (camera({**worst, n: worst[n] + step}) - camera(worst)) / step
+                for n, far in beyond.items()
+            ]
+            variance += drifts.pop(0) ** 2 + sum(map(np.abs, drifts)) ** 2
         return outside, variance
 
     def steady_tables(self) -> tuple[Array, list[Array]]:
@@ -503,6 +507,7 @@ class LiveCamera:
     def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
         """Take a reading and return the camera now, equal to `along` over the history so far.
 
+        Its covariance is the model's, without the noise of readings, as that of `along` by default.
         time: s or datetime64, later than the last; temperature: °C, or {channel: °C} with the
         reference first; for NaN (a failed reading) the channel's last reading is used, for at most
         ten intervals between readings, then DataError is raised. Raises UsageError if the time is

@@ -20,6 +20,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import stdtrit
 
 from thermocald.analysis.statistics.random_effects import Population, population
 from thermocald.analysis.thermal.prediction_test import NORMAL_95, estimate_step, predicted_error
@@ -48,6 +49,10 @@ if TYPE_CHECKING:
     from thermocald.physics.model import Distortion, ModelEffect, ThermalModel
     from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.series import ReducedSeries
+
+
+_FEWEST, _FEW = 5, 30  # third differences of readings from which their noise was estimated
+_ALIKE = 2.3  # that count as one: the correlations are -3/4, 3/10 and -1/20, and 1 + 2 Σ r² = 2.3
 
 
 def fit_thermal_model(
@@ -85,7 +90,8 @@ def fit_thermal_model(
         growth = estimate_noise_slope(others)
         others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
     # the hypothesis of all effects that act on trajectories
-    ready = [in_blocks(weight_slow_noise(s)) for s in calibrate_thermometers(others)]
+    calibrated = _allow_for_few_readings(calibrate_thermometers(others))
+    ready = [in_blocks(weight_slow_noise(s)) for s in calibrated]
     fitter = HypothesisFitter(ready)
     fitter.held, fitter.priors = frozenset(fixed), dict(priors or {})
     terms: tuple[Term, ...] = ()
@@ -100,6 +106,24 @@ def fit_thermal_model(
         fit = fitter.refine_in(again(fitter, fit), fit)
     moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
     return build_camera(fitter, fit, others, listed, growth, moved, sure)
+
+
+def _allow_for_few_readings(series: list[ReducedSeries]) -> list[ReducedSeries]:
+    """Return the series with a thermometer's noise by which 95 % of errors are below 1.96 sds.
+
+    Its estimate from few readings is uncertain itself (Student's t); more epochs show it, too.
+    """
+    names = [e.history.reference for e in series]
+    known = [e.thermometers[n] for e, n in zip(series, names, strict=True)]
+    count = sum(max(int(k.real.sum()) - 3, 0) for k in known)
+    if not _FEWEST <= count < _FEW:
+        return series
+    wider = float(stdtrit(count / _ALIKE, 0.975)) / NORMAL_95
+    known = [replace(k, sd=wider * k.sd, noise=wider * k.noise) for k in known]
+    return [
+        replace(e, thermometers={**e.thermometers, n: k})
+        for e, n, k in zip(series, names, known, strict=True)
+    ]
 
 
 def _check(series: Sequence[ReducedSeries], listed: Sequence[ModelEffect]) -> None:

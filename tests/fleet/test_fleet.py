@@ -21,6 +21,7 @@ from tests.commands import refuse, succeed
 from tests.fleet.conftest import address, execute
 from thermocald.fleet.overview import (
     _calibration,
+    _complete,
     _sensors,
     _shift,
     fleet_document,
@@ -97,6 +98,7 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path, monkeypatch
     html = page.read_text()
     (kind,) = document["types"]
     assert kind["type"] == "imx219 3280×2464"
+    assert kind["rates"]["c"]["sd_between"] < 5e-5  # without the odd one
     drawn = [html.count(f">{name}<") for name in kind["cameras"]]
     assert len(drawn) >= 14
     assert min(drawn) >= 3  # a row in each rate's drawing
@@ -149,6 +151,19 @@ def test_a_thermometer_without_fault_alone_leaves_the_rates_to_a_warmer_camera(
     assert [*_sensors(camera)] == ([("sensor", f"t: {trouble}")] if trouble else [])
     warm_up = [text for _, text in _calibration(camera) if "21.5 to 22.0 °C" in text]
     assert bool(warm_up) == (not trouble)
+
+
+def test_a_rate_is_that_within_the_series_which_have_levels_of_their_own(head):
+    of, t = np.repeat([0, 1], 30), np.tile(np.linspace(0.0, 10.0, 30), 2)
+    measured = [k + rate * t + 0.5 * of for k, rate in enumerate(RATES[0])]
+    samples = np.column_stack([of, 60.0 * np.arange(60), t + 20 * of])
+    for values in measured:
+        samples = np.column_stack([samples, values, np.full(60, 1e-4)])
+    head = replace(head, channels={"t": Channel()})
+    camera = FleetCamera("s", "c", "w", head, {}, 3540.0, 60, 60, 3540.0, None, samples=samples)
+    _complete(camera, 3600.0)
+    rates = [rate.value for rate in camera.rates.values()]
+    assert rates == pytest.approx(list(RATES[0]), rel=1e-3)
 
 
 def test_a_shift_is_counted_in_its_standard_deviations():

@@ -385,6 +385,7 @@ def test_a_row_that_is_cut_off_is_left_out(tmp_path, time, lost):
     found = logged(tmp_path, data[:-lost])
     assert found.times.tolist() == TIMES[:-1]
     assert "the last row is cut off" in found.notes[-1]
+    assert logged(tmp_path, data.strip()).times.tolist() == TIMES
 
 
 DOUBTFUL = {

@@ -122,7 +122,7 @@ DAMAGES = {
         (put(r"t0(.*\n)(.*\n)t2,[-\d.]+", r'"first\ntarget"\1\n\2t2,nan'), "line 6, column X"),
     ],
     "observations.csv": [
-        (lambda text: put(r"(?m),0\.\d+,0\.\d+$", ",0.3,0.1,0.0301")(text).replace("sy", "sy,sxy", 1),
+        (lambda text: put(r"(?m)(,0\.\d+){2}$", ",0.3,0.1,0.0301")(text).replace("sy", "sy,sxy", 1),
          "line 2, column sxy: a covariance must be below sx·sy"),
         (put(",x,", ",x [px],"), "Write x, without"), (put("t5", '"t5'), "line .*is not readable"),
         (lambda text: text.rpartition(",")[0], "61: has 5 fields instead of 6; is the file cut"),

@@ -187,6 +187,8 @@ def test_sensors_that_take_turns_are_channels_if_each_has_one(tmp_path):
     assert {n: np.nanmax(v) for n, v in found.channels.items()} == {"lens": 20, "room": 25}
     with pytest.raises(DataError, match=r"2 sensors with several temperatures each .*'device'"):
         read(tmp_path, "time,device,T °C,T2 °C", rows)
+    given = read(tmp_path, "time,device,T °C,T2 °C", rows, temperatures=("T2 °C",))
+    assert np.nanmax(given.channels["room"]) == 21
     moved = [row.replace("room", "lens") for row in rows[:6]] + rows[7::2]
     assert list(read(tmp_path, "time,device,T °C,RH", moved).channels) == ["T"]
 

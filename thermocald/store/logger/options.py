@@ -296,7 +296,9 @@ def _read_in_orders(
 def find_temperature_columns(
     file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
-    if options.temperatures and not label_columns(file):
+    # else they are sensors, which may share a column
+    given = set(options.temperatures)
+    if given and (given & {*file.names} or not label_columns(file)):
         return require_columns(file.path, file.names, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
     numeric = [

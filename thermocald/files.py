@@ -67,6 +67,15 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
     return OutputError(f"{shown(path)}: cannot be {what}: {why}{advice}", status)
 
 
+@contextmanager
+def reading(path: Path, error: type[ThermocaldError]) -> Iterator[None]:
+    """Raise `error`, which names the file and the reason, for an OSError of the block."""
+    try:
+        yield
+    except OSError as cause:
+        raise error(f"{shown(path)}: cannot be read: {cause.strerror or cause}") from cause
+
+
 def shown(path: Path | str) -> str:
     """Return a path for a message, which an absurdly long one must not fill."""
     text, half = str(path), _LONGEST_SHOWN // 2
@@ -155,7 +164,7 @@ def is_unmounted(path: Path, mount: Path) -> bool:
 
 def is_ordinary(path: Path) -> bool:
     """Return whether a path leads to a file on a disk, not to a device, a pipe or the kernel."""
-    return path.is_file() and Path(os.path.realpath(path)).parts[:2] not in _KERNEL
+    return os.path.isfile(path) and Path(os.path.realpath(path)).parts[:2] not in _KERNEL
 
 
 def is_database(path: Path) -> bool:

@@ -7,6 +7,7 @@ import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,15 @@ from psycopg.rows import dict_row
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import refuse, succeed
 from tests.fleet.conftest import address, execute
-from thermocald.fleet.overview import _calibration, _sensors, _shift, fleet_lines, render_fleet
+from thermocald.fleet.overview import (
+    _calibration,
+    _complete,
+    _sensors,
+    _shift,
+    fleet_document,
+    fleet_lines,
+    render_fleet,
+)
 from thermocald.store.recording.head import Channel
 from thermocald.store.server.connection import grant
 from thermocald.store.server.fleet_reader import SPREAD, FleetCamera, FleetReader, RecentEpoch
@@ -68,7 +77,7 @@ def fleet(server):
     return server.address(name="thermocald")
 
 
-def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
+def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path, monkeypatch):
     page = tmp_path / "fleet.html"
     document = json.loads(run("fleet", fleet, "--json", "-", "--report", page))
     cameras = {c["station"]: c for c in document["cameras"]}
@@ -89,6 +98,7 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     html = page.read_text()
     (kind,) = document["types"]
     assert kind["type"] == "imx219 3280×2464"
+    assert kind["rates"]["c"]["sd_between"] < 5e-5  # without the odd one
     drawn = [html.count(f">{name}<") for name in kind["cameras"]]
     assert len(drawn) >= 14
     assert min(drawn) >= 3  # a row in each rate's drawing
@@ -112,6 +122,12 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     assert [c["station"] for c in document["cameras"]] == ["gauge3"]
     assert document["types"] == []
 
+    # each camera by its own server's clock, not by that of the last server
+    clocks = iter([time.time(), time.time() + 7200])
+    monkeypatch.setattr(FleetReader, "now", lambda _: next(clocks))
+    document = fleet_document([Path(f"{fleet}?station={name}") for name in ("late", "gauge1")])
+    assert "25 rows wait" in document["cameras"][0]["findings"][0]["text"]
+
 
 BAD = {
     "no reading in the last 20 epochs": [np.nan] * 20,
@@ -133,8 +149,21 @@ def test_a_thermometer_without_fault_alone_leaves_the_rates_to_a_warmer_camera(
     camera = FleetCamera("s", "c", "w", head, {}, times[0], 20, 20, times[0], (21.5, 22.0), False,
                          recent)  # fmt: skip
     assert [*_sensors(camera)] == ([("sensor", f"t: {trouble}")] if trouble else [])
-    warm_up = [text for _, text in _calibration(camera, times[0]) if "21.5 to 22.0 °C" in text]
+    warm_up = [text for _, text in _calibration(camera) if "21.5 to 22.0 °C" in text]
     assert bool(warm_up) == (not trouble)
+
+
+def test_a_rate_is_that_within_the_series_which_have_levels_of_their_own(head):
+    of, t = np.repeat([0, 1], 30), np.tile(np.linspace(0.0, 10.0, 30), 2)
+    measured = [k + rate * t + 0.5 * of for k, rate in enumerate(RATES[0])]
+    samples = np.column_stack([of, 60.0 * np.arange(60), t + 20 * of])
+    for values in measured:
+        samples = np.column_stack([samples, values, np.full(60, 1e-4)])
+    head = replace(head, channels={"t": Channel()})
+    camera = FleetCamera("s", "c", "w", head, {}, 3540.0, 60, 60, 3540.0, None, samples=samples)
+    _complete(camera, 3600.0)
+    rates = [rate.value for rate in camera.rates.values()]
+    assert rates == pytest.approx(list(RATES[0]), rel=1e-3)
 
 
 def test_a_shift_is_counted_in_its_standard_deviations():

@@ -122,7 +122,7 @@ DAMAGES = {
         (put(r"t0(.*\n)(.*\n)t2,[-\d.]+", r'"first\ntarget"\1\n\2t2,nan'), "line 6, column X"),
     ],
     "observations.csv": [
-        (lambda text: put("(?m)$", ",0.0101")(text.strip()).replace("0.0101", "sxy", 1),
+        (lambda text: put(r"(?m)(,0\.\d+){2}$", ",0.3,0.1,0.0301")(text).replace("sy", "sy,sxy", 1),
          "line 2, column sxy: a covariance must be below sx·sy"),
         (put(",x,", ",x [px],"), "Write x, without"), (put("t5", '"t5'), "line .*is not readable"),
         (lambda text: text.rpartition(",")[0], "61: has 5 fields instead of 6; is the file cut"),
@@ -251,6 +251,13 @@ def test_sizes_are_read_from_heads(suffix):
     assert image_size(data) == (53, 37)
     for cut in range(0, 40, 3):
         image_size(data[:cut])  # damage is no error here
+
+
+@pytest.mark.parametrize(("unit", "mm"), [(2, 25.4), (3, 10.0), (4, 1.0)])
+def test_the_resolution_of_the_focal_plane_is_per_inch_centimetre_or_millimetre(tmp_path, unit, mm):
+    tags = {0xA20E: mm / 0.0016, 0xA210: unit}
+    photograph(tmp_path / "p.jpg", "2026:06:14 12:00:01", tags=tags)
+    assert read_photograph(tmp_path / "p.jpg").pixel_pitch == pytest.approx(0.0016)
 
 
 def test_damaged_exif_is_no_warning(tmp_path):

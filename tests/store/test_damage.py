@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -15,10 +16,16 @@ from tests.commands import call
 from tests.store.small import change, stored_numbers
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.errors import StoreError, ThermocaldError
+from thermocald.store.archive import archive_store, back_up
 from thermocald.store.database import columns, file
 from thermocald.store.database.file import helper, read_wal_tail
 from thermocald.store.database.store import Store
+from thermocald.store.logger.options import LogOptions
+from thermocald.store.logger.photographs import find_photographs
+from thermocald.store.logger.temperatures import read_log
+from thermocald.store.recording.head import read_head
 from thermocald.store.series import Event
+from thermocald.store.sources import open_source
 
 NAMES = ["epoch", "frame_time", "c", "sd_x0", "status", "temperature", "blur"]
 
@@ -237,6 +244,28 @@ def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_
         with pytest.raises(StoreError, match=refused):
             Store.open(path, "append")
     assert set(Path(tempfile.gettempdir()).glob("thermocald-*")) == before
+
+
+@pytest.mark.parametrize("use", [
+    read_head, Store.open, open_source, lambda path: read_log(path, LogOptions()),
+    lambda path: find_photographs([path]), lambda path: back_up(path, path),
+    lambda path: back_up(next(path.parents[1].glob("*.db")), path),
+    lambda path: archive_store(
+        next(path.parents[1].glob("*.db")), path, None, None, False, True, print),
+])  # fmt: skip
+def test_a_closed_folder_is_said_in_one_line(crashed, monkeypatch, use):
+    """It was a PermissionError; root may look into every folder, so the system's answer is made."""
+    closed, stat = crashed.parent / "closed" / "file.csv", os.stat
+
+    def refused(path, *arguments, **options):
+        if not isinstance(path, int) and closed.parent in Path(path).parents:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return stat(path, *arguments, **options)
+
+    closed.parent.mkdir()
+    monkeypatch.setattr(os, "stat", refused)
+    with pytest.raises(ThermocaldError, match=r"closed\S*: cannot be (read|written): Permission"):
+        use(closed)
 
 
 def test_a_name_that_lacks_the_wal_is_not_read_as_whole(crashed):

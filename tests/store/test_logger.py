@@ -121,6 +121,19 @@ LOGS = {
         "{i},{b.year}年{b.month}月{b.day}日 {b:%H:%M:%S},{t:.2f},45"),
     "a remark between the rows": (
         "time,T °C", [*rows_of("{s},{t:.2f}")[:6], "# battery", *rows_of("{s},{t:.2f}")[6:]]),
+    "a remark of several lines": ("time,T °C,note", '{s},{t:.2f},"box\nopened"'),
+    # after a power cut, the end of a row and sometimes of its line is missing
+    "NULs after a power cut": ("time,T °C", [
+        "178334610\0\0\0" + row if i == 5 else row for i, row in enumerate(rows_of("{s},{t:.2f}"))],
+        "1783346600,2" + 512 * "\0"),
+    "a sensor's number": ("SensorId,Sensor,Time,Value", "123.4,1,{m:%Y-%m-%dT%H:%M:%SZ},{t:.2f}"),
+    "a head that is narrower than the rows": (
+        "No.  Time  Temp.", "{i}\t{b:%d/%m/%Y %X}\t{t:.2f} °C"),
+    "Almemo, short dates": ("DATUM:;UHRZEIT:;00: °C", "{b:%d.%m.%y};{b:%X};{c}"),
+    "a column of offsets": ("time,offset,T °C", "{e:%Y-%m-%d %X},-05:00,{t:.2f}"),
+    "a word of 12 hours in German": ("Zeit;T °C", "{b:%d.%m.%Y %I:%M:%S} nachm.;{c}"),
+    "no number of an old C library": ("time,T °C", [
+        *rows_of("{s},{t:.2f}")[:6], "1783346400,-1.#IND", *rows_of("{s},{t:.2f}")[6:]]),
 }  # fmt: skip
 SAID = {
     "Testo": "4 rows without a time: left out (line 15: 'Minimum')",
@@ -164,6 +177,20 @@ def test_sensors_below_one_another_are_channels(tmp_path):
         logged(tmp_path, data, temperatures=("sensor.lens",))
     given = {"temperatures": ("sensor.cpu",), "names": {"sensor.cpu": "processor"}}
     assert list(logged(tmp_path, data, **given).channels) == ["processor"]
+
+
+def test_sensors_that_take_turns_are_channels_if_each_has_one(tmp_path):
+    """They were one series that leapt to and fro."""
+    rows = [f"{m + timedelta(seconds=9 * k):%Y-%m-%d %X},{w},{20 + 5 * k},21"
+            for m in MOMENTS for k, w in enumerate(("lens", "room"))]  # fmt: skip
+    found = read(tmp_path, "time,device,T °C,RH", rows)
+    assert {n: np.nanmax(v) for n, v in found.channels.items()} == {"lens": 20, "room": 25}
+    with pytest.raises(DataError, match=r"2 sensors with several temperatures each .*'device'"):
+        read(tmp_path, "time,device,T °C,T2 °C", rows)
+    given = read(tmp_path, "time,device,T °C,T2 °C", rows, temperatures=("T2 °C",))
+    assert np.nanmax(given.channels["room"]) == 21
+    moved = [row.replace("room", "lens") for row in rows[:6]] + rows[7::2]
+    assert list(read(tmp_path, "time,device,T °C,RH", moved).channels) == ["T"]
 
 
 def test_of_one_sensor_of_many_only_its_readings_are_examined(tmp_path):
@@ -271,6 +298,12 @@ def test_an_encoding_is_detected_by_its_words_and_said(tmp_path, encoding, head,
     ("time,T °C\n2026-06-14 12:00,20\n", {"encoding": "utf-16"},
      "--encoding utf-16: .* cannot be read so: .*BOM"),
     (f"time,T\n{'x' * 200_000}\n", {"separator": ","}, "line 2: is not readable: field larger"),
+    # it swallowed the rows below
+    ("time,note,T\n" + "".join(
+        f"{1.78e9 + i},{'x' if i - 3 else chr(34)},{i}\n" for i in range(12)),
+     {}, "line 5: a quote is not closed"),
+    ("No.,time,x\n" + "".join(f"{i},{1.78e9 + i},{i}\n" for i in range(9)), {},
+     "which column is the temperature"),
     # 21,5 split at its comma would be 21
     ("time,T\n2026-06-14 12:00,21,5\n2026-06-14 12:01,21,75\n", {},
      "line 2: the row holds more fields than the head"),
@@ -354,6 +387,7 @@ def test_a_row_that_is_cut_off_is_left_out(tmp_path, time, lost):
     found = logged(tmp_path, data[:-lost])
     assert found.times.tolist() == TIMES[:-1]
     assert "the last row is cut off" in found.notes[-1]
+    assert logged(tmp_path, data.strip()).times.tolist() == TIMES
 
 
 DOUBTFUL = {
@@ -369,7 +403,7 @@ DOUBTFUL = {
        for head in ("temp", "T1", "Sensor 1", "value")},
     "85": ("temp °C", "{s},85.00", "all 12 readings are 85 °C"),
     "sensors below one another": (
-        "sensor,temp °C", [f"{m:%Y-%m-%d %X},S{k},{20 + k}" for m in MOMENTS for k in (0, 5)],
+        "whose,temp °C", [f"{m:%Y-%m-%d %X},S{k},{20 + k}" for m in MOMENTS for k in (0, 5)],
         "left out; its reading is another: are sensors below one another? Make a file of each"),
 }  # fmt: skip
 

@@ -13,7 +13,7 @@ import thermocald as tc
 from tests.commands import call, finish
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.series import Event
+from thermocald.store.series import Event, clock_corrections
 from thermocald.store.sources import open_source
 
 EPOCHS = 40
@@ -45,6 +45,14 @@ def stamp(tmp_path, head, field, make_epoch, make_result):
         return path
 
     return make
+
+
+def test_a_glitch_between_slow_frames_is_paired():
+    """The next frame came 100 s late, less than three intervals."""
+    times = 60.0 * np.arange(10) + 7200.0 * np.isin(np.arange(10), (3, 4, 5))
+    times[6:] += 100.0
+    corrections = clock_corrections(times, 60.0, np.ones(10), [])
+    assert np.flatnonzero(corrections).tolist() == [3, 4, 5]
 
 
 def read(path) -> dict[str, np.ndarray]:

@@ -203,7 +203,7 @@ def _check_outputs(command: str, options: dict[str, Any], values: list[tuple[str
         if kind is None:
             if isinstance(given, Path):
                 read = (given, given / "testfield.csv")  # of a recording
-                taken |= {os.path.realpath(file): option for file in read if file.is_file()}
+                taken |= {os.path.realpath(file): option for file in read if os.path.isfile(file)}
         # `--report / --no-report` is a switch, not a file
         elif isinstance(given, (str, Path)) and given not in ("", "-"):
             path = Path(given)

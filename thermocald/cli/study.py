@@ -83,7 +83,9 @@ def replay(
 
 def export(
     source: Path = typer.Argument(..., help="A recording (folder) or a store (file)."),
-    format_: str = typer.Option("csv", "--format", help="csv, json, or parquet."),
+    format_: str = typer.Option(
+        "", "--format", help="csv, json, or parquet. Default: the file's, .json or .parquet; csv."
+    ),
     output: str = typer.Option("-", "--output", "-o", help="File; - is standard output."),
     exterior: str = typer.Option(
         "",
@@ -119,6 +121,8 @@ def export(
 
     folder = source.is_dir()
     exterior = exterior or ("auto" if folder else "stored")
+    suffix = Path(output).suffix.lower()
+    format_ = format_ or (suffix[1:] if suffix in (".json", ".parquet") else "csv")
     if format_ not in ("csv", "json", "parquet"):
         raise UsageError(f"--format {format_}: must be one of csv, json, parquet")
     wanted, mark = series_export.check_style(units, time_, separator, decimal)

@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from thermocald.acquisition.frame_folder import is_chosen
 from thermocald.config import ForwardConfig
 from thermocald.errors import OutputError, ServerError, ServerGone, StoreError
-from thermocald.files import write_text
+from thermocald.files import reading, write_text
 from thermocald.names import FileFolder
 from thermocald.store.database.columns import KEPT
 from thermocald.store.database.store import Store
@@ -70,10 +70,8 @@ class Cursor(BaseModel):
 
         Raises StoreError if the store is missing.
         """
-        try:
+        with reading(store.path, StoreError):
             inode = store.path.stat().st_ino
-        except OSError as error:
-            raise StoreError(f"{store.path}: cannot be read: {error.strerror}") from error
         fresh = cls(server=server, station=station, identity=store.identity, inode=inode)
         try:
             old = cls.model_validate_json(path.read_text(encoding="utf-8"))

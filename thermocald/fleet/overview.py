@@ -173,15 +173,15 @@ _OUTSIDE_K = 2.0
 _SHIFT_PX, _SHIFT_SDS = 0.3, 6.0
 
 
-def _late(camera: FleetCamera, now: float) -> Findings:
+def _late(camera: FleetCamera) -> Findings:
     limit = max(_LATE_INTERVALS * camera.head.interval, _LATE_S)
     if camera.lag_s > limit:
         since = f"no epoch for {short_duration(camera.lag_s)}"
         state = camera.state
         if state.contact is None:
             why = "; its station has never reported"
-        elif now - state.contact > _SILENT_S:
-            ago = short_duration(now - state.contact)
+        elif camera.now - state.contact > _SILENT_S:
+            ago = short_duration(camera.now - state.contact)
             why = f"; its station last reported {ago} ago: check its power and network"
         elif state.waiting:
             why = f"; {counted(state.waiting, 'row')} waiting at its station to be sent"
@@ -241,7 +241,7 @@ def _stuck_for(camera: FleetCamera, known: Sequence[float]) -> float:
     return camera.last_time - since
 
 
-def _calibration(camera: FleetCamera, now: float) -> Findings:
+def _calibration(camera: FleetCamera) -> Findings:
     recent = camera.recent
     if len(recent) >= _FEWEST and camera.ok < _LEAST_OK:
         failed = [e.status for e in recent if e.status not in WITH_VALUES]
@@ -250,8 +250,9 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
     if not math.isfinite(camera.last_ok):
         yield "calibrate", "was never calibrated"
         return
-    if now - camera.last_ok > _OLD_S and camera.lag_s < _OLD_S:
-        yield "calibrate", f"the last result is {short_duration(now - camera.last_ok)} old"
+    age = camera.now - camera.last_ok
+    if age > _OLD_S and camera.lag_s < _OLD_S:
+        yield "calibrate", f"the last result is {short_duration(age)} old"
     low, high = camera.temperature_range or (math.nan, math.nan)
     outside = max(low - camera.temperature, camera.temperature - high)
     if outside > _OUTSIDE_K:
@@ -345,7 +346,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     type_of = {name: kind for kind in types for name in kind["cameras"]}
     for camera in cameras:
         findings = chain(
-            _late(camera, now), _sensors(camera), _calibration(camera, now),
+            _late(camera), _sensors(camera), _calibration(camera),
             _odd(camera, type_of.get(camera.name)), _clock(camera),
         )  # fmt: skip
         camera.findings = [{"kind": kind, "text": text} for kind, text in findings]

@@ -209,7 +209,7 @@ def find_blocks(
             epochs = len(open_recording(path))
         for first in range(0, epochs, size):
             target = out / name / f"part-{first:08d}.parquet"
-            if not target.exists():
+            if not os.path.exists(target):
                 blocks.append(Block(path, first, min(first + size, epochs), target, free))
     return blocks
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,7 +56,7 @@ def archive_store(
                 name = f"{one.camera}--{one.name}"  # `a-b`/`c` and `a`/`b-c` must differ
             target = folder / name
             last = opened.last_epoch(one)
-            if last is None or (skip_existing and target.exists()):
+            if last is None or (skip_existing and os.path.exists(target)):
                 continue
             archive_series(opened, one, target, frames)
             say(f"{target}: epochs to {last}")
@@ -136,13 +137,13 @@ def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
     Returns the document of the command. Raises DataError if the file exists, UsageError if its
     folder does not, StoreError for a damaged store, which is not copied.
     """
-    if target.is_dir():
+    if os.path.isdir(target):  # in a closed folder, the copy cannot be written below
         target = target / f"{store.stem}-{utc_stamp()}.db"
     elif keep:
         raise UsageError(f"--keep is for a folder of backups; {target} is not a folder")
-    if target.exists():
+    if os.path.exists(target):
         raise DataError(f"{target}: exists already; choose another name for the backup")
-    if not target.absolute().parent.is_dir():
+    if not os.path.isdir(target.absolute().parent):
         raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
     with Store.open(require_file(store)) as opened:
         opened.copy_to(target)

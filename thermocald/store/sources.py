@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import StoreError
-from thermocald.files import is_database, shown
+from thermocald.files import is_database, is_ordinary, reading, shown
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.recording.observation_file import grid_runs
 from thermocald.store.recording.reader import EpochColumns, TemperatureLog
@@ -44,7 +44,7 @@ def open_source(source: Path) -> SeriesReader:
     else:
         from thermocald.store.database.store import Store
 
-        if source.suffix.lower() in _NO_STORES and source.is_file() and not is_database(source):
+        if source.suffix.lower() in _NO_STORES and is_ordinary(source) and not is_database(source):
             raise StoreError(
                 f"{shown(source)}: is not a store; give a recording's folder or a store"
             )
@@ -72,16 +72,12 @@ def require_source(source: Path) -> Path:
 
     A server is not contacted until it is opened.
     """
-    try:
-        if not is_server(source):
-            source.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise StoreError(
-            f"{shown(source)}: does not exist; give a recording (folder), a store (file), or "
-            "postgresql://…"
-        ) from None
-    except OSError as cause:
-        raise StoreError(f"{shown(source)}: cannot be read: {cause.strerror}") from cause
+    with reading(source, StoreError):
+        if not (is_server(source) or source.exists()):
+            raise StoreError(
+                f"{shown(source)}: does not exist; give a recording (folder), a store (file), or "
+                "postgresql://…"
+            )
     return source
 
 

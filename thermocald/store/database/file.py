@@ -40,7 +40,7 @@ from thermocald.errors import (
     StoreVersionError,
     ThermocaldError,
 )
-from thermocald.files import cannot_write, is_ordinary, new_file
+from thermocald.files import cannot_write, is_ordinary, new_file, reading
 from thermocald.store import schema
 from thermocald.store.database.columns import DamageError
 
@@ -245,9 +245,10 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
 
     Raises StoreError; StoreVersionError for a file of a newer version.
     """
-    if mode == "read" and not path.is_file():
-        there = "is a folder, not a store" if path.is_dir() else "there is no such store"
-        raise StoreError(f"{path}: {there}")
+    with reading(path, StoreError):
+        if mode == "read" and not path.is_file():
+            there = "is a folder, not a store" if path.is_dir() else "there is no such store"
+            raise StoreError(f"{path}: {there}")
     if mode == "read" and written_elsewhere(path):
         raise StoreError(
             f"{path}: is or was written under another of its names (hard links) and lacks the "

@@ -190,7 +190,7 @@ _DATE = r"(?P<a>\d{1,4})(?P<mark>[-/:]|\. ?)(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4}
 _COMPACT_DATE = r"(?P<compact>\d{8})"
 _TIME = (
     r"(?P<h>\d{1,2})[:.](?P<m>\d{2})(?:[:.](?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?"
-    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?|[FfEe][Mm]|[ΠΜπμ]\.?μ\.?)?"
+    r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?|[FfEe][Mm]|[ΠΜπμ]\.?μ\.?|(?:vor|nach)m\.)?"
 )
 _COMPACT_TIME = r"(?P<ct>\d{6})(?:[.,]?(?P<cf>\d{1,9}))?"
 ZONES_H = {
@@ -365,7 +365,7 @@ def _time(found: re.Match[str]) -> time:
         if groups["half"]:
             if hour > 12:
                 raise ValueError(f"{hour} {groups['half']} is not a time")
-            hour = hour % 12 + (12 if groups["half"][0] in "PpEeΜμ" else 0)
+            hour = hour % 12 + (12 if groups["half"][0] in "PpEeΜμn" else 0)
     micro = int(part.ljust(6, "0")[:6]) if part else 0
     zone = _zone(groups["zone"]) if groups["zone"] else None
     return time(hour, minute, second, micro, tzinfo=zone)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
+from thermocald.files import reading
 from thermocald.store.logger.clock import date_orders, parse_moment
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ _MOST_COLUMNS = 1000
 _SAMPLE = 400
 _CONSISTENT = 0.8
 _PREAMBLE = 12
+_MOST_BREAKS = 5  # of the lines in a row, as in a quoted remark
 _ENDS = ("\n", "\r")
 _FOREIGN = 50  # lines by which an encoding is detected
 _ENCODINGS = (
@@ -124,6 +126,8 @@ class LoggerFile:
             for line, row in _parse_rows(self.path, lines, self.separator):
                 if line < self.first_line:
                     continue
+                if (breaks := "".join(row).count("\n")) > _MOST_BREAKS:
+                    raise DataError(f"{self.path}, line {line - breaks}: a quote is not closed")
                 more = row[width:] if self.separator == "," else []
                 if more and all(map(str.isdigit, more)):
                     raise _commas_twice(self.path, line)
@@ -218,9 +222,10 @@ def _is_shorter(rows: tuple[tuple[str, ...], ...], decimal: str) -> bool:
 
 def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
     """Yield rows that are not empty, with their lines."""
-    # `temp=` of vcgencmd, NULs after a power cut, a mark of UTF-16 written with each line
+    # `temp=` of vcgencmd, NULs in place of the end of a line before a power cut, a mark of UTF-16
+    # written with each line
     plain = (
-        line.replace("−", "-").replace("temp=", "").replace("\0", "").replace("\ufeff", "")
+        line.rpartition("\0")[2].replace("−", "-").replace("temp=", "").replace("\ufeff", "")
         for line in lines
     )
     if mark == " ":  # a head of NumPy
@@ -252,11 +257,11 @@ def _detect_encoding(path: Path) -> str:
     Of a file without a byte order mark that is not UTF-8, it is the one in which its lines hold
     most words of a log that this program knows.
     """
-    if not path.is_file():
-        raise DataError(f"{path}: {'is not a file' if path.exists() else 'does not exist'}")
-    if path.stat().st_size > _LARGEST_BYTES:
-        raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; split it")
-    try:
+    with reading(path, DataError):
+        if not path.is_file():
+            raise DataError(f"{path}: {'is not a file' if path.exists() else 'does not exist'}")
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; split it")
         with path.open("rb") as file:
             head = re.sub(rb"\0{8,}", b"", file.read(4096))  # a power cut may leave a block of them
             if not head.strip():
@@ -277,8 +282,6 @@ def _detect_encoding(path: Path) -> str:
             while text.read(_CHUNK):
                 pass
             return "utf-8"
-    except OSError as cause:
-        raise DataError(f"{path}: cannot be read: {cause.strerror}") from cause
     some = b"\n".join(lines[:_FOREIGN])
     # GB 18030 writes Chinese in pairs of high bytes; ° and ä of Western Europe are single
     pairs = all(len(run) % 2 == 0 for run in re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", some))

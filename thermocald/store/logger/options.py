@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from datetime import date, datetime
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError, UsageError
@@ -42,6 +43,14 @@ if TYPE_CHECKING:
 
 
 _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
+_SENSOR = re.compile(
+    r"(?:sensor|probe|device|logger|station|location|channel|name|series|topic|place|kanal)"
+    r"[ _.-]?(id|name|no|nr|number)?\.?",
+    re.IGNORECASE,
+)
+"""Heads of columns that name the sensor of a row."""
+_SHIFT = re.compile(r"(?:UTC|GMT)?[+-]\d\d:\d\d")
+_SHORT_DATE = re.compile(r"\d\d\.\d\d\.\d\d")
 _LONGER = 10.0  # ratio of spans: in the wrong order, a log of days spans months or years
 
 
@@ -142,18 +151,37 @@ def find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
         return require_columns(file.path, file.names, options.times, "--time-column")
     found = _guess_time_columns(file)
     words = {name: set(filter(None, file.column(name))) for name in file.names}
-    zones = [name for name, said in words.items() if said and said <= ZONES_H.keys()]
+    zones = [
+        name
+        for name, said in words.items()
+        if said and (said <= ZONES_H.keys() or all(map(_SHIFT.fullmatch, said)))
+    ]
     return (*found, *zones[:1]) if lacks_zone(file.column(found[-1])[0]) else found
 
 
 def label_columns(file: LoggerFile) -> list[str]:
     """Return the columns that name the sensor of a row, if one table has all sensors.
 
-    That is `entity_id` of Home Assistant; of InfluxDB, the words that differ between the rows.
+    That is `entity_id` of Home Assistant; of InfluxDB, the words that differ between the rows; else
+    a column called so whose words alternate.
     """
     if "_value" in file.names:
         return [n for n in file.of_kind("text", "empty") if len(set(file.column(n))) > 1]
-    return [name for name in ("entity_id",) if name in file.names]
+    if "entity_id" in file.names:
+        return ["entity_id"]
+    labels = {name: file.column(name) for name in file.names if _is_label(file, name)}
+    return [
+        name
+        for name, words in labels.items()
+        if sum(a != b for a, b in pairwise(words)) > 2 * len(set(words)) > 2
+    ]
+
+
+def _is_label(file: LoggerFile, name: str) -> bool:
+    """Return whether a column is called as a sensor and has no readings, but words or numbers."""
+    found = _SENSOR.fullmatch(name)
+    is_word = name in file.of_kind("text", "empty") or all(map(str.isdigit, file.column(name)))
+    return found is not None and bool(found[1] or is_word)
 
 
 def _guess_time_columns(file: LoggerFile) -> tuple[str, ...]:
@@ -167,6 +195,9 @@ def _guess_time_columns(file: LoggerFile) -> tuple[str, ...]:
     if found := found or list(filter(TIME_NAME.search, seconds)):
         return (found[0],)
     dates, clocks = file.of_kind("date"), file.of_kind("time")
+    if not dates:  # 14.06.26, which could also be a time
+        dates = [n for n in clocks if all(map(_SHORT_DATE.fullmatch, file.column(n)))][:1]
+        clocks = [n for n in clocks if n not in dates]
     if dates and clocks:
         return (dates[0], clocks[0])
     if len(seconds) == 1:
@@ -265,10 +296,14 @@ def _read_in_orders(
 def find_temperature_columns(
     file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
-    if options.temperatures and not label_columns(file):
+    # else they are sensors, which may share a column
+    given = set(options.temperatures)
+    if given and (given & {*file.names} or not label_columns(file)):
         return require_columns(file.path, file.names, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
-    numeric = [n for n in file.of_kind("number", "seconds") if n not in times]
+    numeric = [
+        n for n in file.of_kind("number", "seconds") if n not in times and not _is_label(file, n)
+    ]
     of_name = [n for n in numeric if TEMPERATURE_NAME.search(n)]
     plain = [n for n in of_name if not OTHER_NAME.search(n)]
     # a mean is a reading unless it is one of another column
@@ -278,7 +313,11 @@ def find_temperature_columns(
     named = [n for n in of_name if n in {*plain, *means} and n not in wanted]
     if wanted or named:
         return (*wanted, *named)
-    others = [n for n in numeric if not OTHER_NAME.search(n) and n not in OUR_TIMES]
+    others = [
+        n
+        for n in numeric
+        if not OTHER_NAME.search(n) and n not in OUR_TIMES and not _counts(file.column(n))
+    ]
     if len(others) == 1:
         return (others[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
@@ -286,6 +325,13 @@ def find_temperature_columns(
         f"{file.path}: which column is the temperature? Give --temperature-column NAME. "
         f"{shown[:400]}"
     )
+
+
+def _counts(texts: Sequence[str]) -> bool:
+    """Return whether texts are the numbers of the rows."""
+    numbers = [int(text) for text in texts if text.isdecimal()]
+    rise = sum(b - a == 1 for a, b in pairwise(numbers))
+    return len(numbers) == len(texts) > 2 and rise >= len(texts) - 2  # the sample has a gap
 
 
 def quoted(names: Iterable[str]) -> str:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
+from thermocald.files import reading
 from thermocald.names import file_name
 from thermocald.numbers import counted, short_duration
 from thermocald.photogrammetry.camera.camera_model import Sensor
@@ -88,15 +89,16 @@ def find_photographs(paths: list[Path]) -> list[Path]:
         raise DataError("no photographs are given")
     found: list[Path] = []
     for path in paths:
-        if path.is_dir():
-            # macOS leaves ._IMG_1.jpg, which is no picture, beside IMG_1.jpg
-            found += sorted(
-                p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.name[0] != "."
-            )
-        elif path.is_file():
-            found.append(path)
-        else:
-            raise DataError(f"{path}: there is no such file or folder")
+        with reading(path, DataError):
+            if path.is_dir():
+                # macOS leaves ._IMG_1.jpg, which is no picture, beside IMG_1.jpg
+                found += sorted(
+                    p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.name[0] != "."
+                )
+            elif path.is_file():
+                found.append(path)
+            else:
+                raise DataError(f"{path}: there is no such file or folder")
     if not found:
         raise DataError(
             f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))}); convert others, "
@@ -199,7 +201,7 @@ def find_copies(paths: Sequence[Path]) -> dict[int, int]:
 
 def strange_photographs(paths: Sequence[Path]) -> list[str]:
     """Return doubts about the frames of a recording, a sentence each."""
-    there = list(dict.fromkeys(path for path in paths if path.is_file()))
+    there = list(dict.fromkeys(path for path in paths if os.path.isfile(path)))
     found = []
     if copies := find_copies(there):
         copy, original = next(iter(copies.items()))

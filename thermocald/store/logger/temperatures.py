@@ -171,6 +171,11 @@ def _separate_sensors(table: _Table, sensors: Sequence[str], options: LogOptions
     asked = [name for name in options.temperatures if name not in table.file.names]
     names = require_columns(path, sensors, asked, "--temperature-column")
     names = names or tuple(filter(options.wanted.__contains__, sensors))
+    if len(table.values) > 1:
+        raise DataError(
+            f"{path}: has rows of {counted(len(sensors), 'sensor')} with several temperatures each "
+            f"(column {quoted(label_columns(table.file))}): make a file of each sensor"
+        )
     ((column, values),) = table.values.items()
     labels = np.array(table.labels)
     every = {n: np.where(labels == n, values, np.nan) for n in names or sensors}
@@ -392,7 +397,7 @@ class _Table:
             value = np.nan
         if math.isfinite(value) and value not in _NO_READING:
             return value
-        if re.match(r"[^#]*\d", text) and value not in _NO_READING:
+        if re.match(r"(?!-?1\.#)[^#]*\d", text) and value not in _NO_READING:
             raise DataError(
                 f"{self.file.path}, line {line}, column {name!r}: {text[:40]!r} is not a number"
             )

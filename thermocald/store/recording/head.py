@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import DataError, RecordingError
-from thermocald.files import QuantityReader, read_yaml
+from thermocald.files import QuantityReader, read_yaml, reading
 from thermocald.names import require_channels
 from thermocald.photogrammetry.camera.camera_model import CameraSpec as CameraSpec
 
@@ -75,10 +75,12 @@ class _Reader(QuantityReader):
 def read_head(folder: Path) -> Head:
     """Read `recording.yaml` of a folder. Raises RecordingError naming file and key."""
     path = folder / "recording.yaml"
-    if not folder.is_dir():
-        raise RecordingError(f"{folder}: is not a folder with recording.yaml, as a recording is")
-    if not path.is_file():
-        raise RecordingError(f"{folder}: is not a recording: recording.yaml is missing")
+    with reading(path, RecordingError):
+        if not folder.is_dir():
+            what = "is not a folder with recording.yaml, as a recording is"
+            raise RecordingError(f"{folder}: {what}")
+        if not path.is_file():
+            raise RecordingError(f"{folder}: is not a recording: recording.yaml is missing")
     head = parse_head(read_yaml(path, RecordingError), path)
     require_channels(head.channels, f"{path}, key temperatures", RecordingError)
     return head

@@ -58,9 +58,11 @@ class RecordingWriter:
 
     def __enter__(self) -> Self:
         require_channels(self._head.channels, str(self.path), RecordingError)
-        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
-            raise RecordingError(f"{self.path}: exists already; choose another name or remove it")
         with self._in_words():
+            if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+                raise RecordingError(
+                    f"{self.path}: exists already; choose another name or remove it"
+                )
             shutil.rmtree(self._partial, ignore_errors=True)
             self._partial.mkdir(parents=True)
             for name, text in (

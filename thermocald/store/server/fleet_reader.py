@@ -125,6 +125,11 @@ class FleetCamera:
     def name(self) -> str:
         return f"{self.station}/{self.camera}"
 
+    @property
+    def now(self) -> float:
+        """The clock of the camera's server when it was read, s UTC."""
+        return self.last_time + self.lag_s
+
 
 class FleetReader(Connected):
     """A server, to read the state of all cameras that its address selects."""

@@ -370,7 +370,13 @@ def _draw_curve(axis: Any, curve: Curve) -> None:
         x = np.column_stack([curve.x, ends, np.full(len(curve.x), np.nan)]).ravel()
         y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()
         axis.plot(
-            x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label, snap=False
+            x,
+            y,
+            color=curve.colour,
+            linewidth=2.2,
+            label=label,
+            snap=False,
+            solid_capstyle="projecting" if curve.dashed else "round",
         )
         return
     style = "--" if curve.dashed else "-"

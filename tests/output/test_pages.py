@@ -36,10 +36,11 @@ from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
 from thermocald.errors import DriverMissing
 from thermocald.figures import Curve, Figure, Panel, draw_panel
-from thermocald.fleet.overview import render_fleet
+from thermocald.fleet.overview import _drawing, render_fleet
 from thermocald.numbers import spanned
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
+from thermocald.output.study.figures import deviation_figure
 from thermocald.output.study.report import render_study, save_figures
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -323,6 +324,25 @@ def test_only_effects_that_move_the_image_have_a_pattern(undrawn):
     words = words_of(_discovered(("decentering_drift", "defocus"), "two", seed=1))
     assert "Effect found: defocus" in words
     assert "in the pattern of decentering_drift, root mean square" in words
+
+
+def test_bars_and_band_of_a_fleet_hold_95_percent():
+    """A rate and its standard deviation of 1 and 0.2 µm/K; the type's 3 and 0.5 µm/K."""
+    one = {"station": "weir", "camera": "cam", "findings": [],
+           "rates": {"c": {"value": 1e-3, "sd": 2e-4}}}  # fmt: skip
+    kind = {"cameras": ["weir/cam"], "rates": {"c": {"value": 3e-3, "sd_between": 5e-4}}}
+    (axis,) = _drawing("drawing", "c", kind, [one]).drawing.axes
+    band = axis.patches[0].get_extents().transformed(axis.transData.inverted())
+    assert band.intervalx == pytest.approx([3 - 1.96 * 0.5, 3 + 1.96 * 0.5])
+    (bar,) = axis.collections[0].get_segments()
+    assert bar[:, 0] == pytest.approx([1 - 1.96 * 0.2, 1 + 1.96 * 0.2])
+
+
+def test_twelve_series_are_drawn_in_twelve_ways():
+    """Those after the tenth had the colours of the first, in lines as in points."""
+    (camera,) = warm_study().cameras
+    figure = deviation_figure(replace(camera, series=12 * camera.series[:1]))
+    assert all(len({(c.colour, c.dashed) for c in p.curves}) == 12 for p in figure.panels)
 
 
 def test_the_epochs_report_opens_with_the_drift(open_page):

@@ -398,9 +398,10 @@ def _warmed(study: SeriesStudy) -> str:
     if reference is None or reference.name not in study.deviations:
         return ""
     d = study.deviations[reference.name]
-    name, known = parameter_label(reference.name), int(np.isfinite(reference.values).sum())
+    label, known = parameter_label(reference.name), int(np.isfinite(reference.values).sum())
+    name = "the temperature" if label == "temperature" else f"the temperature ({label})"
     if known < len(study.series):
-        name += f" (known in {known} of {len(study.series)} epochs)"
+        name += f", known in {known} of {len(study.series)} epochs,"
     if d.returned:
         rose, largest = "rose" if d.largest > 0 else "fell", plain(abs(d.largest), "K", 3)
         within = plain(d.range, "K", 3)

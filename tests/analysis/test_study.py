@@ -294,6 +294,9 @@ def test_a_nearly_steady_camera_is_described_by_numbers_that_hold(warm_up):
     assert float(re.search(r"stayed within (\S+) px", text)[1]) == pytest.approx(farthest, rel=0.05)
     assert re.search(r"errors of 0\.00\d\d+ cm on average and up to 0\.0\d\d+ cm", text)
     assert re.search(r"while the temperature stayed within 0\.\d\d K\.", text)
+    steady.values[:, 1] += np.linspace(0.0, 2.0 * SDS[1], len(steady))  # 14 of its sds
+    (change,) = answer_sentences(study_camera("rpi", [steady], StudySettings(sets=500)), 1e4)[:1]
+    assert "the principal point moved by" in change
 
 
 def test_the_covariance_of_displacements_is_their_scatter(warm_up):

@@ -176,7 +176,7 @@ def test_one_result_prints_documents_draws_and_reports(
         with pytest.raises(UsageError, match="would be overwritten"):
             result.write("points.csv")
         again = tc.correct(tmp_path / "corrected.csv", camera, log="M1")
-        with pytest.raises(DataError, match=r"column dx would stand twice.*corrected already"):
+        with pytest.raises(DataError, match=r"column dx would occur twice.*corrected already"):
             again.write(tmp_path / "again.csv")
     if name == "Discovery":
         assert result.verdict == "effects_found"

@@ -462,9 +462,9 @@ def test_a_legend_stays_in_its_drawing(names):
     assert len({text.get_text() for text in legend.get_texts()}) == len(names)
 
 
-def test_series_that_differ_only_in_their_numbers_share_a_sentence(page_text):
+def test_series_that_differ_only_in_their_numbers_share_a_sentence(undrawn):
     """Seven series were fourteen nearly equal sentences."""
-    words = words_of(page_text("study-names"))
+    words = words_of(_study_of_names(None))
     assert words.count("All 3 series: between ") == words.count("All 3 series: in 25 minutes") == 1
     rates = [f"x₀ by {rate} px/K in {k} s" for k, rate in enumerate(("−0.35 ± 0.1", "+2", "−0.36"))]
     assert spanned(rates) == "x₀ by −0.36 to +2 px/K in 0–2 s"

@@ -249,8 +249,8 @@ def answer_sentences(camera: CameraStudy, distance_mm: float) -> list[str]:
     if mc is not None:
         sentences.append(
             f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
-            "about the series' mean with the correlations of an epoch's adjustment (the "
-            f"reference's procedure) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
+            "about the series' mean with the correlations of an epoch's adjustment (the procedure "
+            f"of Elias et al. 2020) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
             f"average and up to {plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of "
             f"{mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."

@@ -380,6 +380,14 @@ def test_down_in_a_figure_is_down_in_the_image(name, open_page):
         assert places == sorted(places)
 
 
+def test_strong_correlations_and_what_limits_a_printed_field_are_stated(page_text):
+    table = page_text("calibration").partition("Correlations beyond ±0.5")[2]
+    strong = [abs(float(r)) for r in re.findall(r">−?(0\.\d+)</td>", table.partition("</table>")[0])]
+    assert 0.5 <= min(strong) < 0.95
+    words = words_of(page_text("field-check"))
+    assert "With the stated errors of the targets' coordinates one image gives" in words
+
+
 def test_photographs_without_targets_are_one_line(undrawn):
     words = words_of(_calibrated("camera", factor=0.25, more=[Observations.none()] * 90))
     assert words.count("5.jpg, 6.jpg, 7.jpg and 87 more: ") == 1

@@ -172,7 +172,7 @@ def test_one_result_prints_documents_draws_and_reports(
     if name == "Correction":
         for _ in range(2):  # the second counts anew
             result.write(tmp_path / "corrected.csv")
-        assert result.points == 2
+        assert (result.points, result.extrapolated_rows) == (2, 0)
         with pytest.raises(UsageError, match="would be overwritten"):
             result.write("points.csv")
         again = tc.correct(tmp_path / "corrected.csv", camera, log="M1")

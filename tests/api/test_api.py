@@ -21,6 +21,7 @@ import pytest
 import thermocald as tc
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
+from tests.recordings import read_rows
 from thermocald.discovery.plan import Plan
 from thermocald.errors import ConfigurationError, DataError, RecordingError, StoreError, UsageError
 from thermocald.result import jsonable
@@ -173,6 +174,10 @@ def test_one_result_prints_documents_draws_and_reports(
         for _ in range(2):  # the second counts anew
             result.write(tmp_path / "corrected.csv")
         assert (result.points, result.extrapolated_rows) == (2, 0)
+        rows = read_rows(tmp_path / "corrected.csv")
+        moved = np.array([[float(row[key]) for key in ("dx", "dy")] for row in rows])
+        rms = result.as_dict()["rms_correction_px"]
+        assert rms == pytest.approx(np.sqrt(np.mean(moved**2)), rel=1e-4)
         with pytest.raises(UsageError, match="would be overwritten"):
             result.write("points.csv")
         again = tc.correct(tmp_path / "corrected.csv", camera, log="M1")

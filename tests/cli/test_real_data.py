@@ -40,6 +40,7 @@ def test_fixed_cameras(shared, camera, exterior):
     assert [p["name"] for p in found["parameters"]] == ["c", "x0", "y0"]
 
 
+@pytest.mark.slow
 def test_a_hand_held_board_is_called_weak(shared):
     """Residuals are sub-pixel, all views within some degrees of frontal."""
     folder = shared / "data" / "charuco"

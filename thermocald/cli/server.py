@@ -232,8 +232,8 @@ def reprocess(
         places = [{"source": source_name(o.task[0])} for o in failed]
         summary = f"{count - len(failed)} of {count} series analysed"
     errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
-    document = {"format": "thermocald-reprocess/1", **document, "failed": errors}
-    show(document, json, f"{out}: {summary}")
+    found = {"format": "thermocald-reprocess/1", **document, "failed": errors}
+    show(found, json, f"{out}: {summary}")
     if not failed:
         return
     first = failed[0]

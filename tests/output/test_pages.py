@@ -365,6 +365,13 @@ def test_the_epochs_report_opens_with_the_drift(open_page):
     assert max(page.evaluate(wide)) <= 0  # what the command prints stays on the paper
 
 
+def test_the_time_axis_of_a_single_epoch_is_a_minute(tmp_path):
+    """It was four years, with a warning."""
+    recording = open_recording(make_recording(tmp_path / "small", 1))
+    axis = series_epochs(recording, AdjustmentSettings(), "auto").plot().axes[0]
+    assert np.ptp(axis.get_xlim()) == pytest.approx(1 / 1440)  # days
+
+
 @pytest.mark.parametrize("name", ["calibration", "field-check"])
 def test_down_in_a_figure_is_down_in_the_image(name, open_page):
     """If a label states that y grows downwards, its ticks do."""

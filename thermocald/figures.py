@@ -369,9 +369,8 @@ def _draw_curve(axis: Any, curve: Curve) -> None:
         ends = curve.x + (short or 1e-9)
         x = np.column_stack([curve.x, ends, np.full(len(curve.x), np.nan)]).ravel()
         y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()
-        axis.plot(
-            x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label, snap=False
-        )
+        cap: Any = "projecting" if curve.dashed else "round"
+        axis.plot(x, y, color=curve.colour, lw=2.2, solid_capstyle=cap, label=label, snap=False)
         return
     style = "--" if curve.dashed else "-"
     axis.plot(curve.x, curve.y, style, color=curve.colour, linewidth=1.1, label=label)

@@ -209,10 +209,10 @@ def checked(public: Public) -> Public:
         for name, value in (*zip(names, given, strict=False), *named.items()):
             kind = kinds().get(name, Any)
             if not _accepts(kind, value):
-                without = " without a NUL character" * ("\\x00" in repr(value))
-                raise UsageError(
-                    f"{name} is {repr(value)[:80]}; it must be {_in_words(kind)}{without}"
-                )
+                shown = repr(value)
+                without = " without a NUL character" * ("\\x00" in shown)
+                shown = shown if len(shown) <= 80 else f"{shown[:79]}…"
+                raise UsageError(f"{name} is {shown}; it must be {_in_words(kind)}{without}")
         return public(*given, **named)
 
     return cast("Public", called)

@@ -186,6 +186,11 @@ def _times_power(value: float, exponent: int, decimals: int, unit: str) -> str:
     return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 
+def celsius(T: float) -> str:
+    """Write a temperature in °C, without the unit, to a hundredth at most."""
+    return f"{round(T, 2):zg}".replace("-", _MINUS)
+
+
 def counted(count: int, noun: str) -> str:
     """Write `1 epoch`, `3 epochs`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"

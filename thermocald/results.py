@@ -19,7 +19,7 @@ from thermocald.discovery.result import build_model, field_lines, mount_lines, s
 from thermocald.errors import DataError
 from thermocald.figures import draw_figure
 from thermocald.names import tell_apart
-from thermocald.numbers import counted, percent, plain, with_sd
+from thermocald.numbers import counted, percent, plain
 from thermocald.output import calibration as calibration_report
 from thermocald.output import discovery as discovery_report
 from thermocald.output.study import report as study_report
@@ -94,10 +94,11 @@ class Discovery(discoveries.Discovery, Result):
             lines.append(say_adequate(self.examination))
         for effect in self.effects:
             lines.append(f"{effect.effect}: {effect.statement}")
-            for name, e in effect.estimates.items():
-                if isinstance(e["value"], float):
-                    sd = math.nan if e["sd"] is None else e["sd"]
-                    lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
+            lines += [
+                f"    {name} = {discovery_report.estimate_text(e)}"
+                for name, e in effect.estimates.items()
+                if isinstance(e["value"], float)
+            ]
             evidence = effect.evidence
             if "false_alarm_probability" in evidence:
                 drawn = evidence["surrogates"]

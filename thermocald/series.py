@@ -153,7 +153,8 @@ class Series:
         known = self.temperature[np.isfinite(self.temperature)]
         if len(known):
             reference = next(iter(self.temperatures))
-            text += f", {known.min():.1f} to {known.max():.1f} °C (reference: {reference})"
+            span = f"{known.min():z.1f} to {known.max():z.1f} °C".replace("-", "−")
+            text += f", {span} (reference: {reference})"
         return text + ">"
 
     def calibrate(

@@ -311,7 +311,7 @@ def measure(
         tell(f"{path}, line {line}: {why}; left out")
     when = seconds_of(seen, clock, order, table)
     if not table.known_at(np.array([when])).all():
-        raise DataError(f"--seen {seen}: the log {log} does not tell the temperature of that time")
+        raise DataError(f"--seen {seen}: the log {log} has no temperature at that time")
     return measure_places(thermal, table, controls, when, plane, rows, extrapolate)
 
 
@@ -383,7 +383,9 @@ def fit_calibrations(
     require_within(T0=(T0, COLDEST_C), temperature_sd=(temperature_sd, 0.0))
     for name in calibrations:
         if not calibrated.is_calibration(source_of(name)):
-            raise UsageError(f"{name}: is not a calibration; fit series and calibrations apart")
+            raise UsageError(
+                f"{name}: is not a calibration; fit series and calibrations separately"
+            )
     given = [calibrated.read_calibration(source_of(name), T) for name, T in calibrations.items()]
     channel = "temperature"
     if log is not None:

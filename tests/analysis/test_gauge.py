@@ -134,7 +134,7 @@ def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
     _, inside, outside, far, _ = (r.adjustment for r in results)
     assert outside.sd[0] > 2 * inside.sd[0]
     assert far.interior is None
-    assert "-5 to 45 °C" in far.reason
+    assert "−5 to 45 °C" in far.reason
     assert [kind for kind, _ in events] == ["outside_range", "predicted"]
     gauge = GaugeCalibrator(thermal_camera())
     gauge.predictor.take(START, {"h": 20.0})

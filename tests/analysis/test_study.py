@@ -195,7 +195,7 @@ def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
     found = study_series(with_temperature(series, temperature), SETTINGS)
     assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
     text = " ".join(answer_sentences(study_camera("c", [found.series], SETTINGS), 1e4))
-    assert "while temperature (known in 140 of 150 epochs) changed by" in text
+    assert "while the temperature, known in 140 of 150 epochs, changed by" in text
     # a constant parameter has no dependence
     assert "A1" not in found.channels[0].dependences
     assert (found.deviations["A1"].change, found.significance["A1"].drift) == (0, None)
@@ -294,7 +294,10 @@ def test_a_nearly_steady_camera_is_described_by_numbers_that_hold(warm_up):
     farthest = np.hypot(*steady.path_px.T).max()
     assert float(re.search(r"stayed within (\S+) px", text)[1]) == pytest.approx(farthest, rel=0.05)
     assert re.search(r"errors of 0\.00\d\d+ cm on average and up to 0\.0\d\d+ cm", text)
-    assert re.search(r"while temperature stayed within 0\.\d\d K\.", text)
+    assert re.search(r"while the temperature stayed within 0\.\d\d K\.", text)
+    steady.values[:, 1] += np.linspace(0.0, 2.0 * SDS[1], len(steady))  # 14 of its sds
+    (change,) = answer_sentences(study_camera("rpi", [steady], StudySettings(sets=500)), 1e4)[:1]
+    assert "the principal point moved by" in change
 
 
 def test_the_covariance_of_displacements_is_their_scatter(warm_up):

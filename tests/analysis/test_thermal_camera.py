@@ -128,7 +128,7 @@ def test_missing_readings_are_refused():
     with pytest.raises(UsageError, match="temperature is nan: give one in °C"):
         camera.at(float("nan"))
     for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
-        with pytest.raises(UsageError, match="for each of its times"):
+        with pytest.raises(UsageError, match="for each time"):
             camera.along(times, temperatures, at)
     with pytest.raises(UsageError, match="no reading"):
         camera.live().update(0.0, {})

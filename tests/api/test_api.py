@@ -12,6 +12,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ import pytest
 import thermocald as tc
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
+from tests.recordings import read_rows
 from thermocald.discovery.plan import Plan
 from thermocald.errors import ConfigurationError, DataError, RecordingError, StoreError, UsageError
 from thermocald.result import jsonable
@@ -171,11 +173,15 @@ def test_one_result_prints_documents_draws_and_reports(
     if name == "Correction":
         for _ in range(2):  # the second counts anew
             result.write(tmp_path / "corrected.csv")
-        assert result.points == 2
+        assert (result.points, result.extrapolated_rows) == (2, 0)
+        rows = read_rows(tmp_path / "corrected.csv")
+        moved = np.array([[float(row[key]) for key in ("dx", "dy")] for row in rows])
+        rms = result.as_dict()["rms_correction_px"]
+        assert rms == pytest.approx(np.sqrt(np.mean(moved**2)), rel=1e-4)
         with pytest.raises(UsageError, match="would be overwritten"):
             result.write("points.csv")
         again = tc.correct(tmp_path / "corrected.csv", camera, log="M1")
-        with pytest.raises(DataError, match=r"column dx would stand twice.*corrected already"):
+        with pytest.raises(DataError, match=r"column dx would occur twice.*corrected already"):
             again.write(tmp_path / "again.csv")
     if name == "Discovery":
         assert result.verdict == "effects_found"
@@ -321,7 +327,7 @@ OF_A_CAMERA = {
     "an array .H, W. or .H, W, c": lambda c: fed(c).correct(np.zeros((2464, 3280, 3, 2), np.uint8)),
     "a temperature is no number": lambda c: c.along(TIMES, "hot"),
     "temperature is {'board': '30'}": lambda c: c.live().update(0.0, {"board": "30"}),
-    "the frame is a list: give an array": lambda c: c.live().correct([[1, 2], [3, 4]]),
+    "the frame is list: give an array": lambda c: c.live().correct([[1, 2], [3, 4]]),
     "no reading yet": lambda c: c.live().correct(FRAME),
     "to one run: make another": lambda c: pickle.dumps(fed(c)),
     "not later than the last reading": lambda c: fed(c).update(0.0, 30.0),
@@ -359,6 +365,13 @@ def test_every_argument_is_checked():
 def test_an_argument_out_of_bounds_is_refused(inside, M1, message):
     with pytest.raises((UsageError, DataError, ConfigurationError), match=message):
         OUT_OF_BOUNDS[message](M1)
+
+
+def test_temperatures_of_a_model_are_printed_with_a_minus_sign_or_not_at_all(camera):
+    cold = replace(camera.model, T0=-21.94, validity={"temperature": (-35.0, -9.9)})
+    assert "from −35 to −9.9 °C, T0 = −21.94 °C" in str(replace(camera, model=cold))
+    assert str(replace(camera, model=cold).at(-20)).startswith("rpi-v2.1 at −20 °C\n")
+    assert "nan" not in str(replace(camera, model=replace(camera.model, validity={})))
 
 
 @pytest.mark.parametrize("message", OF_A_CAMERA)

@@ -367,7 +367,7 @@ def test_a_lens_that_is_not_the_model_s_is_doubted():
     doubted = {0.0: 0, 0.045: 0}
     for off in doubted:
         wrong = 0
-        for seed in range(30):
+        for seed in range(16):
             world = few(seed, 8)
             world.off["c"] -= off
             with contextlib.suppress(DataError):

@@ -10,11 +10,6 @@ import numpy as np
 import pytest
 
 from tests.commands import document, finish
-from tests.recordings import read_rows
-from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
-from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 @pytest.mark.slow
@@ -38,33 +33,6 @@ def test_fixed_cameras(shared, camera, exterior):
     assert ((low <= ratios) & (ratios <= high)).all(), ratios
     assert not any(p["drift"] for p in found["parameters"])
     assert [p["name"] for p in found["parameters"]] == ["c", "x0", "y0"]
-
-
-def test_a_hand_held_board_is_called_weak(shared):
-    """Residuals are sub-pixel, all views within some degrees of frontal."""
-    folder = shared / "data" / "charuco"
-    board = cv2.aruco.CharucoBoard(
-        (12, 8), 15.5864, 12.1227, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
-    )
-    detector = cv2.aruco.CharucoDetector(board)
-    rows = read_rows(folder / "targets.csv")
-    points = [[float(row[k]) for k in ("X_mm", "Y_mm", "Z_mm")] for row in rows]
-    field = TestField.build([row["charuco_corner_id"] for row in rows], points)
-    video = cv2.VideoCapture(str(folder / "testcalibration.mp4"))
-    measured = []
-    for _ in range(3):
-        images = [video.read()[1] for _ in range(6)]
-        corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY))
-        seen = corners.reshape(-1, 2).astype(float)
-        measured.append(Observations(ids.ravel().astype(np.int64), seen, np.full(seen.shape, 0.1)))
-    video.release()
-    result = calibrate_observations(
-        [str(i) for i in range(len(measured))], measured, {}, field,
-        CameraSpec("", Sensor(1920, 1080, 0.001)), AdjustmentSettings(),
-    )  # fmt: skip
-    assert result.status == "weak_geometry"
-    assert result.reason
-    assert not result.estimated
 
 
 @pytest.mark.slow

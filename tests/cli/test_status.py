@@ -147,5 +147,5 @@ def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path)
             succeed(*command.split())
     for place, store in ((places[1], "there.db"), (places[0], "here.db")):
         place.write_text(f"store: {{path: {store}}}\nthermometers: [{{name: h, driver: mock}}]\n")
-        with pytest.raises(ThermocaldError, match=f"no daemon runs for .*/{store}"):
+        with pytest.raises(ThermocaldError, match=f"no daemon is running for .*/{store}"):
             succeed("status")

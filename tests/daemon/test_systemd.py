@@ -127,7 +127,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
 
     assert timer()[0] == 2  # no configuration: one line, no traceback
     daemon.configure(**devices())
-    assert "nothing was stored yet" in timer()[1]
+    assert "nothing has been stored yet" in timer()[1]
     for series in ("M1", "M2"):
         daemon.configure(**devices(series=series), keep="all", frames={"max_age_days": 1})
         daemon.start(**SYNCHRONISED)

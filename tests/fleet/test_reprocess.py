@@ -108,7 +108,7 @@ def test_bad_usage_is_said(archive, tmp_path):
 @pytest.mark.slow
 def test_series_are_analysed_one_by_one_and_done_ones_are_left(archive, tmp_path):
     run = ("reprocess", archive, "--out", tmp_path / "o", "--do", "study", "--sets", "500")
-    assert document(*run) == {"series": 2, "failed": []}
+    assert document(*run) == {"format": "thermocald-reprocess/1", "series": 2, "failed": []}
     names = sorted(p.name for p in (tmp_path / "o").iterdir())
     assert names == ["rpi-v2.1-M1.json", "rpi-v2.1-M2.json"]
     (tmp_path / "o" / names[0]).unlink()

@@ -159,7 +159,7 @@ def test_health_and_metrics(get, live):
     (live / "status.json").unlink()
     assert get("/healthz").status_code == 503
     assert "thermocald_up 0.0" in get("/metrics").text
-    assert get("/camera.json").json()["error"] == "no daemon runs that has a camera"
+    assert get("/camera.json").json()["error"] == "no daemon with a camera is running"
 
 
 def test_the_camera_of_now_in_opencv_terms_and_for_ros(get, live):

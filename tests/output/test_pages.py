@@ -36,12 +36,13 @@ from thermocald.analysis.study.study import study
 from thermocald.discovery.result import discover_series
 from thermocald.errors import DriverMissing
 from thermocald.figures import Curve, Figure, Panel, draw_panel
-from thermocald.fleet.overview import render_fleet
-from thermocald.numbers import spanned
-from thermocald.output.calibration import render_calibration
+from thermocald.fleet.overview import _drawing, render_fleet
+from thermocald.numbers import spanned, with_sd
+from thermocald.output.calibration import _by_radius, render_calibration
 from thermocald.output.discovery import report_html
+from thermocald.output.study.figures import deviation_figure
 from thermocald.output.study.report import render_study, save_figures
-from thermocald.photogrammetry.camera.camera_model import CameraSpec
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
@@ -325,6 +326,36 @@ def test_only_effects_that_move_the_image_have_a_pattern(undrawn):
     assert "in the pattern of decentering_drift, root mean square" in words
 
 
+def test_bands_hold_95_percent():
+    """Of a fleet: a rate and its standard deviation of 1 and 0.2 µm/K; the type's 3 and 0.5 µm/K.
+
+    Of residuals of 0.1 px: the mean of 100 in each ring.
+    """
+    one = {"station": "weir", "camera": "cam", "findings": [],
+           "rates": {"c": {"value": 1e-3, "sd": 2e-4}}}  # fmt: skip
+    kind = {"cameras": ["weir/cam"], "rates": {"c": {"value": 3e-3, "sd_between": 5e-4}}}
+    (axis,) = _drawing("drawing", "c", kind, [one]).drawing.axes
+    band = axis.patches[0].get_extents().transformed(axis.transData.inverted())
+    assert band.intervalx == pytest.approx([3 - 1.96 * 0.5, 3 + 1.96 * 0.5])
+    (bar,) = axis.collections[0].get_segments()
+    assert bar[:, 0] == pytest.approx([1 - 1.96 * 0.2, 1 + 1.96 * 0.2])
+    rng, sensor = np.random.default_rng(1), Sensor(1000, 1000, 0.001)
+    figure = _by_radius(rng.uniform(0, 999, (1000, 2)), rng.normal(0, 0.1, (1000, 2)), sensor)
+    assert figure.panels[0].curves[1].half == pytest.approx(np.full(10, 0.0196), rel=0.25)
+
+
+def test_twelve_series_are_drawn_in_twelve_ways():
+    """Those after the tenth had the colours of the first, in lines as in points.
+
+    The bands hold 95 %.
+    """
+    (camera,) = warm_study().cameras
+    sd_c = camera.series[0].series.sds[:, 0]
+    figure = deviation_figure(replace(camera, series=12 * camera.series[:1]))
+    assert all(len({(c.colour, c.dashed) for c in p.curves}) == 12 for p in figure.panels)
+    assert figure.panels[0].curves[0].half == pytest.approx(1.96 * 1000 * sd_c)
+
+
 def test_the_epochs_report_opens_with_the_drift(open_page):
     page = open_page("epochs", 794)
     sentence = page.text_content(".answer .sentence").replace("\xa0", " ")
@@ -332,6 +363,13 @@ def test_the_epochs_report_opens_with_the_drift(open_page):
     page.emulate_media(media="print")
     wide = "[...document.querySelectorAll('pre')].map(e => e.scrollWidth - e.clientWidth)"
     assert max(page.evaluate(wide)) <= 0  # what the command prints stays on the paper
+
+
+def test_the_time_axis_of_a_single_epoch_is_a_minute(tmp_path):
+    """It was four years, with a warning."""
+    recording = open_recording(make_recording(tmp_path / "small", 1))
+    axis = series_epochs(recording, AdjustmentSettings(), "auto").plot().axes[0]
+    assert np.ptp(axis.get_xlim()) == pytest.approx(1 / 1440)  # days
 
 
 @pytest.mark.parametrize("name", ["calibration", "field-check"])
@@ -347,6 +385,15 @@ def test_down_in_a_figure_is_down_in_the_image(name, open_page):
     for ticks in axes:
         places = [top for _, top in sorted(ticks)]
         assert places == sorted(places)
+
+
+def test_strong_correlations_and_what_limits_a_printed_field_are_stated(page_text):
+    table = page_text("calibration").partition("Correlations beyond ±0.5")[2]
+    table = table.partition("</table>")[0]
+    strong = [float(r) for r in re.findall(r">−?(0\.\d+)</td>", table)]
+    assert 0.5 <= min(strong) < 0.95
+    words = words_of(page_text("field-check"))
+    assert "With the stated errors of the targets' coordinates one image gives" in words
 
 
 def test_photographs_without_targets_are_one_line(undrawn):
@@ -416,8 +463,11 @@ def test_the_page_is_whole_and_holds_the_numbers_of_the_study(page_text):
     words = words_of(html)
     # the sd of the movement, not the root of those of x0 and y0 squared
     assert re.search(r"M1: in .* the principal point moved by 15\.\d+ ± 0\.0071 px", words)
-    mc = warm_study().cameras[0].montecarlo
+    camera = warm_study().cameras[0]
+    mc, moved = camera.montecarlo, camera.series[0].deviations["x0"]
+    pitch = camera.series[0].series.sensor.pixel_pitch
     for said in (
+        with_sd(moved.change / pitch, moved.sd_change / pitch),
         "to the lower right", f"{100 * mc.fractions[0]:.1f} %", f"{mc.overall_mean / 10:.2f} cm",
         "success ratio", "n effective", "p naive", "sd over time",
     ):  # fmt: skip
@@ -442,9 +492,9 @@ def test_a_legend_stays_in_its_drawing(names):
     assert len({text.get_text() for text in legend.get_texts()}) == len(names)
 
 
-def test_series_that_differ_only_in_their_numbers_share_a_sentence(page_text):
+def test_series_that_differ_only_in_their_numbers_share_a_sentence(undrawn):
     """Seven series were fourteen nearly equal sentences."""
-    words = words_of(page_text("study-names"))
+    words = words_of(_study_of_names(None))
     assert words.count("All 3 series: between ") == words.count("All 3 series: in 25 minutes") == 1
     rates = [f"x₀ by {rate} px/K in {k} s" for k, rate in enumerate(("−0.35 ± 0.1", "+2", "−0.36"))]
     assert spanned(rates) == "x₀ by −0.36 to +2 px/K in 0–2 s"

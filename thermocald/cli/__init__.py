@@ -146,7 +146,7 @@ def _print_usage_error(error: Any) -> int:
     command = error.ctx.command_path if error.ctx else f"thermocald {_command_name()}".strip()
     message = error.format_message()
     if error.ctx and not error.ctx.parent and hasattr(error, "option_name"):
-        message = f"{error.option_name} is no option before a command; a command's follow its name"
+        message = f"{error.option_name}: write a command's options after its name"
     if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
         return int(error.exit_code)

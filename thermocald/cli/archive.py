@@ -114,7 +114,7 @@ def archive(
     if store is None:
         raise UsageError("STORE is missing: give its file, or --config FILE")
     if finished and not store.exists():
-        say(f"{store}: nothing was stored yet")
+        say(f"{store}: nothing has been stored yet")
         return
     document = archive_store(store, folder, frames, series, finished, skip_existing, say)
     deleted = enforce_retention(read) if retention and read is not None else []

@@ -339,7 +339,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
     lines = [f"{title}: {camera['device']}"]
     if last:
         temperature = last.get("temperature")
-        at = "" if temperature is None else f" at {temperature:.2f} °C"
+        at = "" if temperature is None else f" at {temperature:z.2f} °C".replace("-", "−")
         lines[0] += f", epoch {last.get('epoch', '?')}{at}"
         if last.get("status") in WITH_VALUES:
             lines += _orientation(last)
@@ -373,7 +373,7 @@ def _orientation(last: dict[str, Any]) -> list[str]:
 
 def _device(device: dict[str, Any]) -> str:
     shown = [
-        f"{value:.2f} °C" if name == "temperature" else f"{name} {value:.2f} °C"
+        ("" if name == "temperature" else f"{name} ") + f"{value:z.2f} °C".replace("-", "−")
         for name, value in device.get("last", {}).items()
         if value is not None
     ]

@@ -116,7 +116,8 @@ def forward(
         done = forwarder.send_waiting()
         counts = ", ".join(counted(n, table) for table, n in done.sent.items())
         refused = f"; {done.refused} refused" if done.refused else ""
-        show({"sent": done.sent, "refused": done.refused}, json, f"sent {counts}{refused}")
+        document = {"format": "thermocald-forward/1", "sent": done.sent, "refused": done.refused}
+        show(document, json, f"sent {counts}{refused}")
         return
     log_to_stderr("INFO")
     ended = threading.Event()
@@ -231,7 +232,8 @@ def reprocess(
         places = [{"source": source_name(o.task[0])} for o in failed]
         summary = f"{count - len(failed)} of {count} series analysed"
     errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
-    show({**document, "failed": errors}, json, f"{out}: {summary}")
+    found = {"format": "thermocald-reprocess/1", **document, "failed": errors}
+    show(found, json, f"{out}: {summary}")
     if not failed:
         return
     first = failed[0]

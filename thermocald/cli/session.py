@@ -136,7 +136,9 @@ def _ask(config: Config, do: str, **values: Any) -> dict[str, Any]:
 
     answer = ask(find_state(config.store.path), do, **values)
     if answer is None:
-        raise DataError(f"no daemon runs for {config.store.path}; start it with `thermocald run`")
+        raise DataError(
+            f"no daemon is running for {config.store.path}; start it with `thermocald run`"
+        )
     return answer
 
 

@@ -365,7 +365,9 @@ def _temperatures(inputs: list[str]) -> dict[str, float | None]:
         name = rest if equals and not Path(text).exists() else text
         if Path(name).suffix != ".json":
             if found or (name == rest and Path(name).exists()):
-                raise UsageError(f"{text}: is not a calibration; fit series and calibrations apart")
+                raise UsageError(
+                    f"{text}: is not a calibration; fit series and calibrations separately"
+                )
             return {}
         try:
             found[name] = float(label) if name == rest else None

@@ -162,7 +162,7 @@ def running_status(path: Path) -> dict[str, Any]:
     folder = find_state(path)
     document = read_json(folder / "status.json")
     if not document:
-        raise DataError(f"no daemon runs for {path} (there is no {folder}/status.json)")
+        raise DataError(f"no daemon is running for {path} (there is no {folder}/status.json)")
     # the daemon's clock may be stepped, so the age is by the machine's clock alone
     age_s = time.time() - (folder / "status.json").stat().st_mtime
     document["age_s"] = max(0.0, age_s)

@@ -149,7 +149,7 @@ def _figures(posed: Sequence[PhotographResult], sensor: Sensor) -> tuple[Figure,
     return (
         Figure(
             "coverage", "Coverage",
-            "The targets seen, one colour per photograph, and the frame of the image.",
+            "The targets seen, coloured by photograph, and the frame of the image.",
             (image_panel("Coverage", *seen),),
         ),
         _by_radius(points, residuals, sensor),

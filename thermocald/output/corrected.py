@@ -113,7 +113,7 @@ class Correction(Result):
         """Yield the corrected CSV of points, a block of rows at a time.
 
         Rows of standard input are corrected as they arrive. Rows that cannot be corrected are added
-        to `refused`. Raises DataError if no row can be corrected, or a column would stand twice.
+        to `refused`. Raises DataError if no row can be corrected, or a column would occur twice.
         """
         for block in self._blocks(("x", "y")):
             yield self._corrected(self._possible(block))
@@ -212,7 +212,7 @@ class Correction(Result):
             header = [*block.header, *_ADDED]
             if twice := [name for name in header if name and header.count(name) > 1]:
                 raise DataError(
-                    f"{self.path}: column {twice[0]} would stand twice; rename it, unless these "
+                    f"{self.path}: column {twice[0]} would occur twice; rename it, unless these "
                     "points are corrected already"
                 )
             writer.writerow(header)

@@ -34,6 +34,8 @@ from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from thermocald.arrays import Array
     from thermocald.discovery.entries import EffectFound
     from thermocald.discovery.gap import Stage
@@ -341,7 +343,7 @@ def _effect(effect: EffectFound) -> Section:
         f"amplitude of {parameter_label(n[2:])}" if n.startswith("a_") else n.replace("_", " ")
         for n in effect.estimates
     ]
-    rows = list(zip(labels, map(_value, effect.estimates.values()), strict=True))
+    rows = list(zip(labels, map(estimate_text, effect.estimates.values()), strict=True))
     text = []
     if proposal := effect.evidence.get("proposal"):
         test = proposal["surrogates"]
@@ -374,7 +376,8 @@ def _effect(effect: EffectFound) -> Section:
     return Section(f"Effect found: {effect.effect}", tuple(text), (), (table,), tuple(items))
 
 
-def _value(estimate: dict[str, Any]) -> str:
+def estimate_text(estimate: Mapping[str, Any]) -> str:
+    """Write an estimated constant with its standard deviation and unit, or the names that it is."""
     value, sd = estimate["value"], estimate["sd"]
     unit = "" if estimate["unit"] == "1" else estimate["unit"]
     if isinstance(value, float):

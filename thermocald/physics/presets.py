@@ -246,9 +246,10 @@ def given_simulation(
 class Catalogue(Result):
     """The list of the presets, and of the effects for model files."""
 
-    def as_dict(self) -> dict[str, list[dict[str, Any]]]:
+    def as_dict(self) -> dict[str, Any]:
         """Return the document that `simulate --list --json` writes."""
         return {
+            "format": "thermocald-catalogue/1",
             "presets": [{"preset": one.name, "about": one.about} for one in PRESETS.values()],
             "effects": [
                 {"effect": name, "kind": effect.kind, "parameters": effect.units()}

@@ -18,7 +18,7 @@ import numpy as np
 from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
 from thermocald.arrays import floats
 from thermocald.errors import ConfigurationError, UsageError
-from thermocald.numbers import UNITS, plain, with_sd
+from thermocald.numbers import UNITS, celsius, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
@@ -301,7 +301,7 @@ class Camera(Result):
 
     def lines(self) -> list[str]:
         """Return the camera as readable lines."""
-        at = "" if np.isnan(self.temperature) else f" at {self.temperature:g} °C"
+        at = "" if np.isnan(self.temperature) else f" at {celsius(self.temperature)} °C"
         return [self.name + at] + [
             f"  {name:>3} = {with_sd(value, self.sd[name], UNITS.get(name, ''))}"
             for name, value in zip(IOP_NAMES, self.values.tolist(), strict=True)

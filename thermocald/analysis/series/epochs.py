@@ -380,6 +380,9 @@ class Epochs(Result):
         if against != "temperature":
             from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
+            if len(x) == 1:  # else years about it are shown
+                half = np.timedelta64(30, "s")
+                axes[-1, 0].set_xlim(self.time[ok][0] - half, self.time[ok][0] + half)
             times = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
             axes[-1, 0].xaxis.set_major_locator(times)
             axes[-1, 0].xaxis.set_major_formatter(

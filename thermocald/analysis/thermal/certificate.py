@@ -6,11 +6,10 @@ the largest rate with its standard deviation; tables list the model and its evid
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from thermocald.figures import Curve, Figure, Panel
-from thermocald.numbers import UNITS, parameter_label, percent, signed, with_sd
+from thermocald.numbers import UNITS, celsius, parameter_label, percent, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.formula import say_together
 from thermocald.physics.model import SURE
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
 _UNSEEN = 0.5
 """A parameter with a larger weight of the type counts as the type's."""
-_UNKNOWN = {"": (math.nan, math.nan)}
 
 
 def describe_small_misfit(document: Mapping[str, Any]) -> str:
@@ -78,7 +76,7 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         for s in document.get("series", ())
     ]
     lines += [
-        f"  {c['calibration']}: {c['photographs']} photographs at {c['temperature']:.1f} °C, "
+        f"  {c['calibration']}: {c['photographs']} photographs at {celsius(c['temperature'])} °C, "
         f"the model's image is {c['rms_px']:.4f} px away"
         for c in document.get("calibrations", ())
     ]
@@ -94,20 +92,22 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
 def _verdict_lines(document: Mapping[str, Any]) -> list[str]:
     """Return the temperatures of the fit, and whether an effect is missing."""
     lines = []
-    low, high = next(iter((document["validity"] or _UNKNOWN).values()))
-    T0 = f"T0 = {short(document['reference_temperature'])} °C"
+    T0 = f"T0 = {celsius(document['reference_temperature'])} °C"
+    within = f"at unstated temperatures, {T0}"
+    for low, high in document["validity"].values():
+        within = f"from {celsius(low)} to {celsius(high)} °C, {T0}"
     if why := document.get("not_examined"):
         left = document["left_over_in_noise"]
         lines.append(f"  not examined whether an effect is missing: {why}")
         lines.append(
-            f"  fitted from {low:g} to {high:g} °C, {T0}; what is left over is {left:.1f} times "
-            "the noise" + ("" if document["band"] else ": no 95 % band is stated")
+            f"  fitted {within}; what is left over is {left:.1f} times the noise"
+            + ("" if document["band"] else ": no 95 % band is stated")
         )
     elif document.get("effect_missing") and document.get("calibrations"):
         lines.append(
             f"  the calibrations differ by {document['sigma0']:.1f} times what their standard "
             "deviations allow: parameters other than c, x0, y0 change with temperature, or the "
-            f"change is not linear\n  fitted from {low:g} to {high:g} °C, {T0}; standard "
+            f"change is not linear\n  fitted {within}; standard "
             "deviations are widened by that"
         )
     elif document.get("effect_missing"):
@@ -118,11 +118,11 @@ def _verdict_lines(document: Mapping[str, Any]) -> list[str]:
             f"  {cause}: the model leaves {document['misfit_px']:.3f} px in smooth "
             f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
             "run: thermocald discover\n"
-            f"  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by what "
+            f"  fitted {within}; standard deviations are widened by what "
             "is left, and no 95 % band is stated"
         )
     else:
-        lines.append(f"  valid from {low:g} to {high:g} °C, {T0}")
+        lines.append(f"  valid {within}")
         if left := describe_small_misfit(document):
             lines.append(f"  left over: {left}; thermocald discover looks for the cause")
     return lines
@@ -234,15 +234,10 @@ def drift_figure(T: Array, T0: float, changes: Array, half: Array | None) -> Fig
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
     return Figure(
         "drift", "Change of the camera with its temperature",
-        f"Each parameter minus its value at {short(T0)} °C, at steady temperatures; "
+        f"Each parameter minus its value at {celsius(T0)} °C, at steady temperatures; "
         f"{'no band is given' if half is None else 'bands: 95 %'}.",
         tuple(panels),
     )  # fmt: skip
-
-
-def short(T: float) -> str:
-    """Return a temperature, °C, to a hundredth at most: a T₀ is a mean with many decimals."""
-    return f"{round(T, 2):g}"
 
 
 def _shown(entry: Mapping[str, Any], unit: str, scale: float = 1.0) -> str:
@@ -263,7 +258,7 @@ def _model_tables(document: Mapping[str, Any]) -> list[Table]:
             document["interior"].items(),
             {
                 "parameter": lambda r: parameter_label(r[0]),
-                f"at {short(document['reference_temperature'])} °C": lambda r: _shown(
+                f"at {celsius(document['reference_temperature'])} °C": lambda r: _shown(
                     r[1], UNITS.get(r[0], "")
                 ),
                 "rate": lambda r: _shown(rates[r[0]], "µm/K", 1e3) if r[0] in rates else "",

@@ -17,7 +17,7 @@ import numpy as np
 from thermocald.analysis.camera.camera import Camera
 from thermocald.arrays import floats, seconds
 from thermocald.errors import DataError, UsageError
-from thermocald.numbers import counted
+from thermocald.numbers import celsius, counted
 from thermocald.photogrammetry.camera.camera_model import (
     IOP,
     IOP_NAMES,
@@ -86,8 +86,8 @@ class Validity:
         whose = f" of {self.of}" if self.of else ""
         unit = self.other_unit(T)
         return (
-            f"{T:.5g} °C{whose} is {self.beyond(T):.1f} K outside the {self.low:g} to "
-            f"{self.high:g} °C that the model was fitted on"
+            f"{celsius(T)} °C{whose} is {self.beyond(T):.1f} K outside the {celsius(self.low)} to "
+            f"{celsius(self.high)} °C that the model was fitted on"
             + (f"; if it is in {unit}, convert it" if unit else "")
         )
 
@@ -351,7 +351,7 @@ class Along:
 
     def __repr__(self) -> str:
         T = self.temperatures
-        span = f", {T.min():.1f} to {T.max():.1f} °C" if len(T) else ""
+        span = f", {celsius(T.min())} to {celsius(T.max())} °C" if len(T) else ""
         return f"<Along {self.camera}: {counted(len(self), 'time')}{span}>"
 
     def __len__(self) -> int:
@@ -394,12 +394,12 @@ def read_history(
     except (TypeError, ValueError):
         raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
     instants = t if at is None else np.atleast_1d(seconds(at))
-    sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
+    sizes = ", ".join(f"{name} {c.shape}" for name, c in readings.items()) or "nothing"
     shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
     if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
         raise UsageError(
-            f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
-            "each of its times, and at least one time"
+            f"times {t.shape}, {sizes}, at {instants.shape}: give columns (n,) with a temperature "
+            "for each time, and at least one time"
         )
     if (np.diff(t) < 0).any():
         raise UsageError("the times run backwards: give a log in the order of time")

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.thermal.certificate import short
 from thermocald.analysis.thermal.modelled_camera import OTHER_UNITS
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import steady_camera
 from thermocald.errors import DataError, UsageError
-from thermocald.numbers import percent, plain
+from thermocald.numbers import celsius, percent, plain
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
 from thermocald.physics.device import CameraDevice, read_camera_device, read_programme
 from thermocald.physics.simulation import Simulation
@@ -180,7 +179,7 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
     }
     in_space = (
         f"  on a plane at {distance:g} m: ± {plain(document['object_error_mm'], 'mm', 2)} "
-        f"from this orientation's uncertainty; the drift since {short(T0)} °C is up to "
+        f"from this orientation's uncertainty; the drift since {celsius(T0)} °C is up to "
         f"{plain(document['drift_from_reference_mm'], 'mm', 3)}"
     )
     return Prediction(thermal, document, [*camera.lines(), in_space], camera)

@@ -553,9 +553,8 @@ class LiveCamera:
 
         sensor = self.thermal.model.sensor
         if not isinstance(frame, np.ndarray) or frame.ndim not in (2, 3):
-            raise UsageError(
-                f"the frame is a {type(frame).__name__}: give an array (H, W) or (H, W, channels)"
-            )
+            given = getattr(frame, "shape", type(frame).__name__)
+            raise UsageError(f"the frame is {given}: give an array (H, W) or (H, W, channels)")
         if frame.shape[:2] != (sensor.height, sensor.width):
             raise UsageError(
                 f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "

@@ -66,7 +66,7 @@ class View:
         """Return whether the daemon runs without a fault, and if not, why."""
         status = self.status()
         if not status:
-            return False, "no daemon runs"
+            return False, "no daemon is running"
         if status["age_s"] > _OLD_S:
             return False, f"the daemon has not answered for {status['age_s']:.0f} s"
         if status.get("stalled"):
@@ -102,7 +102,7 @@ class View:
         if name is None:
             if len(names) != 1:
                 asked = f"give ?camera=NAME; the cameras are: {', '.join(names)}"
-                raise DataError(asked if names else "no daemon runs that has a camera")
+                raise DataError(asked if names else "no daemon with a camera is running")
             name = names[0]
         row = self.last_epoch(name).get("row", {})
         if not row.get("opencv"):

@@ -7,7 +7,7 @@ listed in docs/explanation/study.md.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -67,10 +67,10 @@ def study_figures(camera: CameraStudy) -> dict[str, Figure]:
     return {figure.name: figure for figure in made if figure is not None}
 
 
-def _coloured(camera: CameraStudy) -> Iterator[tuple[SeriesStudy, str]]:
-    """Yield each series with its colour."""
+def _styled(camera: CameraStudy) -> Iterator[tuple[SeriesStudy, dict[str, Any]]]:
+    """Yield each series with its colour; the lines of those after the tenth are dashed."""
     for i, study in enumerate(camera.series):
-        yield study, PALETTE[i % len(PALETTE)]
+        yield study, {"colour": PALETTE[i % len(PALETTE)], "dashed": i >= len(PALETTE)}
 
 
 def by_series(
@@ -123,22 +123,23 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     temperatures: dict[str, list[Curve]] = {}
     for name in _free_parameters(camera):
         k, (scale, label), curves = IOP_NAMES.index(name), _readable(camera, name), []
-        for study, colour in _coloured(camera):
+        for study, style in _styled(camera):
             s = study.series
             change, band = scale * (s.values[:, k] - s.values[0, k]), scale * BAND * s.sds[:, k]
             t, y, half = thin(s.time_s / 60, change, band)
-            curves.append(Curve(s.name, t, y, "line", colour, half))
+            curves.append(Curve(s.name, t, y, half=half, **style))
         panels.append(Panel(f"Δ{parameter_label(name)}", "time in min", label, tuple(curves)))
-    for study, colour in _coloured(camera):
+    for study, style in _styled(camera):
         s = study.series
         minutes = s.time_s / 60
         t, ratio = thin(minutes, s.sigma0 / s.sigma0[0])
-        ratios.append(Curve(s.name, t, ratio, "line", colour))
+        ratios.append(Curve(s.name, t, ratio, **style))
         for thermometer in s.thermometers:
             if np.isfinite(thermometer.values).any():
                 t, celsius = thin(minutes, thermometer.values)
-                curve = Curve(s.name, t, celsius, "line", colour)
-                temperatures.setdefault(thermometer.name, []).append(curve)
+                temperatures.setdefault(thermometer.name, []).append(
+                    Curve(s.name, t, celsius, **style)
+                )
     panels.append(Panel("σ₀ / first σ₀", "time in min", "ratio (no unit)", tuple(ratios)))
     panels += [
         Panel(parameter_label(name), "time in min", "temperature in °C", tuple(curves))
@@ -157,11 +158,11 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
     if not {"x0", "y0"} <= set(_free_parameters(camera)):
         return None
     curves, words = [], []
-    for study, colour in _coloured(camera):
+    for study, style in _styled(camera):
         s = study.series
         x, y = s.path_px.T
         rows = spread_rows(len(s), 600)
-        curves.append(Curve(s.name, x[rows], y[rows], "line", colour))
+        curves.append(Curve(s.name, x[rows], y[rows], **style))
         curves.append(Curve("", x[:1], y[:1], "points", "#000000"))
         way = _direction(float(x[-1]), float(y[-1]))
         farthest = float(np.max(np.hypot(x, y)))
@@ -193,8 +194,8 @@ def _direction(x: float, y: float) -> str:
 def _movement_figure(camera: CameraStudy) -> Figure | None:
     """Draw the directional zoom: the movement of the image of a static scene (Figures 4 and 6)."""
     moved = [
-        (study, colour, study.displacement)
-        for study, colour in _coloured(camera)
+        (study, style["colour"], study.displacement)
+        for study, style in _styled(camera)
         if study.displacement is not None and np.any(study.displacement)
     ]
     if not moved:
@@ -226,16 +227,16 @@ def _significance_figure(camera: CameraStudy) -> Figure | None:
     panels, always, rarely = [], [], []
     for name in _free_parameters(camera):
         tested = [
-            (study.series.name, study.significance[name], colour)
-            for study, colour in _coloured(camera)
+            (study.series.name, study.significance[name], style)
+            for study, style in _styled(camera)
             if name in study.significance
         ]
         if not tested:
             continue
         label = parameter_label(name)
         curves = tuple(
-            Curve(series, test.course[:, 0] / 60, test.course[:, 1], "line", colour)
-            for series, test, colour in tested
+            Curve(series, test.course[:, 0] / 60, test.course[:, 1], **style)
+            for series, test, style in tested
         )
         limit = ((tested[-1][1].critical, "limit"),)
         panels.append(
@@ -268,8 +269,8 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
     panels = []
     for name in only or [*_free_parameters(camera), "sigma0"]:
         shown = [
-            (study, colour)
-            for study, colour in _coloured(camera)
+            (study, style)
+            for study, style in _styled(camera)
             if study.channels and name in study.channels[0].dependences
         ]
         if not shown:
@@ -277,7 +278,7 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
         scale, label = 1.0, "σ₀ (no unit)"
         if name != "sigma0":
             scale, label = _readable(camera, name)
-        curves = [c for study, colour in shown for c in _fitted(study, name, scale, colour)]
+        curves = [c for study, style in shown for c in _fitted(study, name, scale, style)]
         reference = parameter_label(shown[0][0].channels[0].thermometer.name)
         panels.append(Panel(parameter_label(name), f"{reference} in °C", label, tuple(curves)))
     if not panels:
@@ -290,7 +291,7 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
     )  # fmt: skip
 
 
-def _fitted(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Curve]:
+def _fitted(study: SeriesStudy, name: str, scale: float, style: dict[str, Any]) -> list[Curve]:
     """Return the curves of a parameter's changes over the temperature and of their line."""
     s = study.series
     value = s.sigma0
@@ -303,8 +304,8 @@ def _fitted(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Cu
     slope = scale * study.channels[0].dependences[name].slope
     rows = spread_rows(len(t), _DRAWN)
     return [
-        Curve(s.name, t[rows], v[rows], "points", colour),
-        Curve("", ends, v.mean() + slope * (ends - t.mean()), "line", colour),
+        Curve(s.name, t[rows], v[rows], "points", **style),
+        Curve(s.name, ends, v.mean() + slope * (ends - t.mean()), **style),
     ]
 
 

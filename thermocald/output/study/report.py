@@ -249,8 +249,8 @@ def answer_sentences(camera: CameraStudy, distance_mm: float) -> list[str]:
     if mc is not None:
         sentences.append(
             f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
-            "about the series' mean with the correlations of an epoch's adjustment (the "
-            f"reference's procedure) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
+            "about the series' mean with the correlations of an epoch's adjustment (the procedure "
+            f"of Elias et al. 2020) cause errors of {plain(mc.overall_mean / 10, 'cm', 3)} on "
             f"average and up to {plain(mc.mean_largest / 10, 'cm', 2)} (mean of the largest of "
             f"{mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
@@ -398,9 +398,10 @@ def _warmed(study: SeriesStudy) -> str:
     if reference is None or reference.name not in study.deviations:
         return ""
     d = study.deviations[reference.name]
-    name, known = parameter_label(reference.name), int(np.isfinite(reference.values).sum())
+    label, known = parameter_label(reference.name), int(np.isfinite(reference.values).sum())
+    name = "the temperature" if label == "temperature" else f"the temperature ({label})"
     if known < len(study.series):
-        name += f" (known in {known} of {len(study.series)} epochs)"
+        name += f", known in {known} of {len(study.series)} epochs,"
     if d.returned:
         rose, largest = "rose" if d.largest > 0 else "fell", plain(abs(d.largest), "K", 3)
         within = plain(d.range, "K", 3)

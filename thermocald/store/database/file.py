@@ -259,7 +259,7 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
         try:
             version = _version(connection, path)
             if version == 0 and mode == "read":
-                raise StoreError(f"{path}: is empty; nothing was stored yet")
+                raise StoreError(f"{path}: is empty; nothing has been stored yet")
             if version < len(schema.FILE_STEPS) and mode == "read":
                 connection.close()
                 connection = open_copy(path, _upgrade)  # reading must not change the file

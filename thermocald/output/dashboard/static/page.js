@@ -70,7 +70,7 @@ function connected(text) {
 
 function ended() {
   const since = status.stopped || lastUtc;
-  return since ? `acquisition has stopped: no daemon has run since ${time(since)} UTC` : "no daemon runs";
+  return since ? `acquisition has stopped: no daemon has run since ${time(since)} UTC` : "no daemon is running";
 }
 
 // The camera whose figures, frame and curves are shown; data of other cameras are discarded.

@@ -78,12 +78,15 @@ def full_scale(image: NDArray[Any]) -> int:
 
 
 def eight_bit(image: NDArray[Any], brightest: int = 0) -> NDArray[np.uint8]:
-    """Return 8-bit values of an image of 8 or 16 bit; brightest: of 16 bit, becomes 255."""
+    """Return 8-bit values of an image of 8 or 16 bit; brightest: of 16 bit, becomes 255.
+
+    By default it is the brightest of areas of 5 × 5 px, as a hot pixel must not darken the image.
+    """
     if image.dtype == np.uint8:
         return image
     import cv2
 
-    brightest = max(brightest or int(image.max()), 1)
+    brightest = max(brightest or int(np.max(cv2.erode(image, np.ones((5, 5), np.uint8)))), 1)
     return cv2.convertScaleAbs(image, alpha=255.0 / brightest)  # type: ignore[return-value]
 
 

@@ -76,11 +76,17 @@ def test_all_targets_are_measured(frame, camera):
     assert np.all(quality["saturation"] == 0)
 
 
+def with_hot_pixels(image: np.ndarray) -> np.ndarray:
+    """Return a frame of 16 bit with three pixels at full scale."""
+    image[[100, 700, 1100], [1200, 40, 900]] = 65535
+    return image
+
+
 @pytest.mark.parametrize(
     "change",
     [
         pytest.param(lambda image: np.ascontiguousarray(image[::-1, ::-1]), id="upside down"),
-        pytest.param(lambda image: image.astype(np.uint16) * 16, id="12 bit in 16"),
+        pytest.param(lambda image: with_hot_pixels(image * np.uint16(16)), id="12 bit in 16"),
         pytest.param(lambda image: 255 - image, id="negative"),
         pytest.param(lambda image: image // 4, id="dim"),
     ],

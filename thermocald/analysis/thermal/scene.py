@@ -88,7 +88,7 @@ Track = tuple["NDArray[np.int64]", "Array"]
 def detect_features(reference: NDArray[Any]) -> NDArray[np.float32]:
     """Detect features (F, 2) px in a reference frame (H, W). Raises DataError for too few."""
     corners = cv2.goodFeaturesToTrack(
-        eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
+        eight_bit(reference, int(reference.max())), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
     )
     found = np.zeros((0, 2)) if corners is None else np.asarray(corners).reshape(-1, 2)
     last = np.array(reference.shape[::-1]) - _WINDOW_PX

@@ -13,7 +13,7 @@ deviation is 0.8 to 1.6, most often 1.0 to 1.2.
 
 The tone curve of a photograph shifts blurred edges towards their dark side, at gamma 0.45 by a
 quarter of the blur. The residuals across all edges of a frame show it, and it is corrected: error
-over standard deviation is 1.0 then, with a coarse JPEG or a curve in the shape of an S 2 to 5.
+over standard deviation is 1.0 to 1.6 then, in a coarse JPEG 2, with a curve shaped like an S to 9.
 
 If squares touch at a corner (chessboards, AprilGrids), the opposite quadrant is dark as well. The
 grey values decide whether it is added to the model.
@@ -63,6 +63,7 @@ _BITS_BLURS = 3.0  # blurs between a marker's bits and pixels that show the tone
 _EDGE_BLURS = 2.0  # blurs about an edge that are needed for it
 _FEWEST_FOR_TONE = 8  # corners
 _CURVED = 3.0  # standard deviations, from which a tone curve is corrected
+_OTHER_PROFILE = 0.5  # rendered: demosaiced, denoised and clipped frames, 0.25 to 0.5
 _CLEAR = 6.0  # times its variance, from which the light's squared gradient is corrected
 _LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
@@ -360,15 +361,17 @@ def _correct_tone(
     """Correct parameters in place for the camera's tone curve, if it is significant.
 
     A photograph's grey values are not linear in the light, which shifts blurred edges towards the
-    dark side. To first order the curve adds κ a w (1 − w) to the wedge w, with κ common to all
-    corners; it is estimated where no blurred bits are. Returns what its error adds to the
-    covariances (n, 2, 2) of the places.
+    dark side. To first order the curve adds κ |a| w (1 − w) to the wedge w, with κ common to all
+    corners; it is estimated where no blurred bits are. A tone curve brightens, κ > 0; where κ is
+    negative, edges have another profile than assumed, as in a demosaiced or denoised frame, and the
+    corners are off by up to half of what the curve would do. Returns what this, or the error of
+    κ, adds to the covariances (n, 2, 2) of the places.
     """
     depth = _depth(*_from_edges(p[:, :4], pixels.x, pixels.y), pixels.saddle)
     free = quiet - _BITS_BLURS * p[:, 4]
     near = (np.abs(depth) < free[:, None]) & (free > _EDGE_BLURS * p[:, 4])[:, None] & pixels.use
     w = j[..., 6]
-    curve = p[:, 6, None] * w * (1 - w)
+    curve = np.abs(p[:, 6, None]) * w * (1 - w)
 
     def response(use: Mask) -> Array:
         """Return the parameters (n, 7) that imitate the curve."""
@@ -385,8 +388,11 @@ def _correct_tone(
         return np.zeros((len(p), 2, 2))
     kappa *= 1 - _CURVED**2 / tested  # sets in continuously
     by = response(pixels.use)
+    unit: Array = by[:, :2, None] * by[:, None, :2]
+    if kappa < 0:
+        return unit * (_OTHER_PROFILE * kappa) ** 2
     p -= kappa * by
-    return by[:, :2, None] * by[:, None, :2] / information
+    return unit / information
 
 
 def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:

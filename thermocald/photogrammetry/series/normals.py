@@ -134,11 +134,11 @@ class ObservationGrid:
         return ObservationGrid(self.points[:, columns], self.weights[:, columns])
 
     def reject(self, mask: Mask) -> ObservationGrid:
-        """Return the grid with the observations of a mask (E, T) without weight."""
+        """Return the grid with the observations of a mask (E, T) or (T,) without weight."""
         if not mask.any():
             return self
         weights = self.weights.copy(order="K")
-        weights[mask] = 0.0
+        weights[np.broadcast_to(mask, weights.shape[:2])] = 0.0
         return ObservationGrid(self.points, weights)
 
 
@@ -326,9 +326,7 @@ class WithoutTargets:
     ) -> Iterator[tuple[int, ObservationGrid]]:
         """Yield the blocks without the targets."""
         for first, grid in self.source.blocks(windows):
-            mask = np.zeros(grid.observed.shape, dtype=bool)
-            mask[:, self.targets] = True
-            yield first, grid.reject(mask)
+            yield first, grid.reject(np.isin(np.arange(grid.points.shape[1]), self.targets))
 
 
 def often_shown(misclosure: Array) -> Array:
@@ -370,9 +368,9 @@ def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]
     return tuple(slice(int(start), int(start) + length) for start in starts)
 
 
-def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> ObservationGrid:
-    """Read the epochs of some windows into one grid."""
-    if isinstance(source, ObservationGrid) and list(windows) == [slice(0, len(source))]:
+def gathered(source: ObservationBlocks, windows: Sequence[slice] | None = None) -> ObservationGrid:
+    """Read the epochs of some windows, by default all, into one grid."""
+    if isinstance(source, ObservationGrid) and windows is None:
         return source
     return joined([grid for _, grid in source.blocks(windows)])
 

@@ -21,6 +21,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     rays,
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, cold_start
+from thermocald.photogrammetry.epoch.gauss_markov import Problem, point_tests, resolve, solve
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.orientation import approximate_orientation
 
@@ -88,6 +89,17 @@ def test_gross_errors_are_rejected_without_initial_values(nominal):
     assert len(a.rejected) <= 15 + 3
     assert a.redundancy == 2 * (len(points) - len(a.rejected)) - len(FREE)
     assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
+
+
+def test_a_point_is_tested_alike_in_use_and_left_out():
+    """vᵀ(I - H)⁻¹v of a point in use is vᵀ(I + H)⁻¹v of the same point without it."""
+    field = scene.corner_field(per_side=3)
+    obs = scene.observe(field, np.random.default_rng(5))
+    problem = Problem.build(scene.SENSOR, field, obs, FREE, TRUTH, np.zeros((16, 16)))
+    others = ~np.eye(len(obs), dtype=bool)
+    whole = solve(problem, TRUTH, others.any(axis=0))
+    left_out = [point_tests(resolve(problem, whole, use), use) for use in others]
+    np.testing.assert_allclose(np.diag(left_out), point_tests(whole, others.any(axis=0)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("view_deg", [9.0, 50.0, 112.0, 130.0])

@@ -89,8 +89,12 @@ def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     assert two.sd_scale < one.sd_scale
     assert two.extent == pytest.approx(one.extent, rel=0.02 / 900)
     assert two.extent > one.extent
-    # mostly the distance's own sd
+    # mostly the distance's own sd, which is that of the adjusted distance
     assert 1.0 < one.sd_scale / (0.1 / first.length) < 1.1
+    J = np.zeros((30, 3))
+    J[29] = (one.points[29] - one.points[0]) / first.length
+    J[0] = -J[29]
+    assert np.sqrt(J.ravel() @ one.covariance @ J.ravel()) == pytest.approx(0.1, rel=1e-3)
     about = one.points - one.points.mean(axis=0)
     turns = [np.cross(axis, about).ravel() for axis in np.eye(3)]
     G = np.column_stack([np.tile(np.eye(3), (30, 1)), *turns])

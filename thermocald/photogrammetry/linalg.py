@@ -205,7 +205,7 @@ def mad_sd(values: NDArray[np.floating[Any]], axis: int | None = None) -> Any:
     return MAD_TO_SD * np.nanmedian(np.abs(values), axis=axis)
 
 
-def chi2_quantile(p: float, dof: int) -> float:
+def chi2_quantile(p: float, dof: float | Array) -> Any:
     """Return the chi-square quantile at probability p, to 4 % for dof ≥ 6.
 
     By Wilson and Hilferty (1931), as scipy.stats would cost the daemon 22 MB.
@@ -214,4 +214,4 @@ def chi2_quantile(p: float, dof: int) -> float:
 
     z = NormalDist().inv_cdf(p)
     h = 2.0 / (9.0 * dof)
-    return float(dof * (1.0 - h + z * np.sqrt(h)) ** 3)
+    return dof * (1.0 - h + z * np.sqrt(h)) ** 3

@@ -270,7 +270,7 @@ class OnlineFilter:
 
         S, cross = covariances()
         chi2 = float(v @ np.linalg.solve(S, v))
-        bound = chi2_quantile(1.0 - _ALPHA, n)
+        bound = float(chi2_quantile(1.0 - _ALPHA, n))
         if len(self._history) >= _FEWEST:
             # a mount in the wind does not move normally: movements of a size that a tenth of the
             # epochs show are no event

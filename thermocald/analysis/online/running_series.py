@@ -342,7 +342,7 @@ class RunningSeries:
 
     def _adjust_newest(self, alone: Adjustment) -> tuple[Adjustment | None, Adjustment]:
         """Return the newest epoch's own result, None if unchanged, and that in its series."""
-        whole, newest = None, self._without_wrong(self._kept[-1].grid)
+        whole, newest = None, self._kept[-1].grid.reject(self._wrong)
         more = (newest.observed[0] & ~self._shown).any()  # targets that no earlier epoch showed
         if self._series is not None and not more and self.epochs < self._look_at[1]:
             whole = self._series.further(alone, newest, len(self._kept))
@@ -361,7 +361,7 @@ class RunningSeries:
         if self._each is None:
             return None, whole
         gross = np.isin(np.arange(len(self._field)), whole.rejected) & (self._binds and whole.ok)
-        newest = self._without_wrong(self._kept[-1].grid).reject(gross[None])
+        newest = self._kept[-1].grid.reject(self._wrong).reject(gross)
         own = self._each.further(alone, newest, len(self._kept))
         return _rejecting(own, gross), whole
 
@@ -409,12 +409,12 @@ class RunningSeries:
         alone, c_px = np.array([k.alone for k in kept]), start[0] / self._sensor.pixel_pitch
         self._wrong = misplaced_targets(self._sensor, self._field, grid, alone)
         while True:  # a single pass, unless misplaced targets biased the initial values
-            self._series = series = self._together(self._without_wrong(grid), start, s, ())
+            self._series = series = self._together(grid.reject(self._wrong), start, s, ())
             drawn = find_misplaced(series.sample.offsets, c_px)
             if not drawn.any():
                 break
             self._wrong = self._wrong | drawn
-        grid = self._without_wrong(grid)
+        grid = grid.reject(self._wrong)
         share = _OFTEN if self._hurried else 0.0 if self.epochs < _EACH else _SOON
         self._look_at[1] = self._again(share)
         if len(kept) < FEWEST_EPOCHS:
@@ -428,10 +428,6 @@ class RunningSeries:
         if moved:
             self._series = self._together(still, start, s, moved)
         return row
-
-    def _without_wrong(self, grid: ObservationGrid) -> ObservationGrid:
-        """Return observations without the targets that the field has misplaced."""
-        return grid.reject(np.broadcast_to(self._wrong, grid.observed.shape))
 
     def _own_schedule(self) -> tuple[int, int]:
         """Return the last and next epoch of `_adjust_each`, the same ones after a restart."""
@@ -448,7 +444,7 @@ class RunningSeries:
         kept, grid, start, _ = self._lay_out()
         each = self._series
         if self._binds or first is not None:
-            grid = taken_off(self._without_wrong(grid), each.moved).reject(self._gross())
+            grid = taken_off(grid.reject(self._wrong), each.moved).reject(self._gross())
             kept, grid = kept[:first], grid[slice(first)]
             s = replace(self._asked, exterior="per_epoch", drift_period=self._period)
             if self._binds:

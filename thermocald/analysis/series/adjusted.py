@@ -124,7 +124,7 @@ def table_of_series(
     c_px = start[0] / head.camera.sensor.pixel_pitch
     while True:  # a single pass, unless misplaced targets biased the initial values
         used = WithoutTargets(source, np.flatnonzero(far)) if far.any() else source
-        grid = used if in_blocks else gathered(used, [slice(0, len(source))])
+        grid = used if in_blocks else gathered(used)
         found = _adjust(testfield, apart, start, grid, settings, jobs, advance)
         assert found.adjustment is not None
         drawn = find_misplaced(found.adjustment.offsets, c_px)
@@ -133,8 +133,8 @@ def table_of_series(
         far = far | drawn
     if not in_blocks:
         moved, still = correct_field(
-            head.camera.sensor, testfield, gathered(grid, [slice(0, len(source))]),
-            found.adjustment, start, apart.number, apart.frame_time,
+            head.camera.sensor, testfield, gathered(grid), found.adjustment, start, apart.number,
+            apart.frame_time,
         )  # fmt: skip
         if moved:
             found = _adjust(testfield, apart, start, still, settings)
@@ -151,7 +151,7 @@ def _adjust(
 ) -> Epochs:  # fmt: skip
     """Adjust all epochs once, in a single grid or in blocks."""
     assert apart.head is not None
-    sensor, whole_series = apart.head.camera.sensor, [slice(0, len(source))]
+    sensor = apart.head.camera.sensor
     camera = (
         InteriorOrientation.from_array(start[IOP]), ExteriorOrientation.from_array(start[EOP])
     )  # fmt: skip
@@ -163,8 +163,7 @@ def _adjust(
         # only a sample of the epochs has its covariances and residuals
         sample, sampled = whole.sample, whole.sampled
     else:
-        grid = gathered(source, whole_series)
-        whole = sample = adjust_series(sensor, testfield, grid, *camera, settings)
+        whole = sample = adjust_series(sensor, testfield, gathered(source), *camera, settings)
         sampled = None
 
     def without(targets: NDArray[np.int64], quick: bool) -> Epochs:
@@ -172,9 +171,9 @@ def _adjust(
         if not quick:
             return _adjust(testfield, apart, start, fewer, rough, jobs)
         rough = replace(rough, snooping_alpha=0.0, target_noise=False)
-        windows, some = whole_series, apart
+        windows, some = None, apart
         if sampled is not None:
-            windows = list(spread_windows(len(source), len(sampled)))
+            windows = spread_windows(len(source), len(sampled))
             some = replace(
                 apart,
                 **{n: getattr(apart, n)[sampled] for n in _AS_READ},

@@ -26,7 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     project,
 )
-from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2, chi2_quantile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -311,8 +311,8 @@ TRUSTED_REDUNDANCY = 20
 """Redundancy from which the noise is estimated from the residuals."""
 
 _MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 or more
-_GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
-_AFTER_REJECTION_NORMAL = 1.28  # 10 %
+_GLOBAL_TEST = 0.999  # probability of passing
+_AFTER_REJECTION = 0.9
 
 
 def limit_2d(alpha: float, uncertainty: Array) -> Array:
@@ -332,14 +332,12 @@ def fails_global_test(
 ) -> Mask:
     """Return whether residuals, too few to estimate the noise, are too large for their sigmas.
 
-    unit: variance of unit weight; redundancy: its degrees of freedom. χ² at 0.1 %, by Wilson and
-    Hilferty's approximation (1931). After a rejection, which relies on the stated noise alone, at
-    10 %: noise three times as large would look the same, and lose its worst target too.
+    unit: variance of unit weight; redundancy: its degrees of freedom. χ² at 0.1 %. After a
+    rejection, which relies on the stated noise alone, at 10 %: noise three times as large would
+    look the same, and lose its worst target too.
     """
-    quantile = _AFTER_REJECTION_NORMAL if after_rejection else _GLOBAL_TEST_NORMAL
     r = np.maximum(np.asarray(redundancy, dtype=float), 1.0)
-    ninth = 2.0 / (9.0 * r)
-    bound = (1.0 - ninth + quantile * np.sqrt(ninth)) ** 3
+    bound = chi2_quantile(_AFTER_REJECTION if after_rejection else _GLOBAL_TEST, r) / r
     return np.asarray((np.asarray(redundancy) < TRUSTED_REDUNDANCY) & (np.asarray(unit) > bound))
 
 

@@ -404,7 +404,7 @@ def judge_epochs(
     few = 2 * offered - s.carried < TRUSTED_REDUNDANCY
     most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
     if not offered.all():
-        again = "it repeats the frame of the epoch before, and is no new observation"
+        again = "it repeats the image points of an earlier epoch, and is no new observation"
         fail((offered == 0) & grid.repeated, "repeated_frame", again)
     fail(offered == 0, "no_observations", "no target was measured")
     fail(

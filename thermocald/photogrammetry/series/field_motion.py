@@ -144,10 +144,10 @@ def taken_off(
 
     rows: the grid's epochs within the movements' trajectories.
     """
-    points, wandering = grid.points.copy(order="K"), np.zeros(grid.observed.shape, dtype=bool)
+    points, wandering = grid.points.copy(order="K"), np.zeros(grid.points.shape[1], dtype=bool)
     for m in moved:
         if m.kind == "wander":
-            wandering[:, m.rows] = True
+            wandering[m.rows] = True
         else:
             points[:, m.rows] -= m.trajectory[rows, None, None] * m.image
     return ObservationGrid(points, grid.weights).reject(wandering)

@@ -42,8 +42,8 @@ class ObservationGrid:
     """The observations of many epochs on one grid of epochs × targets of the test field.
 
     points (E, T, 2) px: NaN if a target was not observed; weights (E, T, 3) px⁻²: the elements xx,
-    yy, xy of each point's inverse covariance, 0 if it was not observed, is rejected, or repeats the
-    epoch before.
+    yy, xy of each point's inverse covariance, 0 if it was not observed, is rejected, or repeats an
+    earlier epoch.
     """
 
     points: Array
@@ -78,7 +78,7 @@ class ObservationGrid:
         sigmas: Array,
         covariances: Array | None = None,
     ) -> ObservationGrid:
-        """Build the grid of n image points; an epoch that repeats the one before has no weight.
+        """Build the grid of n image points; an epoch that repeats an earlier one has no weight.
 
         shape: numbers of epochs and targets; epochs, targets (n,): of the points; measured, sigmas
         (n, 2) px; covariances (n,) px²: of x and y.
@@ -121,13 +121,11 @@ class ObservationGrid:
 
     @property
     def repeated(self) -> Mask:
-        """Mask (E,) of the epochs with the image points of the last epoch before that has any."""
-        there = np.isfinite(self.points[..., 0])
-        again, some = np.zeros(len(there), dtype=bool), np.flatnonzero(there.any(axis=1))
-        now, then = some[1:], some[:-1]
-        same = (self.points[now] == self.points[then]).all(axis=-1) == there[now]
-        again[now] = (same & (there[now] == there[then])).all(axis=1)
-        return again
+        """Mask (E,) of the epochs with the image points of an earlier one."""
+        keys = [hash(points.tobytes()) for points in self.points]
+        later = np.ones(len(keys), dtype=bool)
+        later[np.unique(keys, return_index=True)[1]] = False
+        return later & np.isfinite(self.points[..., 0]).any(axis=1)
 
     def targets(self, columns: Index) -> ObservationGrid:
         """Return the grid of some targets."""
@@ -136,11 +134,11 @@ class ObservationGrid:
         return ObservationGrid(self.points[:, columns], self.weights[:, columns])
 
     def reject(self, mask: Mask) -> ObservationGrid:
-        """Return the grid with the observations of a mask (E, T) without weight."""
+        """Return the grid with the observations of a mask (E, T) or (T,) without weight."""
         if not mask.any():
             return self
         weights = self.weights.copy(order="K")
-        weights[mask] = 0.0
+        weights[np.broadcast_to(mask, weights.shape[:2])] = 0.0
         return ObservationGrid(self.points, weights)
 
 
@@ -328,9 +326,7 @@ class WithoutTargets:
     ) -> Iterator[tuple[int, ObservationGrid]]:
         """Yield the blocks without the targets."""
         for first, grid in self.source.blocks(windows):
-            mask = np.zeros(grid.observed.shape, dtype=bool)
-            mask[:, self.targets] = True
-            yield first, grid.reject(mask)
+            yield first, grid.reject(np.isin(np.arange(grid.points.shape[1]), self.targets))
 
 
 def often_shown(misclosure: Array) -> Array:
@@ -372,9 +368,9 @@ def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]
     return tuple(slice(int(start), int(start) + length) for start in starts)
 
 
-def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> ObservationGrid:
-    """Read the epochs of some windows into one grid."""
-    if isinstance(source, ObservationGrid) and list(windows) == [slice(0, len(source))]:
+def gathered(source: ObservationBlocks, windows: Sequence[slice] | None = None) -> ObservationGrid:
+    """Read the epochs of some windows, by default all, into one grid."""
+    if isinstance(source, ObservationGrid) and windows is None:
         return source
     return joined([grid for _, grid in source.blocks(windows)])
 

@@ -51,6 +51,15 @@ def test_times_and_settings_of_a_driver_are_numbers(wrong):
             make()
 
 
+@pytest.mark.parametrize("image", [
+    IMAGE[:0], IMAGE[:, :0], IMAGE[0], np.dstack([IMAGE] * 3), IMAGE / 2.0, [[0, 1]],
+])  # fmt: skip
+def test_what_is_no_grey_image_is_no_frame(image):
+    """With `keep: all`, an empty one lost the epoch."""
+    with pytest.raises(BadReading, match="its driver gives an image of"):
+        Frame(image, 1.0, 2.0)
+
+
 @pytest.mark.parametrize("clock", [VirtualClock(), SystemClock()], ids=["virtual", "system"])
 def test_clocks_keep_one_contract(clock):
     assert isinstance(clock, hal.Clock)

@@ -79,7 +79,8 @@ class Frame:
     on and off. They are stored with the epoch in the columns `camera_<name>`.
     fingerprint: a number that differs between any two images by their noise; None without one.
 
-    Raises BadReading if a time or a setting is no number, or if `encoded` holds no bytes.
+    Raises BadReading if a time or a setting is no number, if `encoded` holds no bytes, or if
+    `image` holds no grey values.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -102,6 +103,14 @@ class Frame:
             raise BadReading(f"its driver gives {type(self.encoded).__name__} as encoded bytes")
         data: bytes | memoryview | None = self.encoded
         if self.image is not None:
+            given: Any = self.image  # what a driver gives may be anything
+            size, kind = getattr(given, "shape", ()), getattr(given, "dtype", type(given).__name__)
+            if len(size) != 2 or 0 in size or kind not in ("uint8", "uint16"):
+                what = f"{'×'.join(map(str, size))} {kind}".lstrip()
+                raise BadReading(
+                    f"its driver gives an image of {what}; it must be height × width grey values "
+                    "of 8 or 16 bits"
+                )
             self.image.setflags(write=False)
             data = self.image.data if self.image.flags.c_contiguous else self.image.tobytes()
         if data is not None:

@@ -213,7 +213,10 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
         if _is_system(place):
             raise ConfigurationError(f"{path}: {key}: {place}: nothing can be stored there")
     store = config.store.path
-    if not os.path.isdir(store.parent):
+    unit = "thermocald" if path.stem == "config" else f"thermocald@{path.stem}"
+    if not os.path.exists(store.parent) and store.parent == Path("/var/lib", *unit.split("@")):
+        lines.append(f"  store.path: systemd will make {store.parent} when it starts {unit}")
+    elif not os.path.isdir(store.parent):
         raise ConfigurationError(f"{path}: store.path: {store}: its folder does not exist; make it")
     if os.access(store, os.R_OK | os.W_OK) and os.path.getsize(store):
         Store.open(store).close()  # raises for a folder, and for a file that is no store

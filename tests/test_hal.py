@@ -51,6 +51,15 @@ def test_times_and_settings_of_a_driver_are_numbers(wrong):
             make()
 
 
+@pytest.mark.parametrize("utc", [1.7e12, 1e300, -1e11])
+def test_a_time_in_ms_is_no_utc(utc):
+    """It was stored as the year 55841, or the epoch as an error of the program."""
+    with pytest.raises(BadReading, match="as utc"):
+        Frame(IMAGE, 1.0, utc)
+    with pytest.raises(BadReading, match="as utc"):
+        Reading({"temperature": 20.0}, 1.0, utc)
+
+
 @pytest.mark.parametrize("image", [
     IMAGE[:0], IMAGE[:, :0], IMAGE[0], np.dstack([IMAGE] * 3), IMAGE / 2.0, [[0, 1]],
 ])  # fmt: skip

@@ -17,7 +17,7 @@ device is not used any more.
 
 from __future__ import annotations
 
-import math
+import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -54,12 +54,14 @@ Kind = Literal["camera", "thermometer", "output"]
 _ATTEMPTS = 10  # at most, until the clocks were read within _CLOSE_S
 _CLOSE_S = 1e-4
 _POSSIBLE_C = (-273.15, 3000.0)
+_FARTHEST_UTC_S = 7.26e9  # the year 2200; a time in ms is beyond it
 
 
 def _require_numbers(given: Mapping[str, Any]) -> None:
-    """Raise BadReading if what a driver gave as a number is none, or is infinite."""
+    """Raise BadReading if what a driver gave is no finite number, or `utc` is not in seconds."""
     for name, value in given.items():
-        if not isinstance(value, Real) or not math.isfinite(value):
+        most = _FARTHEST_UTC_S if name == "utc" else sys.float_info.max
+        if not isinstance(value, Real) or not abs(value) <= most:
             raise BadReading(f"its driver gives {value!r:.60} as {name}")
 
 

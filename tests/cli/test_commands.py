@@ -37,6 +37,8 @@ def test_the_system_s_files_are_nothing_to_check(path):
 
 @pytest.mark.parametrize(("store", "why"), [
     ("/proc/self/t.db", "store.path: /proc/self/t.db: nothing can be stored there"),
+    ("~nobody-of-this-name/t.db", "nobody-of-this-name/t.db: its folder does not exist; make it"),
+    (f"{'x' * 250}.db", "its name is too long"),
     ("none/t.db", "none/t.db: its folder does not exist; make it"),
     ("config.yaml.d", "config.yaml.d: is a folder, not a store"),
 ])  # fmt: skip

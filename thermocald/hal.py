@@ -61,7 +61,7 @@ def _require_numbers(given: Mapping[str, Any]) -> None:
     """Raise BadReading if what a driver gave is no finite number, or `utc` is not in seconds."""
     for name, value in given.items():
         most = _FARTHEST_UTC_S if name == "utc" else sys.float_info.max
-        if not isinstance(value, Real) or not abs(value) <= most:
+        if not isinstance(value, Real) or not abs(float(value)) <= most:
             raise BadReading(f"its driver gives {value!r:.60} as {name}")
 
 

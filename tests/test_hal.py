@@ -69,6 +69,12 @@ def test_what_is_no_grey_image_is_no_frame(image):
         Frame(image, 1.0, 2.0)
 
 
+def test_clocks_are_read_at_the_middle_of_an_attempt():
+    first = iter([10.0, 10.00004])
+    both = hal.read_together(lambda: next(first), lambda: 5.0)
+    assert both == pytest.approx((10.00002, 5.0), abs=1e-9, rel=0.0)
+
+
 @pytest.mark.parametrize("clock", [VirtualClock(), SystemClock()], ids=["virtual", "system"])
 def test_clocks_keep_one_contract(clock):
     assert isinstance(clock, hal.Clock)

@@ -51,6 +51,30 @@ def test_times_and_settings_of_a_driver_are_numbers(wrong):
             make()
 
 
+@pytest.mark.parametrize("utc", [1.7e12, 1e300, -1e11])
+def test_a_time_in_ms_is_no_utc(utc):
+    """It was stored as the year 55841, or the epoch as an error of the program."""
+    with pytest.raises(BadReading, match="as utc"):
+        Frame(IMAGE, 1.0, utc)
+    with pytest.raises(BadReading, match="as utc"):
+        Reading({"temperature": 20.0}, 1.0, utc)
+
+
+@pytest.mark.parametrize("image", [
+    IMAGE[:0], IMAGE[:, :0], IMAGE[0], np.dstack([IMAGE] * 3), IMAGE / 2.0, [[0, 1]],
+])  # fmt: skip
+def test_what_is_no_grey_image_is_no_frame(image):
+    """With `keep: all`, an empty one lost the epoch."""
+    with pytest.raises(BadReading, match="its driver gives an image of"):
+        Frame(image, 1.0, 2.0)
+
+
+def test_clocks_are_read_at_the_middle_of_an_attempt():
+    first = iter([10.0, 10.00004])
+    both = hal.read_together(lambda: next(first), lambda: 5.0)
+    assert both == pytest.approx((10.00002, 5.0), abs=1e-9, rel=0.0)
+
+
 @pytest.mark.parametrize("clock", [VirtualClock(), SystemClock()], ids=["virtual", "system"])
 def test_clocks_keep_one_contract(clock):
     assert isinstance(clock, hal.Clock)

@@ -56,7 +56,8 @@ def _not_empty(path: Any) -> Any:
 FilePath = Annotated[
     Path,
     BeforeValidator(_not_empty),
-    AfterValidator(lambda path, info: _folder(info) / path.expanduser()),
+    # Path's own `expanduser` raises for ~nobody
+    AfterValidator(lambda path, info: _folder(info) / os.path.expanduser(path)),
 ]
 """A path relative to the file's folder."""
 

@@ -17,7 +17,7 @@ device is not used any more.
 
 from __future__ import annotations
 
-import math
+import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -54,12 +54,14 @@ Kind = Literal["camera", "thermometer", "output"]
 _ATTEMPTS = 10  # at most, until the clocks were read within _CLOSE_S
 _CLOSE_S = 1e-4
 _POSSIBLE_C = (-273.15, 3000.0)
+_FARTHEST_UTC_S = 7.26e9  # the year 2200; a time in ms is beyond it
 
 
 def _require_numbers(given: Mapping[str, Any]) -> None:
-    """Raise BadReading if what a driver gave as a number is none, or is infinite."""
+    """Raise BadReading if what a driver gave is no finite number, or `utc` is not in seconds."""
     for name, value in given.items():
-        if not isinstance(value, Real) or not math.isfinite(value):
+        most = _FARTHEST_UTC_S if name == "utc" else sys.float_info.max
+        if not isinstance(value, Real) or not abs(float(value)) <= most:
             raise BadReading(f"its driver gives {value!r:.60} as {name}")
 
 
@@ -79,7 +81,8 @@ class Frame:
     on and off. They are stored with the epoch in the columns `camera_<name>`.
     fingerprint: a number that differs between any two images by their noise; None without one.
 
-    Raises BadReading if a time or a setting is no number, or if `encoded` holds no bytes.
+    Raises BadReading if a time or a setting is no number, if `encoded` holds no bytes, or if
+    `image` holds no grey values.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -102,6 +105,14 @@ class Frame:
             raise BadReading(f"its driver gives {type(self.encoded).__name__} as encoded bytes")
         data: bytes | memoryview | None = self.encoded
         if self.image is not None:
+            given: Any = self.image  # what a driver gives may be anything
+            size, kind = getattr(given, "shape", ()), getattr(given, "dtype", type(given).__name__)
+            if len(size) != 2 or 0 in size or kind not in ("uint8", "uint16"):
+                what = f"{'×'.join(map(str, size))} {kind}".lstrip()
+                raise BadReading(
+                    f"its driver gives an image of {what}; it must be height × width grey values "
+                    "of 8 or 16 bits"
+                )
             self.image.setflags(write=False)
             data = self.image.data if self.image.flags.c_contiguous else self.image.tobytes()
         if data is not None:

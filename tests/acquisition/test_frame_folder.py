@@ -55,12 +55,12 @@ def test_a_jpeg_stays_as_it_came_grey_values_lose_nothing_and_what_is_corrected_
 
 
 def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
-    folder, now = folder_of(max_age_days=10, max_size_gb=2.5e-6), time.time()
+    folder, now = folder_of(max_age_days=10, max_size_gb=2e-6), time.time()
     for n in range(1, 7):
         keep(folder, n, now - DAY * (14 - 2 * n))  # 12, 10.. days old
     assert folder.enforce(now - 1.0) == [
         "frames deleted: 1 (0.0 MB), older than 10 days",
-        "frames deleted: 3 (0.0 MB), more than 2.5e-06 GB",
+        "frames deleted: 3 (0.0 MB), more than 2e-06 GB",
     ]
     left = sorted(p.stem for p in folder.root.rglob("*.jpg"))
     assert left == ["0000005", "0000006"]

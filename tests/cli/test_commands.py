@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from pathlib import Path
 
 import cv2
 import pytest
@@ -36,6 +37,8 @@ def test_the_system_s_files_are_nothing_to_check(path):
 
 @pytest.mark.parametrize(("store", "why"), [
     ("/proc/self/t.db", "store.path: /proc/self/t.db: nothing can be stored there"),
+    ("~nobody-of-this-name/t.db", "nobody-of-this-name/t.db: its folder does not exist; make it"),
+    (f"{'x' * 250}.db", "its name is too long"),
     ("none/t.db", "none/t.db: its folder does not exist; make it"),
     ("config.yaml.d", "config.yaml.d: is a folder, not a store"),
 ])  # fmt: skip
@@ -45,6 +48,19 @@ def test_a_store_that_run_refuses_is_not_sound(tmp_path, store, why):
     (tmp_path / "config.yaml").write_text(f"store: {{path: {store}}}\n{devices}\n")
     status = 1 if store.startswith("config") else 2
     assert why in refuse("check", tmp_path / "config.yaml", status=status)
+
+
+@pytest.mark.parametrize(("name", "folder"), [("config", ""), ("gauge7", "/gauge7")])
+def test_a_folder_that_systemd_makes_need_not_exist(tmp_path, name, folder):
+    if Path("/var/lib/thermocald").exists():
+        pytest.skip("thermocald is installed here")
+    for store, status in ((f"/var/lib/thermocald{folder}", 0), ("/var/lib/thermocald/other", 2)):
+        (tmp_path / f"{name}.yaml").write_text(
+            f"store: {{path: {store}/t.db}}\nthermometers: [{{name: a, driver: mock}}]\n"
+        )
+        said = call("check", tmp_path / f"{name}.yaml")
+        assert said.returncode == status
+        assert ("systemd will make" in said.stdout) == (status == 0)
 
 
 def test_a_store_of_two_series_tells_them_and_their_fields_apart(world, tmp_path):

@@ -241,30 +241,36 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(
     assert failed.startswith("the configuration cannot be reloaded, the old one stays in force: ")
 
 
-def test_a_reload_that_fails_after_the_old_devices_were_stopped_ends_it(
-    daemon, measured, monkeypatch
+@pytest.mark.parametrize("fails", [[2, 4], [2, 4, 5]])
+def test_a_reload_that_fails_after_the_old_devices_were_stopped_starts_them_again(
+    daemon, measured, monkeypatch, fails
 ):
-    """It went on without any device, and looked healthy. A file that only root may read is no
-    such failure: it ended the daemon, too."""
+    """It ended the daemon, or went on without any device and looked healthy. If they cannot be
+    started again, it ends."""
     built = []
 
     def build(*arguments):
         built.append(True)
-        if len(built) == 2:
+        if len(built) in fails:  # the 2nd and 3rd are only trials
             raise PermissionError(13, "Permission denied", "testfield.csv")
-        if len(built) == 4:  # after the first and the two that are only trials
-            raise StoreError("its disk is gone")
         return Station(*arguments)
 
     def reload(service) -> bool:
         daemon.configure(**measured, logging={"level": "error"})
-        service._reload = len(built) < 3
-        return len(built) > 4
+        service._reload = len(built) < 4
+        return len(built) > 4 and service.station.cameras[0].run.taken > 2
 
     monkeypatch.setattr("thermocald.daemon.service.Station", build)
     daemon.configure(**measured)
-    with pytest.raises(StoreError, match="disk is gone"):
-        Service(load_config(daemon.config), daemon.config, on_turn=reload).run()
+    service = Service(load_config(daemon.config), daemon.config, on_turn=reload)
+    if len(fails) > 2:
+        with pytest.raises(PermissionError):
+            service.run()
+        return
+    assert service.run()
+    assert service.config.logging.level == "info"
+    with Store.open(daemon.store) as store:
+        assert [e.kind for e in store.events()].count("reload_failed") == len(fails)
 
 
 @pytest.fixture

@@ -355,16 +355,23 @@ class Service:
         Station(config, self._runtime)  # raises for a fault before the old one is stopped
         if not self.station.stop(_GRACE_S):
             log.error("a device does not close; it may be unavailable for a while")
-        # built only now: epoch numbers continue after the last one that the old station stored
+        try:
+            self._switch_to(config)
+        except (ThermocaldError, OSError):
+            self._switch_to(self.config)
+            raise
+        text = "the configuration was read again"
+        self._record("reloaded", text)
+        return text
+
+    def _switch_to(self, config: Config) -> None:
+        """Start a new station in place of the stopped one, whose epoch numbers it continues."""
         new = Station(config, self._runtime)
         self.sessions.resume(new)
         logging.getLogger().setLevel(config.logging.level.upper())
         self.config, self.station = config, new
         gc.collect()  # the old station refers to itself: 50 MB would stay for a while
         new.start()
-        text = "the configuration was read again"
-        self._record("reloaded", text)
-        return text
 
     def _report_stalled(self, stalled: list[str]) -> None:
         for text in set(stalled).difference(self._stalled):

@@ -20,6 +20,7 @@ from thermocald.errors import ConfigurationError, DataError, DeviceError, Thermo
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 from thermocald.names import file_name
 from thermocald.numbers import counted
+from thermocald.store.database.file import helper
 from thermocald.store.database.store import Store
 from thermocald.store.server.connection import require_file
 
@@ -101,6 +102,7 @@ def stanzas(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             yield f"  {mark}- {text.strip()}"
 
 
+_LONGEST_NAME = 255  # bytes, of every usual file system
 _SHOWN = 20  # most lines of a kind
 _TRIED = 3  # epochs of a recording that are calibrated
 
@@ -213,8 +215,14 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
         if _is_system(place):
             raise ConfigurationError(f"{path}: {key}: {place}: nothing can be stored there")
     store = config.store.path
-    if not os.path.isdir(store.parent):
+    unit = "thermocald" if path.stem == "config" else f"thermocald@{path.stem}"
+    if not os.path.exists(store.parent) and store.parent == Path("/var/lib", *unit.split("@")):
+        lines.append(f"  store.path: systemd will make {store.parent} when it starts {unit}")
+    elif not os.path.isdir(store.parent):
         raise ConfigurationError(f"{path}: store.path: {store}: its folder does not exist; make it")
+    if len(os.fsencode(helper(store, "wal").name)) > _LONGEST_NAME:
+        name = f"{store.name[:20]}…"
+        raise ConfigurationError(f"{path}: store.path: {name}: its name is too long")
     if os.access(store, os.R_OK | os.W_OK) and os.path.getsize(store):
         Store.open(store).close()  # raises for a folder, and for a file that is no store
     devices: list[dict[str, Any]] = []

@@ -50,6 +50,7 @@ BAD = [
     ("- 1\n", "must hold `key: value` lines"), ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
     ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"), ("a: [1\n", "line 2"),
     ("a: 010\n", "line 1, column 4: 010 is octal in YAML"), ("[" * 5000, "file.yaml"),
+    ("a: 1:30", "1:30 is 90 in YAML"),
     ("a: !!python/object:os.system x\n", "line 1, column 4: holds a tag, `!…`"),
     ("a:\n\tb: 1\n", "line 2, column 1: a line or a value begins with a tab"),
     ("a: b: c\n", "line 1, column 5: `: ` must not stand here"),

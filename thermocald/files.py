@@ -305,9 +305,9 @@ _CONSTRUCTION = (ValueError, KeyError, IndexError, AttributeError, TypeError, Ov
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The safe loader, which also refuses duplicate keys and numbers that begin with 0.
+    """The safe loader, which also refuses duplicate keys, `010` and `1:30`.
 
-    YAML 1.1 reads such numbers as octal: `010` is 8.
+    YAML 1.1 reads them as the octal number 8, and as 90 in base 60.
     """
 
     def construct_whole(self, node: yaml.ScalarNode) -> int:
@@ -316,7 +316,13 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
                 None, None, f"{node.value} is octal in YAML: write no 0 before it, a point for a "
                 "decimal comma, or quote a text", node.start_mark,
             )  # fmt: skip
-        return int(self.construct_yaml_int(node))
+        number = int(self.construct_yaml_int(node))
+        if ":" in node.value:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"{node.value} is {number} in YAML: write that, or quote a text",
+                node.start_mark,
+            )  # fmt: skip
+        return number
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[str] = set()

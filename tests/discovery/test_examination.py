@@ -16,6 +16,7 @@ from tests.blind.score import discover_case, judge_discovery
 from thermocald.discovery import examination
 from thermocald.discovery.evidence import find_displaced_targets
 from thermocald.discovery.result import build_model, discover_series
+from thermocald.discovery.rivals import list_rivals
 from thermocald.discovery.search import Search, Solution
 from thermocald.discovery.validation import compare_with_surrogates
 from thermocald.output.discovery import report_html
@@ -72,8 +73,8 @@ def test_a_gradient_that_fits_better_is_not_excluded_by_the_errors_of_its_readin
     best, gradient = fitted("mount_motion", 449.4, 108.3), fitted("thermal_gradient", 430.5, 192.4)
     late = fitted("thermal_gradient", 490.0, 192.4)
 
-    assert examination._list_rivals(best, (best, gradient)) == (gradient,)
-    assert examination._list_rivals(best, (best, late)) == ()
+    assert list_rivals(best, (best, gradient)) == (gradient,)
+    assert list_rivals(best, (best, late)) == ()
 
 
 def test_epochs_with_few_targets_have_no_weight(evidence_of):

@@ -10,20 +10,24 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.analysis.test_thermal_model import for_fit, simulated
 from tests.blind.bridge import generated
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.outcome import excess_closed
 from tests.blind.outside import HUMID
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.discovery.formulas import Library, condense
 from thermocald.discovery.proposal import propose
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.search import Search
 from thermocald.physics.formula import Node
+from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import HypothesisFitter
-from thermocald.thermal.hypothesis import BASE, Candidate, Term
+from thermocald.thermal.hypothesis import BASE, Candidate, Term, parse_effect
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
 from thermocald.thermal.reduce import reduce_together
 from thermocald.thermal.scan import examine_all, scan_candidate
+from thermocald.thermal.source import epochs_input
 
 TEN = (
     "tanh", "sign_rate_square", "integral_above", "abs_rate", "two_lags", "product", "switch",
@@ -71,6 +75,21 @@ def test_the_error_of_a_second_thermometer_is_part_of_the_noise(above):
     alone = fitter.fit((term,), start, 1)
     assert len(whole.weightings[0].errors) == len(alone.weightings[0].errors) + 1
     assert whole.covariance[-1, -1] > 1.05 * alone.covariance[-1, -1]
+
+
+@pytest.mark.parametrize(
+    ("text", "k"),
+    [("above(temperature, k):k=90", 31.0), ("saturation(temperature, k, w):w=2", None)],
+)
+def test_a_formula_is_fitted_from_any_start(text, k):
+    """Regression: k was searched between ±10⁹ °C, a second constant was forgotten."""
+    s = simulated(1, listed=(ModelEffect("softening", {"T_k": 31.0, "x0": 4e-4}),))
+    source = epochs_input(s.head, s.field, list(s.epochs()), s.programme.series)
+    (effect,) = fit_thermal_model([for_fit(source)], [parse_effect(text)]).model.effects
+    assert 20.0 < effect.values["k"] < 50.0
+    if k:
+        assert effect.values["k"] == pytest.approx(k, abs=3 * effect.sds["k"])
+        assert effect.sds["k"] < 1.0
 
 
 def test_one_recording_gets_no_formula(above):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -212,11 +213,27 @@ def test_slope_and_curvature_of_correlated_constants_have_true_sds():
 
 
 @pytest.mark.parametrize(
-    "text", ["rate(saturation(temperature, k, w))", "product(time, above(temperature, k))"]
-)
+    ("text", "settles"),
+    [("product(temperature, board)", True), ("product(rate(temperature), board)", True),
+     ("integral(temperature)", False), ("product(time, board)", False)],
+)  # fmt: skip
+def test_what_settles_with_both_thermometers_has_a_value(text, settles):
+    """Regression: a product of two thermometers had no value at steady temperatures."""
+    with nullcontext() if settles else pytest.raises(DataError, match="no value at a steady"):
+        catalogue.get(text).steady({}, 20.0, {"board": 30.0})
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["rate(saturation(temperature, k, w))", "product(time, above(temperature, k))",
+     "product(board, above(temperature, k))"],
+)  # fmt: skip
 def test_other_functions_than_of_temperature_have_no_slope(text):
     names = [name for name, _, _ in parse(text).free()]
     values = {**dict.fromkeys(names, 30.0), "a": 1.0, "rate": 0.0}
-    known = known_together(text, values, ("c",), np.ones((len(values),) * 2), (20.0, 30.0, 45.0))
-    assert known["parameters"] == names
-    assert "slope" not in known
+    for variance, exchanged in ((1.0, False), (1e3, True)):  # k may be anywhere in the range
+        Q = np.full((len(values),) * 2, variance)
+        known = known_together(text, values, ("c",), Q, (20.0, 30.0, 45.0))
+        assert known["parameters"] == names
+        assert "slope" not in known
+        assert known["exchanged"] is exchanged

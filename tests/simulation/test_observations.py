@@ -13,6 +13,7 @@ from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import Measuring
 from thermocald.physics.heat import SimulatedThermometer
+from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import read_model
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.recording.reader import read_recording
@@ -87,6 +88,19 @@ def test_another_camera_and_a_view_without_targets_are_refused(simulation):
         next(replace(simulation, model=model).observations())
 
 
+def test_what_is_probably_not_meant_is_said(simulation):
+    """A time after the end, a knee above all temperatures, rad/K for µrad/K."""
+    listed = [ModelEffect("slip", {"time": 1e9, "c": 1e-3}), ModelEffect("creep", {"c": 1e-9}),
+              ModelEffect("softening", {"T_k": 90.0, "c": 1e-4}),
+              ModelEffect("housing_tilt", {"omega": 1.0})]  # fmt: skip
+    model = replace(simulation.model, effects=listed)
+    doubts = replace(simulation, model=model).as_dict()["doubts"]
+    assert [" ".join(d.split()[:4]) for d in doubts] == [
+        "effect slip changes nothing", "effect softening changes nothing", "the camera sees fewer"
+    ]  # fmt: skip
+    assert simulation.as_dict()["doubts"] == []
+
+
 def test_nothing_is_written_of_a_camera_that_cannot_be(simulation, tmp_path):
     course = simulation.programme
     cold = replace(simulation, programme=replace(course, initial=-400.0))
@@ -128,6 +142,8 @@ def test_preset_to_recording_and_json(tmp_path):
         ("--out r", "give --preset"),
         ("--model none.yaml --programme p.yaml --out r", "cannot be read"),
         ("--preset nexus5-cold --effect slip --out r", "slip:c=…"),
+        ("--preset nexus5-cold --effect creep:c=1e-6,c=2e-6 --out r", "c is given twice"),
+        ("--list --out r", "--list writes no recording"),
     ],
 )
 def test_wrong_usage(tmp_path, monkeypatch, arguments, reason):

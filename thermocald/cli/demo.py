@@ -114,6 +114,8 @@ def simulate(
     Example: thermocald simulate --preset rpi-v2.1-heating --out rpi-M1 --seed 1
     """
     if list_:
+        if out is not None:
+            raise UsageError(f"--list writes no recording; leave out --list, or --out {out}")
         show(tc.catalogue(), json)
         return
     if out is None:
@@ -127,6 +129,8 @@ def simulate(
     assert made.simulation is not None
     document = {**made.simulation.as_dict(), "recording": out}
     show(document, json, f"{out}: {made.simulation.lines()[0]}")
+    for doubt in document["doubts"]:
+        say(f"doubtful: {doubt}")
 
 
 _NAMES = ("c", "x0", "y0")  # the first parameters of the interior orientation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,14 +15,7 @@ from thermocald.discovery.evidence import (
     find_displaced_targets,
     replace_moved_boards,
 )
-from thermocald.discovery.lag import (
-    LAGS_S,
-    NEAR,
-    Late,
-    estimate_lag,
-    fit_behind,
-    lead_readings,
-)
+from thermocald.discovery.lag import Late, search_behind_lag
 from thermocald.discovery.mounted import (
     KNOCKS,
     contradict,
@@ -32,7 +26,8 @@ from thermocald.discovery.mounted import (
     search_beside_mount,
     split_knocks,
 )
-from thermocald.discovery.search import Search, Solution, by_score, list_candidates, say_searched
+from thermocald.discovery.rivals import does_better, list_rivals, may_replace, settle_ties
+from thermocald.discovery.search import Search, Solution, by_score, say_searched
 from thermocald.discovery.validation import (
     SurrogateTest,
     compare_with_surrogates,
@@ -41,7 +36,7 @@ from thermocald.discovery.validation import (
 )
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics import catalogue
-from thermocald.physics.formula import Node, Proportional
+from thermocald.physics.formula import Node
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
 from thermocald.thermal.hypothesis import BASE, Term, make_candidate, targets_of
 from thermocald.thermal.movement import (
@@ -77,9 +72,6 @@ _EFFECTS = 3
 _COMBINATIONS = 8  # fitted in full per level
 _WIDTH = 4  # solutions of a level that are extended
 _GUIDES = 3  # effects fitted to estimate how far the image moves
-_TURNS = 4  # estimates of a thermometer's lag, each beside the effects found with the one before
-_SAME_LAG = 0.02  # share of a lag by which a further estimate may change it
-_BESIDE_LAG = 2  # effects beside a lag of the thermometer
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +165,27 @@ def examine_series(
             say("the camera may have moved at random: searching again")
             result = _examine_beside_mount(calibrated, say, given, jobs, result.best) or result
     if _may_be_late(result):
-        result = replace(result, late=_search_behind_lag(result, say, given, jobs))
+        say("the thermometer may lag behind the camera: searching again")
+
+        def search_in(led: Sequence[ReducedSeries]) -> tuple[Solution, bool]:
+            found = _search_in(led, say, given, jobs)
+            return found.best, found.adequate
+
+        result = replace(result, late=search_behind_lag(result.best, len(given), search_in))
     return replace(
         result, displaced=tuple(displaced), noise_growth=growth, knows_noise="noise" in known,
         unblocked=tuple(cleaned), field_movements=tuple(field), distortion_sigmas=sure,
     )  # fmt: skip
+
+
+def _search_in(
+    series: Sequence[ReducedSeries],
+    say: Callable[[str], None],
+    given: Sequence[ModelEffect],
+    jobs: int,
+) -> Examination:
+    search = Search(HypothesisFitter(series), say)
+    return _search_standing(search, search.base(given), jobs)
 
 
 def _examine_standing(
@@ -193,11 +201,7 @@ def _examine_standing(
     all targets jump together. How much of these jumps a thermometer's errors explain depends on the
     effect; unless an effect explains them, each is fitted beside the tremble that it leaves.
     """
-
-    def search_in(series: list[ReducedSeries]) -> Examination:
-        search = Search(HypothesisFitter(series), say)
-        return _search_standing(search, search.base(given), jobs)
-
+    search_in = partial(_search_in, say=say, given=given, jobs=jobs)
     say("fitting the model without a further effect")
     search = Search(HypothesisFitter(ready), say)
     base = search.base(given)
@@ -237,39 +241,6 @@ def _may_be_late(x: Examination) -> bool:
     leaves = max(a.significance for a in x.adequacy) > criteria.LEFT_SIGMAS
     many = len(found) > 2 or (len(found) == 2 and leaves)
     return not x.adequate or (many and any(t.kind.follows_rate or t.kind.delay for t in found))
-
-
-def _search_behind_lag(
-    found: Examination, say: Callable[[str], None], given: Sequence[ModelEffect], jobs: int
-) -> Late | None:
-    """Find a lag of the thermometer and few effects that explain the series; None if none do.
-
-    All that drifts with the temperature follows T + τ dT/dt then, which gives τ at first.
-    """
-    say("the thermometer may lag behind the camera: searching again")
-    series = found.fitter.series
-    drifts = {
-        c.effect: c.term(None, len(series))
-        for c in list_candidates(series)
-        if isinstance(c.kind, Proportional) and not c.fixed
-    }
-    terms = (*drifts.values(), *(t for t in found.best.terms if t.effect not in drifts))
-    trials, before = LAGS_S, np.inf
-    for _ in range(_TURNS):
-        terms = tuple(t for t in terms if not (t.kind.follows_rate or t.kind.delay))
-        objective, tau = estimate_lag(series, terms, trials)
-        if np.isinf(before) and objective > fit_behind(series, terms, 0.0).objective:
-            return None
-        search = Search(HypothesisFitter([lead_readings(e, tau) for e in series]), say)
-        late = _search_standing(search, search.base(given), jobs)
-        names, worse = late.best.names[len(given) :], late.best.score - found.best.score
-        if worse > -criteria.BAND or not names:
-            return None
-        few = len(names) <= _BESIDE_LAG
-        if late.adequate and few and abs(tau - before) < _SAME_LAG * tau:
-            return Late(tau, worse, names)
-        terms, trials, before = late.best.terms, tau * NEAR, tau
-    return None
 
 
 def _search_beside_knocks(
@@ -334,7 +305,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
         if complete:
             equal = [s for s in frontier if s.score < best.score + criteria.BAND]
             larger = min(grown, key=by_score, default=best)
-            grown = [s for s in grown if _may_replace(base, best, equal, s)]
+            grown = [s for s in grown if may_replace(base, best, equal, s)]
         if not grown:
             break
         champion = min(grown, key=by_score)
@@ -350,9 +321,9 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
             sets = {tuple(sorted(s.names)): s for s in sorted(grown, key=lambda s: -s.score)}
             frontier = sorted(sets.values(), key=by_score)[:_WIDTH]
     # a larger combination that was rejected is a rival if two effects in it do better than one here
-    seen = [s for s in seen if len(s.terms) <= len(best.terms) or _does_better(s, best)]
+    seen = [s for s in seen if len(s.terms) <= len(best.terms) or does_better(s, best)]
     if len(best.terms) > kept:
-        best, seen = _settle_ties(search, best, larger, seen)
+        best, seen = settle_ties(search, best, larger, seen)
     blocks: list[Array] = []
     tests: tuple[SurrogateTest, ...] = ()
     if _is_adequate(examine_all(fitter, best.fit), base_adequacy):
@@ -367,7 +338,7 @@ def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     elif len(best.terms) > kept:
         complete = complete and not _own_rates_do_better(search, base, best)
     return Examination(
-        base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
+        base, best, tuple(ranking), list_rivals(best, seen), base_adequacy, adequacy,
         complete, tuple(blocks), surrogates=tests, walks=walks,
     )  # fmt: skip
 
@@ -415,116 +386,6 @@ def _own_rates_do_better(search: Search, base: Solution, best: Solution) -> bool
     penalty = len(BASE) * float(np.log(search.epochs))
     other = search.refine((*base.terms, *own), (*base.penalties, *[penalty] * len(own)))
     return other.score < best.score - criteria.BAND
-
-
-def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ...]:
-    """List the solutions that cannot be excluded beside the best one, best first."""
-    out: list[Solution] = []
-    for s in sorted(seen, key=by_score):
-        mine = [t for t in best.terms if t.effect not in s.names]
-        theirs = [t for t in s.terms if t.effect not in best.names]
-        worse, band = s.score - best.score, criteria.BAND
-        single = len(mine) == len(theirs) == 1
-        # one drive in place of another is compared by the fit alone
-        if single and mine[0].kind.is_drive and theirs[0].kind.is_drive:
-            worse, band = s.fit.chi2 - best.fit.chi2, criteria.DRIVES_BAND
-        # and so is a step that one epoch shows: any cause that begins there fits it as well, and
-        # the determinant counts only how much the readings' errors blur this epoch
-        elif any(_shows_once(t, best.fitter.series) for t in mine):
-            worse = s.fit.chi2 - best.fit.chi2
-        # the determinant counts how much the readings' errors blur a rate, which excludes none
-        elif single and theirs[0].kind.follows_rate and not mine[0].kind.is_drive:
-            worse -= s.fit.logdet - best.fit.logdet
-        close = worse < band
-        different = sorted(s.names) != sorted(best.names)
-        if different and close and s.names not in [r.names for r in out]:
-            out.append(s)
-    # a larger one says nothing new if it contains another
-    more = [s for s in out if len(s.terms) > len(best.terms)]
-    said = [s for s in more if any(set(r.names) < set(s.names) for r in (best, *out))]
-    return tuple(s for s in out if s not in said)
-
-
-def _shows_once(term: Term, series: Sequence[ReducedSeries]) -> bool:
-    """Test whether an event has one epoch before or after it, in each series in which it occurs."""
-    if not term.kind.is_event:
-        return False
-    pairs = zip(series, term.fresh, strict=True)
-    later = [e.times[e.n > 0] >= own[0][1] for e, own in pairs if own]
-    return all(min(np.sum(after), np.sum(~after)) <= 1 for after in later)
-
-
-def _settle_ties(
-    search: Search, best: Solution, larger: Solution, seen: list[Solution]
-) -> tuple[Solution, list[Solution]]:
-    """Choose among near ties; larger: the best combination with one more effect."""
-    decides = _does_better(larger, best, by=criteria.BAND)
-    best, seen = _compare_ties(search, best, seen)
-    if decides:  # its last effect is too small for a name, but shows which tie is right
-        ties = [s for s in seen if s.score < best.score + criteria.BAND]
-        inside = [s for s in ties if set(s.names) < set(larger.names)]
-        best = min(inside, key=by_score, default=best)
-    # The likelihood takes all trajectories of the temperature as equally probable. A lag smooths
-    # the thermometer's noise, a delay does not, so a smooth image would always favour a lag: only
-    # the fit decides.
-    other = search.with_other_delay(best)
-    if other is not None:
-        seen = [*seen, other]
-        best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
-    return best, seen
-
-
-def _compare_ties(
-    search: Search, best: Solution, seen: list[Solution]
-) -> tuple[Solution, list[Solution]]:
-    """Compare near ties again, each with the thermometer noise that fits it best."""
-    close = {s.terms: s for s in seen if s.score < best.score + 60.0}
-    if len({s.names for s in close.values()}) < 2:
-        return best, seen
-
-    def compare(solutions: list[Solution], most: int) -> list[Solution]:
-        again = []
-        for s in sorted(solutions, key=by_score)[:most]:
-            objective = search.fitter.suit_thermometers(s.fit)
-            again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
-        return sorted(again, key=by_score)
-
-    small = compare([s for s in close.values() if len(s.terms) <= len(best.terms)], 6)
-    large = compare([s for s in close.values() if len(s.terms) > len(best.terms)], 2)
-    return small[0], [*small, *large, *(s for s in seen if s.terms not in close)]
-
-
-def _does_better(larger: Solution, best: Solution, by: float = 0.0) -> bool:
-    """Test whether a larger combination without one of the best one's effects scores better."""
-    return larger.score < best.score - by and not set(best.names) <= set(larger.names)
-
-
-def _may_replace(
-    base: Solution, best: Solution, equal: Sequence[Solution], champion: Solution
-) -> bool:
-    """Decide whether a solution replaces `best`, which is adequate, or one `equal` to it.
-
-    One more effect must explain more than a refinement of the others would; other effects must
-    exclude these and also fit better, not only by a smoother temperature.
-    """
-    fewer = [s for s in equal if set(s.names) <= set(champion.names)]
-    if not fewer:
-        return (
-            _measure_px(best, champion) >= criteria.CURVATURE_PX
-            and champion.score < best.score - criteria.BAND
-            and champion.fit.chi2 < best.fit.chi2
-        )
-    least = max(criteria.FURTHER_PX, criteria.FURTHER_SHARE * _measure_px(base, best))
-    return all(_measure_px(s, champion) >= least for s in fewer)
-
-
-def _measure_px(without: Solution, with_it: Solution) -> float:
-    """Return the RMS that one more effect explains, px."""
-    gain = max(without.score - with_it.score, 0.0)
-    series = without.fitter.series
-    coordinates = 2.0 * sum(float(e.n.sum()) for e in series)
-    weights = np.concatenate([e.weights[..., 0].ravel() for e in series])
-    return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
 
 
 def _is_adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:

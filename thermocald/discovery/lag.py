@@ -11,20 +11,27 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from thermocald.discovery import criteria
+from thermocald.discovery.search import list_candidates
 from thermocald.numbers import enumerated
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
+from thermocald.physics.formula import Proportional
 from thermocald.thermal.fit import HypothesisFitter
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from thermocald.arrays import Array
+    from thermocald.discovery.search import Solution
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.series import ReducedSeries
 
-LAGS_S = np.geomspace(2.0, 600.0, 11)  # trial values for a thermometer's lag
-NEAR = np.array([0.5, 1.0, 2.0])  # the same, as multiples of an estimate
+_LAGS_S = np.geomspace(2.0, 600.0, 11)  # trial values for a thermometer's lag
+_NEAR = np.array([0.5, 1.0, 2.0])  # the same, as multiples of an estimate
+_TURNS = 4  # estimates of it, each beside the effects found with the one before
+_SAME = 0.02  # share of a lag by which a further estimate may change it
+_BESIDE = 2  # effects beside a lag of the thermometer
 _SURE = 3.0  # least lag of a thermometer, in its standard deviations
 _UNLIKE = 0.01  # probability below which the gradients are not one lag times the rates
 
@@ -92,7 +99,42 @@ def describe_lag(tau: float, worse: float, said: str, *beside: str) -> dict[str,
     }
 
 
-def estimate_lag(
+def search_behind_lag(
+    found: Solution,
+    known: int,
+    search_in: Callable[[Sequence[ReducedSeries]], tuple[Solution, bool]],
+) -> Late | None:
+    """Find a lag of the thermometer and few effects that explain the series; None if none do.
+
+    All that drifts with the temperature follows T + τ dT/dt then, which gives τ at first.
+    known: number of effects in the model; search_in: searches for effects in series, and tells
+    whether they are adequate.
+    """
+    series = found.fitter.series
+    drifts = {
+        c.effect: c.term(None, len(series))
+        for c in list_candidates(series)
+        if isinstance(c.kind, Proportional) and not c.fixed
+    }
+    terms = (*drifts.values(), *(t for t in found.terms if t.effect not in drifts))
+    trials, before = _LAGS_S, np.inf
+    for _ in range(_TURNS):
+        terms = tuple(t for t in terms if not (t.kind.follows_rate or t.kind.delay))
+        objective, tau = _estimate_lag(series, terms, trials)
+        if np.isinf(before) and objective > _fit_behind(series, terms, 0.0).objective:
+            return None
+        late, adequate = search_in([_lead_readings(e, tau) for e in series])
+        names, worse = late.names[known:], late.score - found.score
+        if worse > -criteria.BAND or not names:
+            return None
+        few = len(names) <= _BESIDE
+        if adequate and few and abs(tau - before) < _SAME * tau:
+            return Late(tau, worse, names)
+        terms, trials, before = late.terms, tau * _NEAR, tau
+    return None
+
+
+def _estimate_lag(
     series: Sequence[ReducedSeries], terms: Sequence[Term], trials: Array
 ) -> tuple[float, float]:
     """Estimate the thermometer's lag beside some effects, near the best of some `trials`, s.
@@ -101,21 +143,21 @@ def estimate_lag(
     """
     from scipy.optimize import minimize_scalar
 
-    at = int(np.argmin([fit_behind(series, terms, t).objective for t in trials[1:-1]]))
+    at = int(np.argmin([_fit_behind(series, terms, t).objective for t in trials[1:-1]]))
     best = minimize_scalar(
-        lambda t: fit_behind(series, terms, t).objective, bounds=trials[[at, at + 2]],
+        lambda t: _fit_behind(series, terms, t).objective, bounds=trials[[at, at + 2]],
         method="bounded", options={"xatol": 0.005 * trials[at + 1], "maxiter": 14},
     )  # fmt: skip
     return float(best.fun), float(best.x)
 
 
-def fit_behind(series: Sequence[ReducedSeries], terms: Sequence[Term], tau: float) -> Fit:
+def _fit_behind(series: Sequence[ReducedSeries], terms: Sequence[Term], tau: float) -> Fit:
     """Fit effects in the temperature that a thermometer with the lag τ s has read."""
-    fitter = HypothesisFitter([lead_readings(e, tau) for e in series])
+    fitter = HypothesisFitter([_lead_readings(e, tau) for e in series])
     return fitter.refine(fitter.fit(terms), max_iterations=8)
 
 
-def lead_readings(e: ReducedSeries, tau: float) -> ReducedSeries:
+def _lead_readings(e: ReducedSeries, tau: float) -> ReducedSeries:
     """Return the series with the temperature that a thermometer with the lag τ s has read."""
     from scipy.sparse import csr_array, diags_array, eye_array
 

@@ -68,6 +68,13 @@ class Prediction:
         factors = np.ones((epochs, 3)), np.ones(epochs), np.ones(epochs)
         return cls(iop, eop, *factors, np.zeros(epochs), [], field)
 
+    def is_like(self, other: Prediction) -> bool:
+        """Whether another prediction for the same times is the same."""
+        arrays = ("iop", "eop", "scale", "noise_factor")
+        moved = [sum(active.any() for *_, active in p.displacements) for p in (self, other)]
+        same = all(np.array_equal(getattr(self, n), getattr(other, n)) for n in arrays)
+        return same and moved[0] == moved[1]
+
     @property
     def moves_points(self) -> bool:
         """Whether any object point differs from the test field's file."""

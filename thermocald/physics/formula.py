@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.effect import Estimates, Values
+    from thermocald.physics.effect import Estimates, Role, Values
     from thermocald.physics.history import History
 
 TIME = "time"
@@ -53,6 +53,10 @@ _LONGEST = 300  # characters of a formula
 _DEEPEST = 8
 _OFFSET_C = "degC"
 _OWN_UNITS = {"time_constant": "s", "phase": "rad", "exponent": "1"}  # else that of the input
+# the constants whose order of magnitude the recording shows, by role and unit
+_SCANNED: dict[tuple[str, str], Role] = {
+    ("threshold", _OFFSET_C): "threshold", ("time_constant", "s"): "time_constant"
+}  # fmt: skip
 _TOGETHER = 0.99  # correlation from which constants are determined only jointly
 _ON_THE_CURVE = 41  # temperatures
 
@@ -159,17 +163,19 @@ class Node:
         return f"{self.operator}({', '.join(parts)})"
 
     def steady(self, temperatures: Array) -> Array | None:
-        """Return a bound formula's settled values (n,) at constant temperatures (n,) °C.
+        """Return a bound formula's settled values (n,) at constant temperatures (n,) °C of all.
 
-        None if the formula is not a function of one temperature.
+        None if it does not settle.
         """
         if self.is_leaf:
             return None if self.operator else temperatures
         inner = [v for n in self.inputs if (v := n.steady(temperatures)) is not None]
-        if len(inner) < len(self.inputs) or len(self.channels()) > 1:
+        if len(inner) < len(self.inputs):
             return None
         if not self.kind.remembers:
             return self.kind.value(*inner, *self.constants)
+        if self.operator == "rate":
+            return 0.0 * temperatures
         return inner[0] if self.kind.keeps else None
 
     # -- units ---------------------------------------------------------------------------------
@@ -439,8 +445,9 @@ class GivenFormula(OfFormula):
         for name, constant, owner in self.node.free():
             unit, above_0 = owner.unit_of(constant), constant.positive
             start, low = {"degC": 30.0, "s": 60.0}.get(unit, 1.0), 1e-9 if above_0 else -1e9
+            role = _SCANNED.get((constant.role, unit), "")
             self.nonlinear[name] = Parameter(
-                unit, low, 1e9, start, log=above_0, sized=unit != _OFFSET_C
+                unit, low, 1e9, start, log=above_0, role=role, sized=unit != _OFFSET_C
             )
         per = unit_text(self.node.unit())
         self.linear = coefficient_units(per if per.isalnum() else f"({per})")
@@ -505,14 +512,19 @@ def known_together(
     tied = list(dict.fromkeys([*exchanged, *found]))
     if not tied:
         return None
-    low, mean, high = temperatures
+    effect, (low, mean, high) = GivenFormula(text), temperatures
+    # a temperature that may be anywhere in the range, or beyond
+    exchanged = exchanged or [
+        n
+        for n, one in zip(names, sd, strict=False)
+        if n in found and effect.nonlinear[n].unit == _OFFSET_C and one > high - low
+    ]
     T = np.linspace(low, high, _ON_THE_CURVE)
     parabola = np.linalg.pinv(np.vander(T - mean, 3, increasing=True))[1:] * [[1.0], [2.0]]
-    effect = GivenFormula(text)
 
     def course(x: Array) -> Array | None:  # slope and curvature (2, P)
         f = effect.node.bound(dict(zip(names, x.tolist(), strict=True))).steady(T)
-        if f is None:
+        if f is None or len(effect.node.channels()) > 1:
             return None
         return np.outer(parabola @ f, x[L : L + P]) + [[1.0], [0.0]] * x[L + P :]
 

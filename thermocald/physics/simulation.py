@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 _CHUNK = 64  # epochs at a time
 _MARGIN_PX = 5.0  # a target nearer to the image's edge is not measured
+_FEWEST = 3  # targets without which there is nothing to orient the camera by
 _FINEST_STEPS = 10  # knots of the true temperature per interval
 _LONG = 20_000  # epochs above which there is one knot per interval
 _COLDEST, _HOTTEST = -273.15, 220.0  # °C; a recording of hotter ones would be taken for kelvin
@@ -128,6 +129,34 @@ class Simulation:
         return truth
 
     @cached_property
+    def _doubts(self) -> list[str]:
+        """Effects that change nothing in this series, and a camera that turns away from its field.
+
+        Both come of a wrong unit or a time beyond the programme.
+        """
+        effects, history, out = self.model.effects, self.true_history, []
+        for effect in effects:
+            others = tuple(e for e in effects if e is not effect)
+            without = replace(self.model, effects=others, exterior=self.exterior)
+            if without.predict(history, self.field).is_like(self.truth):
+                T = history.temperature()
+                out.append(
+                    f"effect {effect.name} changes nothing in this series, which lasts "
+                    f"{self.frame_times[-1]:.0f} s, at {T.min():.1f} to {T.max():.1f} °C; check "
+                    "its parameters"
+                )
+        every = self.programme.epochs
+        parts = (slice(k, min(k + _CHUNK, every)) for k in range(0, every, _CHUNK))
+        inside = (self.model.sensor.contains(self.image_points(p), _MARGIN_PX) for p in parts)
+        if few := sum(int(np.sum(seen.sum(axis=1) < _FEWEST)) for seen in inside):
+            out.append(
+                f"the camera sees fewer than {_FEWEST} targets in {few} of "
+                f"{counted(every, 'epoch')}; check the effects that turn or shift it, and their "
+                "units"
+            )
+        return out
+
+    @cached_property
     def readings(self) -> dict[str, Array]:
         """The thermometers' readings {channel: (E,) °C}, NaN where missing."""
         true = self.true_history
@@ -182,7 +211,7 @@ class Simulation:
             with np.errstate(invalid="ignore"):
                 seen = self.model.sensor.contains(true, _MARGIN_PX) & ~missed
             measured = true + factor[:, None, None] * noise + gross[..., None] * wrong
-            if begin == 0 and int(seen[0].sum()) < 3:
+            if begin == 0 and int(seen[0].sum()) < _FEWEST:
                 raise GeometryError(
                     f"the camera sees {int(seen[0].sum())} of {n} targets; point it at the field "
                     "(exterior or distance in the camera file)"
@@ -269,6 +298,7 @@ class Simulation:
             },
             "noise_factor": {"first": float(truth.noise_factor[0]),
                              "highest": float(truth.noise_factor.max())},
+            "doubts": self._doubts,
         }  # fmt: skip
 
     def lines(self) -> list[str]:

@@ -324,10 +324,12 @@ def parse_effect(text: str) -> ModelEffect:
             raise UsageError(
                 f"--effect {text}: {name} has no parameter {key!r}; {_suggest(key, kind.units())}"
             )
+        if key in values:
+            raise UsageError(f"--effect {text}: {key} is given twice; give it once")
         if not equals and key not in kind.linear:
             raise UsageError(f"--effect {text}: {key} has no value; give {key}=VALUE")
         if not equals:
-            values.setdefault(key, 0.0)
+            values[key] = 0.0
         elif key in kind.nonlinear and kind.nonlinear[key].text:
             names = kind.nonlinear[key].unit == "names"
             values[key] = tuple(value.split("+")) if names else value

@@ -228,8 +228,9 @@ def make_term(
 ) -> Term:
     """Return an effect as a term to add to a hypothesis, which is fitted only for a search.
 
-    search: search its non-linear parameters over their whole range, except those in `fitter.held`;
-    the time of an event is always searched, in each series.
+    search: search the first of its non-linear parameters that is not in `fitter.held` over its
+    whole range, if the recording shows that range; the time of an event is always searched, in each
+    series.
     """
     kind = catalogue.get(effect.name)
     given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
@@ -251,7 +252,9 @@ def make_term(
             time = float(fitter.series[s].times[best + 1])
             fresh.append(((candidate.name, time),) if gains[best] > least else None)
         return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
-    if search and candidate.name:
+    if search and candidate.name and (kind.nonlinear[candidate.name].role or not numbers):
+        others = tuple((k, v) for k, v in numbers.items() if k != candidate.name and k not in held)
+        candidate = replace(candidate, fixed=(*candidate.fixed, *others))
         found = scan_candidate(fitter, candidate, fitter.fit(terms))
         return candidate.term(float(candidate.grid[found.best]), len(fitter.series))
     return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))

@@ -107,6 +107,8 @@ def test_a_board_is_as_large_as_the_paper_allows():
          "smaller than squares"),
         (("--charuco", "12x12", "--dictionary", "DICT_4X4_50", "--paper", "A0"), "50 markers"),
         (("--aprilgrid", "900x900"), "1 to 100 tags"),
+        (("--aprilgrid", "30x20", "--paper", "A0"), "587 markers.* up to 599"),
+        (("--charuco", "11x8", "--square", 60, "--marker", 60), "smaller than squares"),
         (("--chessboard", "999x998"), "3 to 100"),
     ],
 )  # fmt: skip

@@ -225,6 +225,7 @@ def test_every_paper_has_a_sensible_default(name, landscape):
         (Design((210, 297), 60.0), "smaller discs or larger paper"),
         (Design((841, 1189), 8.0, bits=12), "--bits 14"),
         (Design((841, 1189), 3.0, bits=14), "more than the 516"),
+        (Design((210, 297), 7.0, first_code=516), "the 0 ring.*smaller --first-code"),
         (Design((210, 297), 7.0, bits=13), "12 or 14"),
         (Design((210, 297), 7.0, bits=0), "cannot be identified"),
         (Design((210, 297), 7.0, dictionary="DICT_KLINGON"), "DICT_KLINGON"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from thermocald.arrays import full_scale
 from thermocald.errors import ImageError
 from thermocald.photogrammetry.targets.image_file import (
     EncodedImage,
@@ -58,3 +59,10 @@ def test_a_truncated_jpeg_is_refused():
     for data in (JPEG, preview):
         with pytest.raises(ImageError, match="its end is missing"):
             EncodedImage(data[:-200])
+
+
+@pytest.mark.parametrize(
+    ("brightest", "full"), [(600, 1023), (2500, 4095), (9000, 16383), (40_000, 65_535)]
+)
+def test_a_sensor_of_10_to_16_bit_saturates_at_its_own_full_scale(brightest, full):
+    assert full_scale(np.array([[0, brightest]], dtype=np.uint16)) == full

@@ -21,7 +21,8 @@ from tests.photogrammetry.fields import (
     station,
 )
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
-from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
+from thermocald.photogrammetry.field.planes import field_normals
+from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import frame_figures, measure
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets import ring_code

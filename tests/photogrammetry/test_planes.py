@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.fields import corner_field
-from thermocald.photogrammetry.field.testfield import (
-    TestField,
-    field_normals,
-    field_sheets,
-    target_normals,
-)
+from thermocald.photogrammetry.field.planes import field_normals, field_sheets, target_normals
+from thermocald.photogrammetry.field.testfield import TestField
 
 RNG = np.random.default_rng(4)
 

@@ -17,6 +17,7 @@ from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.sheets import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.field.testfield import Distance, TestField
+from thermocald.photogrammetry.frame.measurement import REPEATED
 from thermocald.photogrammetry.survey import _measure_again, survey
 from thermocald.physics.scene import Scene
 
@@ -66,17 +67,20 @@ def sheet():
 
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_bent_sheet_with_and_without_its_nominal_field(sheet, given):
-    """Without it, codes give the names, photographs the diameters. A black and a foreign photograph
-    are named and do no harm."""
+    """Without it, codes give the names, photographs the diameters. A black, a foreign and a copied
+    photograph are named and do no harm."""
     nominal, truth, pictures, distance = sheet
     shape = pictures["photo0.png"]().shape
     noise = np.random.default_rng(0).integers(60, 180, (77, 103), dtype=np.uint8)
     clutter = cv2.resize(noise, shape[::-1], interpolation=cv2.INTER_CUBIC)
     others = {"black.png": lambda: np.zeros(shape, dtype=np.uint8), "wall.png": lambda: clutter}
+    jpeg = cv2.imencode(".jpg", pictures["photo0.png"](), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+    others["same.jpg"] = lambda: cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
     result = survey(pictures | others, [distance], 0.00224, nominal=nominal if given else None)
     assert not {s.photo for s in result.network.stations} & set(others)
     assert result.measured["wall.png"] == "0 coded targets"
     assert "coded targets" not in result.measured["black.png"]
+    assert result.measured["same.jpg"] == REPEATED.format("photo0.png")
     codes = dict(zip(truth.names, truth.codes, strict=True))
     expected = {name: code for name, code in codes.items() if code or given}
     assert dict(zip(result.field.names, result.field.codes, strict=True)) == expected

@@ -27,7 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
 )
 from thermocald.photogrammetry.epoch.adjustment import image_coverage, weaknesses
-from thermocald.photogrammetry.field.testfield import field_normals, plane_fit
+from thermocald.photogrammetry.field.planes import field_normals, plane_fit
 from thermocald.photogrammetry.linalg import scaled_inverse, unit_diagonal
 from thermocald.photogrammetry.targets.outline import facing, local_maps
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from thermocald.discovery import criteria
 from thermocald.errors import DataError
-from thermocald.photogrammetry.field.testfield import field_sheets
+from thermocald.photogrammetry.field.planes import field_sheets
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.field_motion import (
     FEW_TARGETS,

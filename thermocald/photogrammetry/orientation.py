@@ -31,7 +31,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
     rays,
 )
-from thermocald.photogrammetry.field.testfield import plane_fit
+from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 
 if TYPE_CHECKING:

@@ -24,14 +24,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.testfield import (
-    Distance,
-    Observations,
-    TestField,
-    field_sheets,
-    sheet_normals,
-    target_normals,
-)
+from thermocald.photogrammetry.field.planes import field_sheets, sheet_normals, target_normals
+from thermocald.photogrammetry.field.testfield import Distance, Observations, TestField
 from thermocald.photogrammetry.frame.measurement import (
     REPEATED,
     find_repeated,

@@ -34,7 +34,7 @@ import cv2
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.photogrammetry.field.testfield import plane_fit, target_normals
+from thermocald.photogrammetry.field.planes import plane_fit, target_normals
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import marker_cells, marker_rows
 

@@ -26,12 +26,8 @@ import numpy as np
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, cold_start
-from thermocald.photogrammetry.field.testfield import (
-    FAR_ELSEWHERE,
-    Observations,
-    find_misplaced,
-    plane_fit,
-)
+from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE, Observations, find_misplaced
 from thermocald.photogrammetry.linalg import MAD_TO_SD, median_known, orthonormal_combinations
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,

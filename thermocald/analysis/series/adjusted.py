@@ -17,7 +17,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
 )
-from thermocald.photogrammetry.field.testfield import field_sheets, find_misplaced
+from thermocald.photogrammetry.field.planes import field_sheets
+from thermocald.photogrammetry.field.testfield import find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.field_motion import (
     FEWEST_EPOCHS,

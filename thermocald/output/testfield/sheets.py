@@ -246,6 +246,7 @@ def _codes(design: Design) -> Iterator[str]:
             f"the field needs more than the {len(available[design.first_code :])} ring codes of "
             f"{design.bits} bits that are left; "
             + ("use --bits 14, or " if design.bits == 12 else "use ")
+            + ("a smaller --first-code, " if design.first_code else "")
             + "larger discs, smaller paper, or markers in between"
         )
 
@@ -426,6 +427,7 @@ def print_board(
 
     page: width, height mm. Raises UsageError if the board does not fit on it.
     """
+    field = board.field()
     (width, height), room = _extent(board), _room(page)
     if width > room[0] + 1e-6 or height > room[1] + 1e-6:
         raise UsageError(
@@ -433,7 +435,6 @@ def print_board(
             f"margin; {page[0]:g} × {page[1]:g} mm paper has room for {room[0]:.0f} × "
             f"{room[1]:.0f}; use smaller squares or larger paper"
         )
-    field = board.field()
     # where the origin is on the page if the board is in its middle
     low = board.lattice[3] if board.has_tags else 0.0
     origin = [STRIP + (r - b) / 2 + low for r, b in zip(room, board.black, strict=True)]

@@ -53,7 +53,7 @@ from thermocald.photogrammetry.epoch.gauss_markov import (
     snoop,
     solve,
 )
-from thermocald.photogrammetry.field.testfield import plane_fit
+from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.orientation import approximate_orientation, resection
 
 if TYPE_CHECKING:

@@ -25,12 +25,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.testfield import (
-    FAR_ELSEWHERE,
-    Observations,
-    TestField,
-    field_normals,
-)
+from thermocald.photogrammetry.field.planes import field_normals
+from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE, Observations, TestField
 from thermocald.photogrammetry.linalg import inverse_2x2, mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import locate_chessboards, predict_corners

@@ -33,7 +33,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     uncertain,
 )
 from thermocald.photogrammetry.epoch.gauss_markov import TRUSTED_REDUNDANCY, settle
-from thermocald.photogrammetry.field.testfield import plane_fit
+from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.linalg import median_variance
 from thermocald.photogrammetry.network.bundle import (
     BEHIND,

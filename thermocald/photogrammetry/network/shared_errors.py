@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.field.testfield import plane_fit
+from thermocald.photogrammetry.field.planes import plane_fit
 from thermocald.photogrammetry.network.bundle import sum_at
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.photogrammetry.field.testfield import FEWEST_ON_A_SHEET
+from thermocald.photogrammetry.field.planes import FEWEST_ON_A_SHEET
 from thermocald.photogrammetry.linalg import inverse_of_determined, rigid_motion
 from thermocald.photogrammetry.series.normals import ObservationGrid
 

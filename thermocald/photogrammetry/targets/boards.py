@@ -66,6 +66,16 @@ def board_of(
     return TestField.build(names, points, sigmas, diameter, kinds, codes)
 
 
+def _markers(name: str, last: int) -> Any:
+    """Return a dictionary of OpenCV's; TestFieldError unless it has the marker of number `last`."""
+    found = markers_of(name)
+    if last >= (count := len(found.bytesList)):
+        raise TestFieldError(
+            f"{name} has {count} markers, 0 to {count - 1}, but the board needs them up to {last}"
+        )
+    return found
+
+
 def aprilgrid(
     columns: int,
     rows: int,
@@ -86,6 +96,7 @@ def aprilgrid(
             f"an AprilGrid of {columns} × {rows} tags of {size:g} mm, spacing {spacing:g}: it must "
             "have 1 to 100 tags each way, of more than 0 mm, and a spacing (a ratio) from 0 to 1"
         )
+    _markers("DICT_APRILTAG_36h11", first + columns * rows - 1)
     step = size * (1 + spacing)
     square = np.array([[size, 0.0], [0.0, 0.0], [0.0, size], [size, size]])
     names, points, codes = [], [], []
@@ -121,12 +132,8 @@ def charuco(
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm with markers of "
             f"{marker:g} mm: it must have 2 to 100 squares, and markers smaller than squares"
         )
-    markers = markers_of(dictionary)
     numbers = np.arange(columns * rows // 2, dtype=np.int32)
-    if numbers[-1] >= len(markers.bytesList):
-        raise TestFieldError(
-            f"{dictionary} has {len(markers.bytesList)} markers, but the board needs {len(numbers)}"
-        )
+    markers = _markers(dictionary, int(numbers[-1]))
     board = cv2.aruco.CharucoBoard((columns, rows), square, marker, markers, numbers)
     board.setLegacyPattern(legacy)
     corners = np.asarray(board.getChessboardCorners(), dtype=float)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from tests.blind.world import backlash
 from thermocald.errors import ConfigurationError, DataError
@@ -16,7 +17,7 @@ from thermocald.physics.formula import known_together, parse
 from thermocald.physics.history import History
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import read_effects, write_effects
-from thermocald.physics.operators import OPERATORS
+from thermocald.physics.operators import OPERATORS, averaged_lag_matrix, lag_matrix
 from thermocald.physics.presets import preset_simulation
 
 SECONDS = np.arange(1200.0)
@@ -96,12 +97,26 @@ def test_a_product_of_two_thermometers_propagates_the_errors_of_both(history):
         }), a=20.0)[:, 0]
         for _ in range(400)
     ]  # fmt: skip
-    first = (effect.sensitivity(history, a=20.0) ** 2).sum(axis=1) * sd["temperature"] ** 2
-    (further,) = effect.further_sensitivities(history, a=20.0).values()
-    both = first + (further**2).sum(axis=1) * sd["board"] ** 2
+    matrices = effect.sensitivities(history, a=20.0)
+    first, further = ((matrices[n] ** 2).sum(axis=1) * sd[n] ** 2 for n in sd)
+    both = first + further
     scatter = float(np.mean(np.var(drawn, axis=0)))
     assert scatter == pytest.approx(float(np.mean(both)), rel=0.1)
     assert np.mean(first) < 0.9 * scatter
+
+
+def test_averages_of_a_long_lag_are_those_of_its_whole_matrix():
+    """They are made from few times: the whole matrix of a week needs gigabytes."""
+    rng = np.random.default_rng(2)
+    knots = np.cumsum(rng.uniform(8, 12, 2000)) + np.repeat([0.0, 9000.0], 1000)  # a night between
+    at = knots[:-1] + 3.0
+    averages = csr_array(np.repeat(np.eye(20) / 100, 100, axis=1)[:, :-1])
+    for tau in (20.0, 300.0, 3000.0):
+        whole = (averages @ lag_matrix(knots, knots, tau, at)).toarray()
+        found = averaged_lag_matrix(averages, knots, knots, tau, at).toarray()
+        np.testing.assert_allclose(found.sum(axis=1), whole.sum(axis=1), atol=1e-5)
+        assert (found**2).sum(axis=1) == pytest.approx((whole**2).sum(axis=1), rel=0.05)
+        assert np.abs(found - whole).max() < 0.1 * np.abs(whole).max()
 
 
 def test_every_operator_is_tested():

@@ -98,17 +98,12 @@ def drive(history: History, drives: Drives) -> Array:
     return get(name).drive(driven_history(history, drives[:-1]), **values)
 
 
-def drive_matrix(history: History, drives: Drives, at_readings: bool = False) -> csr_array | None:
-    """Return ∂ drive / ∂ readings, (E, R), sparse.
-
-    at_readings: whether to return ∂ driven readings / ∂ readings (R, R) instead, None for the
-    identity if there is no drive.
-    """
-    chain: csr_array | None = None
-    for number, (name, values) in enumerate(drives, start=1):
-        here = driven_history(history, drives[: number - 1])
-        if at_readings or number < len(drives):
-            here = here.at(history.reading_times)
-        own = get(name).sensitivity(here, **values)
-        chain = own if chain is None else own @ chain
-    return chain if drives or at_readings else history.temperature_matrix()
+def drive_matrix(history: History, drives: Drives, averages: csr_array | None = None) -> csr_array:
+    """Return ∂ drive / ∂ readings, (E, R), sparse; of averages (B, E) of the epochs, (B, R)."""
+    if not drives:
+        matrix = history.temperature_matrix()
+        return matrix if averages is None else averages @ matrix
+    (name, values), before = drives[-1], drives[:-1]
+    here, kind = driven_history(history, before), get(name)
+    own = kind.sensitivities(here, averages, **values)[kind.channel(here, **values)]
+    return drive_matrix(history.at(history.reading_times), before, own) if before else own

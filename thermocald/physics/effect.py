@@ -281,9 +281,16 @@ class Effect:
             columns[:, i] /= 2 * step
         return csr_array(columns)
 
-    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:  # noqa: ARG002
-        """Return the sensitivity to every other column that it reads, {channel: (E, R)}."""
-        return {}
+    def sensitivities(
+        self, history: History, averages: csr_array | None = None, **nonlinear: Any
+    ) -> dict[str, csr_array]:
+        """Return the sensitivity to every column that it reads, {channel: (E, R)}.
+
+        averages (B, E): weights; the sensitivities of these averages are returned, (B, R).
+        """
+        own = self.sensitivity(history, **nonlinear)
+        channel = self.channel(history, **nonlinear)
+        return {channel: own if averages is None else averages @ own}
 
     def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
         """Return the sd (E,) of drive or first signal due to the spacing of the readings.

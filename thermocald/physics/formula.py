@@ -36,7 +36,13 @@ from thermocald.physics.effect import (
     coefficient_units,
     say_estimate,
 )
-from thermocald.physics.operators import OPERATORS, Constant, Operator, interpolation_matrix
+from thermocald.physics.operators import (
+    OPERATORS,
+    Constant,
+    Operator,
+    averaged_lag_matrix,
+    interpolation_matrix,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -342,30 +348,36 @@ class Evaluator:
         at = self.knots if at_knots else self.history.times
         return self.knots, inner, *node.constants, at
 
-    def sensitivity(self, node: Node, channel: str, at_knots: bool = False) -> csr_array:
-        """Return ∂ values / ∂ readings of a channel, (E, R) or (K, R), sparse."""
+    def averaged(
+        self, averages: csr_array, node: Node, channel: str, at_knots: bool = False
+    ) -> csr_array:
+        """Return averages @ ∂ values / ∂ readings of a channel, (B, R), sparse.
+
+        averages (B, E), or (B, K) of values at the knots.
+        """
         from scipy.sparse import csr_array, diags_array
 
-        at = self.knots if at_knots else self.history.times
+        nothing = csr_array((averages.shape[0], len(self.history.reading_times)))
+        if channel not in node.channels():
+            return nothing
         if node.is_leaf:
-            if node.operator or node.name != channel:
-                return csr_array((len(at), len(self.history.reading_times)))
-            p = self.history.polygon(channel)
-            if at is p.times:
-                return p.matrix
-            return interpolation_matrix(p.times, at) @ p.matrix
-        total = csr_array((len(at), len(self.history.reading_times)))
-        carried = [
-            self.sensitivity(n, channel, at_knots or node.kind.remembers) for n in node.inputs
-        ]
-        if not any(matrix.nnz for matrix in carried):
-            return total
-        derivatives = node.kind.derivatives(*self._arguments(node, at_knots))
+            p, at = self.history.polygon(channel), self.knots if at_knots else self.history.times
+            if at is not p.times:
+                averages = averages @ interpolation_matrix(p.times, at)
+            return averages @ p.matrix
+        given = self._arguments(node, at_knots)
+        if node.operator == "lag":
+            inner = averaged_lag_matrix(averages, *given)
+            return self.averaged(inner, node.inputs[0], channel, at_knots=True)
+        derivatives = node.kind.derivatives(*given)
         if node.kind.remembers:
-            return csr_array(derivatives @ carried[0])
-        for slope, matrix in zip(derivatives, carried, strict=True):
-            total = total + diags_array(slope) @ matrix
-        return csr_array(total)
+            inner = averages @ derivatives
+            return self.averaged(inner, node.inputs[0], channel, at_knots=True)
+        total = nothing
+        for slope, below in zip(derivatives, node.inputs, strict=True):
+            inner = averages @ diags_array(slope)
+            total = total + self.averaged(inner, below, channel, at_knots)
+        return total
 
     def shifted(self, node: Node, jump: Array) -> Array:
         """Return the values (E,) if all rates of readings are changed by `jump` (E,), per s."""
@@ -403,14 +415,18 @@ class OfFormula(Effect):
         return self.drive(history, **nonlinear)[:, None]
 
     def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        channel = self.channel(history, **nonlinear)
-        return Evaluator(history).sensitivity(self.bound(history, **nonlinear), channel)
+        return self.sensitivities(history, **nonlinear)[self.channel(history, **nonlinear)]
 
-    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:
+    def sensitivities(
+        self, history: History, averages: csr_array | None = None, **nonlinear: Any
+    ) -> dict[str, csr_array]:
+        from scipy.sparse import csr_array, eye_array
+
         evaluator, node = Evaluator(history), self.bound(history, **nonlinear)
-        first = self.channel(history, **nonlinear)
-        found = {n: evaluator.sensitivity(node, n) for n in node.channels() if n != first}
-        return {name: matrix for name, matrix in found.items() if matrix.nnz}
+        if averages is None:
+            averages = csr_array(eye_array(len(history.times)))
+        names = dict.fromkeys([self.channel(history, **nonlinear), *node.channels()])
+        return {name: evaluator.averaged(averages, node, name) for name in names}
 
     def unresolved(self, history: History, rate_jump: Array, **nonlinear: Any) -> Array:
         evaluator, node = Evaluator(history), self.bound(history, **nonlinear)

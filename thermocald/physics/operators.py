@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 _DECAYED = 1e-7
 _LAG_CUT = 14.0  # time constants after which a reading's weight in a lag is left out
+_LONG = 1500  # times or knots, above which the matrices of memories are not whole
+_LAG_STEP = 0.2  # time constants within which a lag is straight: its curvature leaves 1 / 200
 
 
 def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -168,6 +170,22 @@ def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:
     return states + csr_array((own, (rows, np.concatenate([left, right]))), shape=shape)
 
 
+def averaged_lag_matrix(
+    averages: csr_array, knots: Array, values: Array, tau: float, at: Array
+) -> csr_array:
+    """Return averages @ lag_matrix (B, K), for averages (B, E) from fewer of many times.
+
+    Between these, 0.2 tau apart, the lag is taken as straight: the whole matrix of a week in 10 s
+    needs gigabytes.
+    """
+    begins = np.append(True, np.diff(np.floor(at / (_LAG_STEP * tau))) > 0)
+    begins[-1] = True
+    few = at[begins]
+    if len(at) <= _LONG or 2 * len(few) > len(at):
+        return averages @ lag_matrix(knots, values, tau, at)
+    return averages @ interpolation_matrix(few, at) @ lag_matrix(knots, values, tau, few)
+
+
 def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
     """Pass a polygon through a play: the output rests until the input is `half_width` away.
 
@@ -266,9 +284,6 @@ def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: 
 
 
 Role = Literal["threshold", "width", "time_constant", "exponent", "phase", "scale"]
-# knots above which an integral's matrix, which is full, is left out: the readings' errors average
-# out to below 1/√1500
-_LONG = 1500
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +335,7 @@ def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # no
     from scipy.sparse import csr_array
 
     n = len(knots)
-    if n > _LONG or n < 2:
+    if n > _LONG or n < 2:  # the readings' errors average out to below 1/√1500
         return csr_array((len(at), n))
     return csr_array(_integral(knots, np.eye(n), at))
 

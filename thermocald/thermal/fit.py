@@ -86,8 +86,7 @@ class HypothesisFitter:
 
         def compute() -> tuple[Array, Carried]:
             reduced = self.series[series]
-            operator = drive_matrix(reduced.history, drives)
-            assert operator is not None
+            operator = drive_matrix(reduced.history, drives, reduced.averages)
             carried = self._carry(series, reduced.history.reference, operator)
             return self.drive_trajectory(terms, series), carried
 
@@ -120,21 +119,17 @@ class HypothesisFitter:
         )  # fmt: skip
 
         def compute() -> tuple[Array, list[tuple[Carried, str]]]:
-            history = evidence.history
-            before: csr_array | None = None
-            if through:
-                chain = _drives(terms, series)
-                before = drive_matrix(history, chain, at_readings=True)
-                history = driven_history(history, chain)
+            chain = _drives(terms, series) if through else ()
+            own, history = evidence.history, driven_history(evidence.history, chain)
             trajectory = evidence.averaged(effect.signal(history, **values))
             found: list[tuple[Carried, str]] = []
             if operators and trajectory.shape[1] == 1:
-                sparse = effect.sensitivity(history, **values)
-                by_channel = effect.further_sensitivities(evidence.history, **values)
-                if sparse.nnz:
-                    whole = sparse if before is None else sparse @ before
-                    by_channel = {effect.channel(history, **values): whole, **by_channel}
-                found = [(self._carry(series, c, m), c) for c, m in by_channel.items()]
+                by_channel = effect.sensitivities(history, evidence.averages, **values)
+                for channel, matrix in by_channel.items():
+                    if matrix.nnz and chain and channel == own.reference:
+                        matrix = drive_matrix(own.at(own.reading_times), chain, matrix)
+                    if matrix.nnz:
+                        found.append((self._carry(series, channel, matrix), channel))
             return trajectory, found
 
         return self._once("trajectory", key, compute, 600)

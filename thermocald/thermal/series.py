@@ -375,13 +375,12 @@ class ReducedSeries:
         return every if self.blocks is None else every[self.blocks.first]
 
     def carry(self, channel: str, operator: csr_array) -> Carried:
-        """Return what readings do to a trajectory, from ∂ trajectory / ∂ knots (E, K)."""
+        """Return what readings do to a trajectory, from ∂ its averages / ∂ knots (B, K)."""
         instrument = self.thermometers[channel]
         result = operator @ instrument.mixing
         if self.blocks is None:
             states = np.asarray(result[:, instrument.erring].toarray())
             return Carried(states, states @ self.state_deviation(channel), np.zeros(len(states)))
-        result = self.blocks.average @ result
         states = np.asarray((result @ self.blocks.pool).toarray())
         whole = result.power(2) @ instrument.sd**2
         unshared = whole - states**2 @ self.state_sd(channel) ** 2
@@ -402,6 +401,11 @@ class ReducedSeries:
             return deviation[self.thermometers[channel].erring]
         pool = self.blocks.pool
         return np.asarray((pool.T @ deviation) / pool.sum(axis=0))
+
+    @property
+    def averages(self) -> csr_array | None:
+        """The weights (B, E) of the epochs in each row, None if rows are epochs."""
+        return self.blocks and self.blocks.average
 
     def averaged(self, trajectory: Array) -> Array:
         """Return the averages of a trajectory (epochs, …) over the rows of the normal equations."""

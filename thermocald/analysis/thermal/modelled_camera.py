@@ -250,15 +250,13 @@ Operators = list[tuple["Array", str, "csr_array"]]
 def reading_operators(model: ThermalModel, history: History) -> Operators:
     """Return the operators of the rates and effects of a model at a history's times."""
     drive = drive_matrix(history, model.drives)
-    assert drive is not None
     found: Operators = [(effect_weights(model, ""), history.reference, drive)]
     for effect in model.effects:
         kind = catalogue.get(effect.name)
         nonlinear, coefficients = kind.split(effect.values)
         if kind.seen_in == "noise" or kind.is_drive or not any(coefficients.values()):
             continue
-        own = kind.channel(history, **nonlinear), kind.sensitivity(history, **nonlinear)
-        matrices = dict([own]) | kind.further_sensitivities(history, **nonlinear)
+        matrices = kind.sensitivities(history, **nonlinear)
         weights = effect_weights(model, effect.name, coefficients)
         found += [(weights, channel, S) for channel, S in matrices.items()]
     return found

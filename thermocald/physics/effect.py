@@ -69,7 +69,7 @@ class Prediction:
         return cls(iop, eop, *factors, np.zeros(epochs), [], field)
 
     def is_like(self, other: Prediction) -> bool:
-        """Whether another prediction for the same times is the same."""
+        """Return whether another prediction for the same times is the same."""
         arrays = ("iop", "eop", "scale", "noise_factor")
         moved = [sum(active.any() for *_, active in p.displacements) for p in (self, other)]
         same = all(np.array_equal(getattr(self, n), getattr(other, n)) for n in arrays)

@@ -202,17 +202,6 @@ def test_one_epoch_does_not_show_the_noise_beside_the_fields_errors(epochs, show
     assert np.isfinite(adjusted.outer_noise).all() == (epochs == 6)
 
 
-def test_gross_errors_in_two_epochs_are_rejected_as_in_one():
-    """Regression: those of 9 sds were taken for the noise of single targets, and were in use."""
-    field, _, observations = series(np.random.default_rng(40), epochs=2, hidden=0.0)
-    wrong = np.arange(len(field)) % 12 == np.array([[5], [9]])
-    for o, some in zip(observations, wrong, strict=True):
-        o.points[some, 0] += 0.35
-    r = scene.adjusted_series(field, observations, exterior="per_epoch")
-    assert r.rejected[wrong].mean() > 0.9
-    assert (r.sigma0 < 1.2).all()
-
-
 def test_repeated_epochs_count_once():
     """Each would be two epochs; first a neighbour is repeated, then one before others."""
     field, _, observations = series(np.random.default_rng(38), epochs=60)

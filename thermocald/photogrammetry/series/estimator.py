@@ -297,8 +297,7 @@ class SeriesEstimator:
     @property
     def _noise_freedom(self) -> Array | None:
         """Degrees of freedom (T,) of each target's noise; None if the noise is as stated."""
-        to_be_estimated = self.s.target_noise and len(self.grid) >= _ENOUGH_FOR_NOISE
-        if self.freedom is None and to_be_estimated:
+        if self.freedom is None and self.s.target_noise:
             return np.full(len(self.testfield), _GUESSED)
         return self.freedom
 

@@ -87,7 +87,9 @@ def with_hot_pixels(image: np.ndarray) -> np.ndarray:
     "change",
     [
         pytest.param(lambda image: np.ascontiguousarray(image[::-1, ::-1]), id="upside down"),
-        pytest.param(lambda image: with_hot_pixels(image * np.uint16(16)), id="12 bit in 16"),
+        pytest.param(
+            lambda image: with_hot_pixels(image.astype(np.uint16) * 16), id="12 bit in 16"
+        ),
         pytest.param(lambda image: 255 - image, id="negative"),
         pytest.param(lambda image: image // 4, id="dim"),
     ],

@@ -11,6 +11,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -130,8 +131,12 @@ class Plugged:
     def plug(self) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.connect(str(self.path))
-        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name="plugged")
+        self._thread = threading.Thread(target=self._run, args=(self._socket,), name="plugged")
         self._thread.start()
+
+    def _run(self, line: socket.socket) -> None:
+        with suppress(BrokenPipeError):  # pulled while it answers
+            self._serve(line)
 
     def pull(self) -> None:
         if self._socket is not None:

@@ -186,9 +186,10 @@ def _times_power(value: float, exponent: int, decimals: int, unit: str) -> str:
     return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 
-def celsius(T: float) -> str:
-    """Write a temperature in °C, without the unit, to a hundredth at most."""
-    return f"{round(T, 2):zg}".replace("-", _MINUS)
+def celsius(T: float, decimals: int | None = None) -> str:
+    """Write a temperature in °C, without the unit; by default to a hundredth at most."""
+    text = f"{round(T, 2):zg}" if decimals is None else f"{T:z.{decimals}f}"
+    return text.replace("-", _MINUS)
 
 
 def counted(count: int, noun: str) -> str:

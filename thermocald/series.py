@@ -23,7 +23,7 @@ from thermocald.analysis.study.measured import measured_series
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
 from thermocald.names import checked
-from thermocald.numbers import counted
+from thermocald.numbers import celsius, counted
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE
@@ -153,7 +153,7 @@ class Series:
         known = self.temperature[np.isfinite(self.temperature)]
         if len(known):
             reference = next(iter(self.temperatures))
-            span = f"{known.min():z.1f} to {known.max():z.1f} °C".replace("-", "−")
+            span = f"{celsius(known.min(), 1)} to {celsius(known.max(), 1)} °C"
             text += f", {span} (reference: {reference})"
         return text + ">"
 

@@ -25,7 +25,7 @@ from thermocald.cli.commands import expert
 from thermocald.cli.common import require_config, say, session_line, show
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
-from thermocald.numbers import counted, duration, with_sd
+from thermocald.numbers import celsius, counted, duration, with_sd
 
 if TYPE_CHECKING:
     from thermocald.config import Config
@@ -339,7 +339,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
     lines = [f"{title}: {camera['device']}"]
     if last:
         temperature = last.get("temperature")
-        at = "" if temperature is None else f" at {temperature:z.2f} °C".replace("-", "−")
+        at = "" if temperature is None else f" at {celsius(temperature, 2)} °C"
         lines[0] += f", epoch {last.get('epoch', '?')}{at}"
         if last.get("status") in WITH_VALUES:
             lines += _orientation(last)
@@ -373,7 +373,7 @@ def _orientation(last: dict[str, Any]) -> list[str]:
 
 def _device(device: dict[str, Any]) -> str:
     shown = [
-        ("" if name == "temperature" else f"{name} ") + f"{value:z.2f} °C".replace("-", "−")
+        ("" if name == "temperature" else f"{name} ") + f"{celsius(value, 2)} °C"
         for name, value in device.get("last", {}).items()
         if value is not None
     ]

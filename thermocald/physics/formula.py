@@ -366,15 +366,14 @@ class Evaluator:
                 averages = averages @ interpolation_matrix(p.times, at)
             return averages @ p.matrix
         given = self._arguments(node, at_knots)
-        if node.operator == "lag":
-            inner = averaged_lag_matrix(averages, *given)
-            return self.averaged(inner, node.inputs[0], channel, at_knots=True)
-        derivatives = node.kind.derivatives(*given)
         if node.kind.remembers:
-            inner = averages @ derivatives
+            if node.operator == "lag":
+                inner = averaged_lag_matrix(averages, *given)
+            else:
+                inner = averages @ node.kind.derivatives(*given)
             return self.averaged(inner, node.inputs[0], channel, at_knots=True)
         total = nothing
-        for slope, below in zip(derivatives, node.inputs, strict=True):
+        for slope, below in zip(node.kind.derivatives(*given), node.inputs, strict=True):
             inner = averages @ diags_array(slope)
             total = total + self.averaged(inner, below, channel, at_knots)
         return total
